@@ -9,8 +9,7 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from hrc_learn.store import read_toml
-from hrc_learn.viz.report import flatten, page_templates
-from hrc_learn.viz.report_content import Report
+from hrc_learn.viz.report import Report, flatten, page_templates
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Reports of runs: the folder of a run, and one self-contained HTML page about one or several.
+"""Reports of runs: measured values, pictures and text in a folder, and one page about them.
 
 A program fills a `Report`; `write_report` writes `report.json`, pictures, `film.mp4` and
 `report.html` to the folder of the run. `read_report` reads them again, and `reports_page` shows
@@ -9,24 +9,215 @@ printed, and read offline.
 import base64
 import math
 import os
+import platform
+import re
+import shlex
+import shutil
+import sys
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from hrc_learn.store import new_file, read_json, write_json
-from hrc_learn.viz.report_content import Film as Film
-from hrc_learn.viz.report_content import Measurement as Measurement
-from hrc_learn.viz.report_content import Picture as Picture
-from hrc_learn.viz.report_content import Report as Report
-from hrc_learn.viz.report_content import Section as Section
-from hrc_learn.viz.report_content import flatten as flatten
-from hrc_learn.viz.report_content import leading as leading
-from hrc_learn.viz.report_content import show_command as show_command
-from hrc_learn.viz.report_content import show_measurements as show_measurements
-from hrc_learn.viz.report_content import software_versions as software_versions
+
+_DPI = 150  # sharp in print, at the width of a page
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """One measured value with its target."""
+
+    name: str
+    """Name of the quantity, in words."""
+    value: float | int
+    unit: str = ""
+    target: float | int | None = None
+    """Bound of the value; None: it is only reported."""
+    at_least: bool = False
+    """True if the target is a lower bound; it is an upper one otherwise."""
+    claim: str = ""
+    """Claim of the paper, in words; empty without one."""
+    resolution: float = 0.0
+    """Resolution of the measurement; no finer digits are shown."""
+
+    @property
+    def ok(self) -> bool | None:
+        """True if the target is met, None without a target. NaN meets none."""
+        if self.target is None:
+            return None
+        # A bool of Python's own: numpy's is neither True nor False to an `is`.
+        return bool(self.value >= self.target if self.at_least else self.value <= self.target)
+
+    @property
+    def shown(self) -> str:
+        """Value and unit for a reader, without digits below the resolution."""
+        if abs(self.value) < self.resolution:
+            return f"< {short(self.resolution)} {self.unit}".rstrip()
+        rounded = replace(self, value=_rounded(self.value, self.resolution))
+        # A bound missed by less than the resolution must not look as if it was met.
+        value = rounded.value if rounded.ok is self.ok else self.value
+        return f"{short(value)} {self.unit}".rstrip()
+
+    @property
+    def bound(self) -> str:
+        """Target and unit for a reader, empty without a target."""
+        if self.target is None:
+            return ""
+        return f"{'≥' if self.at_least else '≤'} {short(self.target)} {self.unit}".rstrip()
+
+    @property
+    def key(self) -> str:
+        """Name and unit as one word: the key of the value in JSON files."""
+        words = re.findall(r"\w+", self.name.lower())
+        return "_".join([*words, *([self.unit] if self.unit else [])])
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with its caption."""
+
+    name: str
+    """Name of its file without suffix: letters, digits, hyphens and underscores."""
+    drawing: Any = b""
+    """A matplotlib figure, an RGB image (height, width, 3), or a finished PNG file."""
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ValueError(
+                f"picture name {self.name!r} is not a portable file name: "
+                "use letters, digits, hyphens and underscores."
+            )
+
+    @cached_property
+    def png(self) -> bytes:
+        """The picture as a PNG file, drawn once."""
+        if isinstance(self.drawing, bytes):
+            return self.drawing
+        buffer = BytesIO()
+        if isinstance(self.drawing, np.ndarray):
+            from PIL import Image
+
+            Image.fromarray(self.drawing).save(buffer, "PNG", optimize=True)
+        else:
+            self.drawing.savefig(buffer, format="png", dpi=_DPI)
+        return buffer.getvalue()
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film with its caption."""
+
+    mp4: bytes
+    """The file."""
+    caption: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A heading, paragraphs and pictures."""
+
+    heading: str
+    text: str = ""
+    """Plain text; blank lines part paragraphs."""
+    figures: Sequence[Picture] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Results of a run.
+
+    Raises:
+        ValueError: If two pictures have the same name.
+    """
+
+    title: str
+    summary: str
+    """Description of the run, in plain text; blank lines part paragraphs."""
+    table: Sequence[Measurement] = ()
+    """All measured values."""
+    sections: Sequence[Section] = ()
+    film: Film | None = None
+    """Film of the run."""
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+    """Configuration of the run; nested mappings are flattened."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    """Versions of the software, by name."""
+    command: str = ""
+    """Command line that repeats the run."""
+
+    def __post_init__(self) -> None:
+        names = [picture.name for section in self.sections for picture in section.figures]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(f"report {self.title!r} has two pictures named {twice.pop()!r}.")
+
+    @property
+    def targets(self) -> int:
+        """Number of values with a target."""
+        return sum(m.ok is not None for m in self.table)
+
+    @property
+    def missed(self) -> tuple[Measurement, ...]:
+        """Values that missed their target."""
+        return tuple(m for m in self.table if m.ok is False)
+
+    @property
+    def pictures(self) -> tuple[Picture, ...]:
+        """Pictures of all sections, in order."""
+        return tuple(picture for section in self.sections for picture in section.figures)
+
+
+def leading(
+    table: Sequence[Measurement], count: int
+) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
+    """Measurements to show first, and the others, both in the order of the table.
+
+    Those that missed their targets come first, however many; then others with a target.
+
+    Args:
+        table: All measurements.
+        count: Number of measurements shown first, unless more missed.
+    """
+    ranks = {False: 0, True: 1, None: 2}
+    order = sorted(range(len(table)), key=lambda i: ranks[table[i].ok])
+    missed = sum(m.ok is False for m in table)
+    first = set(order[: max(count, missed)])
+    return (
+        tuple(m for i, m in enumerate(table) if i in first),
+        tuple(m for i, m in enumerate(table) if i not in first),
+    )
+
+
+def _rounded(value: float | int, resolution: float) -> float | int:
+    """Value rounded to its resolution; 0 leaves it unchanged."""
+    if resolution == 0 or not math.isfinite(value):
+        return value
+    return round(value, math.ceil(-math.log10(resolution)))
+
+
+def short(value: float | int) -> str:
+    """Three significant digits; whole numbers in full."""
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e9 else f"{value:.3g}"
+
+
+def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, keys joined by dots."""
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
 
 
 def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = ()) -> str:
@@ -87,37 +278,20 @@ LINKED = (".rrd", ".mp4", ".npz")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _PictureFile:
-    name: str
-    caption: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SectionFile:
-    heading: str
-    text: str
-    figures: list[_PictureFile]
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Row(Measurement):
     value: float | int | None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Value; None if it is not finite, which JSON cannot represent."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ReportFile:
+class _ReportFile(Report):
+    """Content of `report.json`: pictures and film are files next to it."""
+
     format: Literal["hrc_learn report"] = "hrc_learn report"
     version: Literal[1] = 1
-    title: str
-    summary: str
-    command: str
-    film: str | None = None
+    table: Sequence[_Row]
+    film: str | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Caption of the film; None without one."""
-    table: list[_Row]
-    sections: list[_SectionFile]
-    configuration: dict[str, bool | int | float | str | None]
-    versions: dict[str, str]
 
 
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
@@ -160,48 +334,113 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
             "before its report."
         )
     advice = "read it with the package that wrote it, or repeat the run"
-    content = read_json(path, _ReportFile, advice)
-    return _from_file(content, folder)
+    return _from_file(read_json(path, _ReportFile, advice), folder)
 
 
-def _as_file(report: Report) -> dict[str, object]:
-    """Content of `report.json`, which fits `_ReportFile`; pictures and film are files."""
+def _as_file(report: Report) -> dict[str, Any]:
+    """Content of `report.json`, which fits `_ReportFile`."""
     sections = [
         {**vars(s), "figures": [{"name": p.name, "caption": p.caption} for p in s.figures]}
         for s in report.sections
     ]
-    configuration = flatten(report.configuration)
     return {
         "format": "hrc_learn report",
         "version": 1,
         **vars(report),
         "film": None if report.film is None else report.film.caption,
         "sections": sections,
-        "configuration": {key: _plain(value) for key, value in configuration.items()},
+        "configuration": flatten(report.configuration),
     }
 
 
 def _from_file(content: _ReportFile, folder: Path) -> Report:
-    def picture(shown: _PictureFile) -> Picture:
-        png = (folder / FIGURES / f"{shown.name}.png").read_bytes()
-        return Picture(shown.name, png, shown.caption)
+    def with_pictures(section: Section) -> Section:
+        files = [folder / FIGURES / f"{shown.name}.png" for shown in section.figures]
+        drawn = zip(section.figures, files, strict=True)
+        return replace(section, figures=[replace(p, drawing=f.read_bytes()) for p, f in drawn])
 
-    fields = {k: v for k, v in vars(content).items() if k not in ("format", "version")}
-    fields["sections"] = [
-        Section(heading=s.heading, text=s.text, figures=[*map(picture, s.figures)])
-        for s in content.sections
-    ]
-    fields["table"] = [
+    values = {field.name: getattr(content, field.name) for field in fields(Report)}
+    values["sections"] = [with_pictures(section) for section in content.sections]
+    values["table"] = [
         Measurement(**{**vars(row), "value": math.nan if row.value is None else row.value})
         for row in content.table
     ]
     if content.film is not None:
-        fields["film"] = Film((folder / FILM).read_bytes(), content.film)
-    return Report(**fields)
+        values["film"] = Film((folder / FILM).read_bytes(), content.film)
+    return Report(**values)
 
 
-def _plain(value: object) -> bool | int | float | str | None:
-    """JSON value, with all other types converted to text."""
-    if isinstance(value, (bool, int, str, type(None))):
-        return value
-    return value if isinstance(value, float) and math.isfinite(value) else str(value)
+_PACKAGES = (
+    "hrc-learn",
+    "torch",
+    "mujoco",
+    "lerobot",
+    "opencv-python-headless",
+    "rerun-sdk",
+    "viser",
+)
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on, by name."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def show_command(path: str | os.PathLike[str]) -> str:
+    """Shell command that opens the dashboard of a run or a recording.
+
+    It names the program by its path if another one, or none, is on the search path.
+    """
+    python = Path(sys.executable)
+    program = python.with_name("hrc")
+    if shutil.which("hrc") == str(program):
+        return shlex.join(["hrc", "show", str(path)])
+    words = [str(program)] if program.is_file() else [str(python), "-m", "hrc_learn.cli"]
+    return shlex.join([*(_shortest(word) for word in words), "show", str(path)])
+
+
+def _shortest(word: str) -> str:
+    path = Path(word)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else word
+
+
+_ROWS = 8
+"""Rows of a table in the terminal, few enough to stay in view."""
+
+
+def show_measurements(
+    table: Sequence[Measurement],
+    everything: bool = False,
+    *,
+    title: str = "Measured",
+    more: int = 0,
+    elsewhere: str = "the report",
+) -> None:
+    """Print measured values with their targets.
+
+    Args:
+        table: The values.
+        everything: Print all values, not only the missed and the first of the others.
+        title: Title of the table.
+        more: Number of further values that are not in the table.
+        elsewhere: Place of the values that are not shown.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    # As text: brackets in the name of a folder are no markup.
+    shown = Table("measured", "value", "target", "", title=Text(title))
+    marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
+    first, others = (tuple(table), ()) if everything else leading(table, _ROWS)
+    for m in first:
+        shown.add_row(m.name, m.shown, m.bound, marks[m.ok])
+    if left := more + len(others):
+        shown.caption = f"{left} more: {elsewhere}"
+    Console().print(shown)

@@ -8,8 +8,7 @@ import pytest
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
 from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
 from hrc_learn.viz.evidence import clauses, evidence_page
-from hrc_learn.viz.report import Measurement, Report
-from hrc_learn.viz.report_content import flatten
+from hrc_learn.viz.report import Measurement, Report, flatten
 
 ROOT = Path(__file__).parents[2]
 

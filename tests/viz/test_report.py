@@ -376,7 +376,7 @@ def test_a_report_is_read_as_it_was_written(tmp_path):
     assert read.configuration == {
         "out": str(tmp_path),
         "gains.k": 0.3,
-        "pulls": "(1, 2)",
+        "pulls": [1, 2],
         "loose": None,
     }
     (section,) = read.sections
