@@ -7,7 +7,7 @@ bounded, and so is its cost.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from itertools import combinations, pairwise, product
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -303,7 +303,7 @@ def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str,
         path = _polyline(run.plan_path, palette.GREEN)
         drawn.append(("learned motion, planned", palette.GREEN, path))
     elif run.region is not None:
-        edges = _edges(run.region, palette.YELLOW)
+        edges = [_line(*ends, palette.YELLOW, width=0.004) for ends in run.region.edges()]
         drawn.append(("region of visual servoing", palette.YELLOW, edges))
     first = int(np.searchsorted(run.time, run.time[step] - _TRAIL))
     trail = _polyline(run.position[first : step + 1], palette.BLUE)
@@ -329,13 +329,6 @@ def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str,
 def _polyline(points: Float[np.ndarray, "points 3"], colour: str) -> list[Line]:
     kept = points[np.unique(np.linspace(0, len(points) - 1, _POINTS).round().astype(int))]
     return [_line(a, b, colour) for a, b in pairwise(kept) if np.isfinite([a, b]).all()]
-
-
-def _edges(box: Box, colour: str) -> list[Line]:
-    corners = np.array(list(product((-1, 1), repeat=3)))
-    ends = [(a, b) for a, b in combinations(corners, 2) if (a != b).sum() == 1]
-    centre, half = np.array(box.centre), np.array(box.half_size)
-    return [_line(centre + a * half, centre + b * half, colour, width=0.004) for a, b in ends]
 
 
 def _line(start: np.ndarray, end: np.ndarray, colour: str, **more: Any) -> Line:

@@ -142,7 +142,7 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
         if run.demo_path is not None:
             points = np.concatenate([points, run.demo_path])
         for box in near(run.boxes, points):
-            draw_box(axes, box, "#8D8F94", alpha=0.10)
+            draw_box(axes, box, "#8D8F94")
         if run.demo_path is not None:
             axes.plot(*run.demo_path.T, color=palette.DEMO, lw=5.0, label="demonstration")
         carried = np.zeros(len(run.time), dtype=bool)
@@ -272,7 +272,7 @@ def placing_paths_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
         for i, (planned, label) in enumerate(SPACES.items()):
             axes = space(figure, position=(1, len(SPACES), 1 + i))
             for box in near(tuple(run.workplace.scene.cabinet.boxes()), points):
-                draw_box(axes, box, "#8D8F94", alpha=0.08)
+                draw_box(axes, box, "#8D8F94")
             axes.plot(*shown.T, color=palette.DEMO, lw=5, label="demonstration")
             for shelf, colour in zip(shelves, _SHELVES, strict=False):
                 path = paths[planned, shelf]
@@ -294,12 +294,6 @@ def placing_joints_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
     curves = [demonstrated_joints(shown.time - shown.time[0], shown.joint_position)]
     for shelf, colour in zip(shelves, _SHELVES, strict=False):
         placed = run.placings["pose", shelf]
-        curves.append(
-            JointCurves(
-                label=f"{shelf} shelf",
-                time=placed.time,
-                position=placed.joint_position,
-                colour=colour,
-            )
-        )
+        label = f"{shelf} shelf"
+        curves.append(JointCurves(label, placed.time, placed.joint_position, colour))
     return joint_grid_figure(chain.joint_names, curves, joint_ranges(chain))

@@ -7,6 +7,7 @@ material are used.
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,12 @@ class Box:
     """[m]"""
     colour: Colour = (0.75, 0.62, 0.45, 1.0)
     name: str = ""
+
+    def edges(self) -> Float[np.ndarray, "12 2 3"]:
+        """Ends of its twelve edges [m]."""
+        corners = np.array(list(product((-1, 1), repeat=3)))
+        ends = [(a, b) for a, b in combinations(corners, 2) if (a != b).sum() == 1]
+        return np.array(ends) * self.half_size + self.centre
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

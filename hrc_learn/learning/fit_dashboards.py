@@ -197,9 +197,7 @@ def fit_report(
     """
     shown = list(zip(fit.time, fit.demos, fit.reproductions, strict=True))[:4]
     motions = [demonstrated_joints(time, demo) for time, demo, _ in shown]
-    motions += [
-        JointCurves(label="reproduction", time=time, position=made) for time, _, made in shown
-    ]
+    motions += [JointCurves("reproduction", time, made) for time, _, made in shown]
     joints = joint_grid_figure(fit.names, motions, fit.limits, fit.unit)
     caption = "The first four demonstrations and their reproductions."
     figures = [Picture("position" if fit.unit == "m" else "joints", joints, caption)]

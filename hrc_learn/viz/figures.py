@@ -5,9 +5,7 @@ plots that the dashboards show (`panels.py`).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -17,12 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Curves, Plot
+from hrc_learn.viz.panels import Plot, single
 
 STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -62,24 +60,14 @@ def shade(
 
 
 def draw_limits(axes: Axes, lower: float, upper: float) -> None:
-    """Draw lines at the limits of a joint, and tint the range beyond them.
-
-    The motion drawn before fills the panel: if a limit is far from it, both limits are written
-    as text instead.
-    """
+    """Write the limits of a joint, and draw those within the panel, which the motion fills."""
     low, high = axes.dataLim.intervaly
     around = max(0.25, 0.15 * (high - low))  # of a joint that hardly moves [rad]
-    beyond = 0.06 * (upper - lower)
-    bottom, top = max(lower - beyond, low - around), min(upper + beyond, high + around)
-    for limit, end in ((lower, bottom), (upper, top)):
-        if bottom <= limit <= top:
-            inner, outer = sorted((limit, end))
-            axes.axhspan(inner, outer, color=palette.LIMIT, alpha=0.15, lw=0)
-            axes.axhline(limit, color=palette.LIMIT, lw=0.9, label="limit")
-    axes.set_ylim(bottom, top)
-    if not (bottom <= lower and upper <= top):
-        said = f"limits {lower:.2f}, {upper:.2f}"
-        axes.set_title(said, loc="right", fontsize=7, color=palette.LIMIT)
+    for limit in (lower, upper):
+        axes.axhline(limit, color=palette.LIMIT, lw=0.9)
+    axes.set_ylim(low - around, high + around)
+    text = f"limits {lower:.2f}, {upper:.2f}"
+    axes.set_title(text, loc="right", fontsize=7, color=palette.LIMIT)
 
 
 def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
@@ -115,23 +103,13 @@ def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
     return parts
 
 
-def draw_box(axes: Axes3D, box: Box, colour: str, *, alpha: float) -> None:
-    """A translucent box with its edges."""
-    corners = np.array(list(product((-1, 1), repeat=3))) * box.half_size + box.centre
-    faces, edges = [], []
-    for axis, side in product(range(3), (-1, 1)):
-        rim = [k for k, signs in enumerate(product((-1, 1), repeat=3)) if signs[axis] == side]
-        ring = [rim[0], rim[1], rim[3], rim[2], rim[0]]  # round the face
-        faces.append(corners[ring[:4]])
-        edges += [corners[[a, b]] for a, b in pairwise(ring)]
-    axes.add_collection3d(
-        Poly3DCollection(faces, facecolor=colour, alpha=alpha, edgecolor="none")
-    )
-    axes.add_collection3d(Line3DCollection(edges, colors=colour, linewidths=0.6, alpha=0.6))
+def draw_box(axes: Axes3D, box: Box, colour: str) -> None:
+    """The edges of a box."""
+    edges = Line3DCollection(list(box.edges()), colors=colour, linewidths=0.6, alpha=0.6)
+    axes.add_collection3d(edges)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class JointCurves:
+class JointCurves(NamedTuple):
     """Joint positions of one motion over time, with their look."""
 
     label: str
@@ -142,26 +120,12 @@ class JointCurves:
     colour: str = palette.RUN
     width: float = 1.8
 
-    def curves(self, joint: int) -> Curves:
-        """Curve of one joint."""
-        values, colours = self.position[:, [joint]], (palette.rgba(self.colour),)
-        return Curves(
-            path="",
-            names=(self.label,),
-            values=values,
-            colours=colours,
-            width=self.width,
-            time=self.time,
-        )
-
 
 def demonstrated_joints(
     time: Float[np.ndarray, " time"], position: Float[np.ndarray, "time joints"]
 ) -> JointCurves:
     """Thick grey curves of a demonstration."""
-    return JointCurves(
-        label="demonstration", time=time, position=position, colour=palette.DEMO, width=4.5
-    )
+    return JointCurves("demonstration", time, position, palette.DEMO, 4.5)
 
 
 def joint_grid_figure(
@@ -181,7 +145,10 @@ def joint_grid_figure(
     plots = [
         Plot(
             title=f"{name} [{unit}]",
-            curves=tuple(motion.curves(i) for motion in motions),
+            curves=tuple(
+                single("", m.label, m.position[:, i], m.colour, m.width, m.time)
+                for m in motions
+            ),
             legend=i == 0,
         )
         for i, name in enumerate(names)
@@ -198,7 +165,7 @@ def joints_figure(run: RunRecording) -> Figure:
     motions = []
     if run.demo_joint_position is not None:
         motions.append(demonstrated_joints(run.time, run.demo_joint_position))
-    motions.append(JointCurves(label="run", time=run.time, position=run.joint_position))
+    motions.append(JointCurves("run", run.time, run.joint_position))
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
 

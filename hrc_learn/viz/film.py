@@ -1,7 +1,7 @@
 """Films of runs: captions on the pictures, drawings without OpenGL, and the MP4 file."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from hrc_learn.geometry import Body, Box, quaternion
-from hrc_learn.geometry.shapes import Colour, Line
+from hrc_learn.geometry import Box, quaternion
+from hrc_learn.geometry.shapes import Line
 from hrc_learn.log import CameraRecording, RunRecording
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
@@ -28,8 +28,7 @@ _MARGIN = 10  # [px]
 _INSET = 0.27  # of the picture's width
 _SHADE = (24, 26, 30, 200)
 _SKY = (228, 233, 238)
-_BACK, _EDGE = 0.72, 0.35  # brightness of a face turned away from the light, and of outlines
-_UPRIGHT = np.eye(3)
+_OUTLINE = 0.35  # brightness of outlines
 
 # A film of 16 s at 720 x 450 px is 0.3 MB then: a report that holds it can be mailed.
 _CODEC = {"preset": "veryfast", "crf": "27"}
@@ -162,7 +161,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 def draw_run(
     run: RunRecording, step: int, camera: CameraModel, lines: Sequence[Line] = ()
 ) -> Picture:
-    """Draw a moment of a run without OpenGL: capsules and boxes, the farthest first.
+    """Draw a moment of a run without OpenGL: capsules and edges of boxes, the farthest first.
 
     Args:
         run: The run.
@@ -170,97 +169,52 @@ def draw_run(
         camera: Camera without distortion.
         lines: Lines drawn over the scene.
     """
+    shown = [line for box in run.boxes for line in _edges(box)]
+    for body in run.bodies:
+        R, origin = _matrix(body.orientation[step]), body.position[step]
+        parts = [line for box in body.boxes for line in _edges(box)]
+        parts += [
+            Line(
+                start=np.array(capsule.start),
+                end=np.array(capsule.end),
+                colour=capsule.colour,
+                width=2 * capsule.radius,
+            )
+            for capsule in body.capsules
+        ]
+        shown += [
+            replace(part, start=R @ part.start + origin, end=R @ part.end + origin)
+            for part in parts
+        ]
     image = Image.new("RGB", (camera.width, camera.height), _SKY)
     draw = ImageDraw.Draw(image)
-    still = [part for box in run.boxes for part in _faces(box, _UPRIGHT, np.zeros(3), camera)]
-    moving = [part for body in run.bodies for part in _body_parts(body, step, camera)]
-    # Furniture first: a large board has no one depth, and what moves is in front of most of it.
-    for parts in (still, moving):
-        for _, part in sorted(parts, key=lambda part: -part[0]):
-            part.draw(draw)
-    for line in lines:
-        ends, colour = np.stack([line.start, line.end]), _bytes(line.colour)
-        (part,) = _capsule(ends, line.width, colour, camera)
-        part[1].draw(draw)
+    for line in [*sorted(shown, key=lambda line: -_depth(line, camera)), *lines]:
+        _draw_line(draw, line, camera)
     return np.asarray(image)
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A polygon, or a thick line, in pixels."""
-
-    points: list[tuple[float, float]]
-    colour: tuple[int, int, int]
-    width: float | None = None
-    """Width of a line [px]; None for a polygon."""
-
-    def draw(self, draw: ImageDraw.ImageDraw) -> None:
-        if not np.isfinite(self.points).all():  # behind the camera
-            return
-        if self.width is None:
-            draw.polygon(self.points, fill=self.colour, outline=_dimmed(self.colour, _EDGE))
-            return
-        outline = _dimmed(self.colour, _EDGE)
-        for colour, width in ((outline, self.width + 3), (self.colour, self.width)):
-            draw.line(self.points, fill=colour, width=max(1, round(width)))
-            r = width / 2
-            for u, v in self.points:
-                draw.ellipse((u - r, v - r, u + r, v + r), fill=colour)
+def _draw_line(draw: ImageDraw.ImageDraw, line: Line, camera: CameraModel) -> None:
+    """Draw a line with round ends and a dark outline, unless it reaches behind the camera."""
+    points = camera.project(np.stack([line.start, line.end]))
+    if not np.isfinite(points).all():
+        return
+    thick = camera.focal[0] * line.width / max(_depth(line, camera), 0.01)
+    for light, width in ((_OUTLINE, thick + 3), (1.0, thick)):
+        r, g, b = (round(255 * light * channel) for channel in line.colour[:3])
+        draw.line(points.ravel().tolist(), fill=(r, g, b), width=max(1, round(width)))
+        for u, v in points.tolist():
+            box = (u - width / 2, v - width / 2, u + width / 2, v + width / 2)
+            draw.ellipse(box, fill=(r, g, b))
 
 
-def _body_parts(body: Body, step: int, camera: CameraModel) -> list[tuple[float, _Part]]:
-    R, origin = _matrix(body.orientation[step]), body.position[step]
-    parts = [part for box in body.boxes for part in _faces(box, R, origin, camera)]
-    for capsule in body.capsules:
-        ends = np.array([capsule.start, capsule.end]) @ R.T + origin
-        parts += _capsule(ends, 2 * capsule.radius, _bytes(capsule.colour), camera)
-    return parts
+def _edges(box: Box) -> list[Line]:
+    return [Line(start=a, end=b, colour=box.colour) for a, b in box.edges()]
 
 
-def _capsule(
-    ends: Float[np.ndarray, "2 3"],
-    width: float,
-    colour: tuple[int, int, int],
-    camera: CameraModel,
-) -> list[tuple[float, _Part]]:
-    depth = float(camera.to_camera(ends)[:, 2].mean())
-    points = [(float(u), float(v)) for u, v in camera.project(ends)]
-    return [(depth, _Part(points, colour, camera.focal[0] * width / max(depth, 0.01)))]
-
-
-def _faces(
-    box: Box, R: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"], camera: CameraModel
-) -> list[tuple[float, _Part]]:
-    """Visible faces of a box, each with its depth [m]."""
-    parts = []
-    eye = camera.pose[:3, 3]
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            normal = np.zeros(3)
-            normal[axis] = side
-            others = np.delete(np.eye(3), axis, axis=0)
-            square = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ others
-            corners = (square + normal) * box.half_size + box.centre
-            corners = corners @ R.T + origin
-            outwards = R @ normal
-            if outwards @ (eye - corners[0]) <= 0:
-                continue
-            light = _BACK + (1 - _BACK) * max(float(outwards[2]), 0.0)
-            depth = float(camera.to_camera(corners)[:, 2].mean())
-            points = [(float(u), float(v)) for u, v in camera.project(corners)]
-            parts.append((depth, _Part(points, _dimmed(_bytes(box.colour), light))))
-    return parts
+def _depth(line: Line, camera: CameraModel) -> float:
+    """Distance of the middle of a line in front of the camera [m]."""
+    return float(camera.to_camera((line.start + line.end) / 2)[2])
 
 
 def _matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     return quaternion.to_matrix(torch.from_numpy(orientation)).numpy()
-
-
-def _bytes(colour: Colour) -> tuple[int, int, int]:
-    r, g, b = (round(255 * c) for c in colour[:3])
-    return r, g, b
-
-
-def _dimmed(colour: tuple[int, int, int], light: float) -> tuple[int, int, int]:
-    r, g, b = colour
-    return round(light * r), round(light * g), round(light * b)

@@ -39,8 +39,6 @@ class Plot:
     """Range of the vertical axis; None: that of the data."""
     legend: bool = False
     """Show a legend, if the title cannot name the colours."""
-    height: float = 1.0
-    """Height relative to the other plots of the tab."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,38 +60,25 @@ def without_empty_plots(tab: Tab) -> Tab:
     return replace(tab, plots=tuple(seen))
 
 
+_EFFORT = "Null-space effort d of the person, by joint [N m]"
+_ERROR = "Distance from feature to target [px]"
+_DEVIATION = "Deviation of the end effector, position [mm]"
+_WORKER = "Distance of the worker from the robot and its load [mm]"
+_STORY = (_ERROR, _EFFORT, _DEVIATION, _WORKER)
+"""Plots of the overview, one for each topic."""
+
+
 def run_tabs(run: RunRecording) -> list[Tab]:
-    """All tabs that the run has data for."""
+    """All tabs that the run has data for, an overview first."""
     tabs = [
-        _story(run),
         _servoing(run),
         _person_and_worker(run),
         _primitive(run),
         _safety(run),
         _lyapunov(run),
     ]
-    return [tab for tab in tabs if tab.plots]
-
-
-def _story(run: RunRecording) -> Tab:
-    """Overview with one curve per topic; the other tabs show details."""
-    plots = []
-    if run.camera is not None:
-        error = single("story/error", "distance", run.camera.error, palette.RUN_ON_DARK)
-        plots.append(Plot(title="Servoing: distance to the target [px]", curves=(error,)))
-    if run.nullspace_input is not None:
-        effort = np.abs(run.nullspace_input).max(axis=1)
-        curve = single("story/effort", "largest of the joints", effort, palette.PERSON)
-        plots.append(Plot(title="Person: null-space effort [N m]", curves=(curve,)))
-    if run.position_deviation is not None:
-        off = 1e3 * run.position_deviation
-        curve = single("story/deviation", "deviation", off, palette.PURPLE)
-        plots.append(Plot(title="End effector: displacement [mm]", curves=(curve,)))
-    if run.worker_distance:
-        name, true = next(iter(run.worker_distance.items()))
-        curve = single("story/distance", name, 1e3 * true, palette.GREEN)
-        plots.append(Plot(title="Worker: distance from the robot [mm]", curves=(curve,)))
-    return Tab(title="Story", plots=tuple(plots))
+    story = tuple(plot for tab in tabs for plot in tab.plots if plot.title in _STORY)
+    return [tab for tab in (Tab(title="Story", plots=story), *tabs) if tab.plots]
 
 
 def _servoing(run: RunRecording) -> Tab:
@@ -103,7 +88,7 @@ def _servoing(run: RunRecording) -> Tab:
     delta = run.camera.feature - run.camera.target
     parts = several("camera/error_uv", ("u (right)", "v (down)"), delta)
     plots = [
-        Plot(title="Distance from feature to target [px]", curves=(error,)),
+        Plot(title=_ERROR, curves=(error,)),
         Plot(title="Feature minus target [px]", curves=(parts,), legend=True),
         *image_jacobian_plots(run),
     ]
@@ -167,8 +152,7 @@ def person_plots(run: RunRecording) -> list[Plot]:
     plots = []
     if run.nullspace_input is not None:
         effort = several("person/effort", run.joint_names, run.nullspace_input)
-        title = "Null-space effort d of the person, by joint [N m]"
-        plots.append(Plot(title=title, curves=(effort,), legend=True))
+        plots.append(Plot(title=_EFFORT, curves=(effort,), legend=True))
     if run.followed is not None:
         share = single("person/followed", "fraction", run.followed, palette.TARGET)
         title = "Followed fraction of the push [-]"
@@ -180,17 +164,11 @@ def person_plots(run: RunRecording) -> list[Plot]:
         extent, title = (0.0, len(rows) + 1.0), "Reasons for not following, or only in part"
         plots.append(Plot(title=title, curves=(reasons,), range=extent, legend=True))
     moved, turned = run.position_deviation, run.rotation_deviation
-    blue, deviation = palette.RUN_ON_DARK, "Deviation of the end effector"
+    turning = "Deviation of the end effector, rotation [deg]"
     for path, values, unit, colour, title in (
         ("elbow", run.elbow_motion, 1e3, palette.PERSON, "Elbow: displacement [mm]"),
-        ("position_deviation", moved, 1e3, blue, f"{deviation}, position [mm]"),
-        (
-            "rotation_deviation",
-            turned,
-            180 / np.pi,
-            palette.PURPLE,
-            f"{deviation}, rotation [deg]",
-        ),
+        ("position_deviation", moved, 1e3, palette.RUN_ON_DARK, _DEVIATION),
+        ("rotation_deviation", turned, 180 / np.pi, palette.PURPLE, turning),
     ):
         if values is not None:
             curve = single(f"person/{path}", path.split("_")[0], unit * values, colour)
@@ -204,12 +182,11 @@ def worker_plots(run: RunRecording) -> list[Plot]:
         return []
     values = 1e3 * np.column_stack(list(run.worker_distance.values()))
     distance = several("worker/distance", run.worker_distance, values)
-    title = "Distance of the worker from the robot and its load [mm]"
     # The last few centimetres matter.
     near = several("worker/near", run.worker_distance, np.where(values < 300, values, np.nan))
     return [
-        Plot(title=title, curves=(distance,), legend=True),
-        Plot(title=f"{title}, below 300", curves=(near,), range=(-50.0, 300.0), legend=True),
+        Plot(title=_WORKER, curves=(distance,), legend=True),
+        Plot(title=f"{_WORKER}, below 300", curves=(near,), range=(-50.0, 300.0), legend=True),
     ]
 
 
@@ -253,8 +230,13 @@ def joint_plot(
 
 def limit_curves(path: str, limits: JointRanges, i: int, steps: int) -> Curves:
     """Both limits of joint i."""
-    bounds = np.broadcast_to([limits.lower[i], limits.upper[i]], (steps, 2))
+    return _bounds(path, (limits.lower[i], limits.upper[i]), steps)
+
+
+def _bounds(path: str, values: tuple[float, float], steps: int) -> Curves:
+    """A lower and an upper limit."""
     names, red = ("lower limit", "upper limit"), palette.rgba(palette.LIMIT)
+    bounds = np.broadcast_to(values, (steps, 2))
     return Curves(path=path, names=names, values=bounds, colours=(red, red))
 
 
@@ -288,13 +270,7 @@ def _within(
     path: str, title: str, names: Iterable[str], fractions: Shaped[np.ndarray, "time joints"]
 ) -> Plot:
     """Plot of fractions of limits, between -1 and 1."""
-    red = palette.rgba(palette.LIMIT)
-    bounds = Curves(
-        path=f"{path}/limits",
-        names=("limit", "limit"),
-        values=np.broadcast_to([-1.0, 1.0], (len(fractions), 2)),
-        colours=(red, red),
-    )
+    bounds = _bounds(f"{path}/limits", (-1.0, 1.0), len(fractions))
     curves = (several(f"{path}/joints", names, fractions), bounds)
     return Plot(title=title, curves=curves, range=(-1.1, 1.1), legend=True)
 
@@ -304,11 +280,18 @@ def slug(name: str) -> str:
     return re.sub(r"\W+", "_", name).strip("_")
 
 
-def single(path: str, name: str, values: np.ndarray, colour: str, width: float = 1.5) -> Curves:
+def single(
+    path: str,
+    name: str,
+    values: np.ndarray,
+    colour: str,
+    width: float = 1.5,
+    time: np.ndarray | None = None,
+) -> Curves:
     """One curve, from values of shape (T,)."""
-    colours = (palette.rgba(colour),)
+    colours, column = (palette.rgba(colour),), values[:, None]
     return Curves(
-        path=path, names=(name,), values=values[:, None], colours=colours, width=width
+        path=path, names=(name,), values=column, colours=colours, width=width, time=time
     )
 
 

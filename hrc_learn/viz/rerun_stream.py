@@ -233,7 +233,6 @@ def tab_view(tab: Tab, span: tuple[float, float] | None = None) -> rrb.Grid:
     return rrb.Grid(
         contents=[plot_view(plot, span) for plot in tab.plots],
         grid_columns=columns,
-        row_shares=[plot.height for plot in tab.plots[::columns]],
         name=tab.title,
     )
 

@@ -165,12 +165,12 @@ class RunStream:
             self._send_region(run, run.active_region, first)
         if run.camera is not None:
             self._camera.send_overlays(time, run.camera, at, ends)
-        for tab in run_tabs(run):
-            for plot in tab.plots:
-                for curves in plot.curves:
-                    self._still.send(curves.path, style(curves), key=curves.names)
-                    new = replace(curves, values=curves.values[first:])
-                    send_rows(self._stream, seconds(time[first:]), new)
+        # Plots of the overview show curves of other tabs.
+        plots = [plot for tab in run_tabs(run) for plot in tab.plots]
+        for curves in {c.path: c for plot in plots for c in plot.curves}.values():
+            self._still.send(curves.path, style(curves), key=curves.names)
+            new = replace(curves, values=curves.values[first:])
+            send_rows(self._stream, seconds(time[first:]), new)
 
     def _send_path(self, run: RunRecording, ends: Int[np.ndarray, " ends"]) -> None:
         path, colours = "world/paths/run", [palette.rgba(palette.RUN_ON_DARK)]

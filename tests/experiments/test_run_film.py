@@ -84,12 +84,3 @@ def test_the_distance_of_a_worker_is_told_while_he_is_near():
     run = sample_run(worker_nearest=points)
     assert "distance to the worker: 0.25 m" in labels(run, 10)
     assert not any("worker" in name for name in labels(run, 150))
-
-
-def test_the_edges_of_a_box_are_twelve_and_each_once():
-    box = sample_run().region
-    lines = film._edges(box, palette.BLUE)
-    ends = {frozenset([tuple(line.start), tuple(line.end)]) for line in lines}
-    assert len(ends) == len(lines) == 12
-    lengths = sorted(np.linalg.norm(np.subtract(line.end, line.start)) for line in lines)
-    np.testing.assert_allclose(lengths, np.repeat(np.sort(2 * np.array(box.half_size)), 4))

@@ -48,24 +48,24 @@ def test_legends_name_each_curve():
     assert first == {"position", "demonstration", "lower limit", "upper limit"}
 
 
-def test_the_story_shows_what_other_tabs_show_in_detail():
-    run = sample_run()
-    shown = curves(run_tabs(run))
-    np.testing.assert_array_equal(shown["story/error"].values, shown["camera/error"].values)
-    np.testing.assert_allclose(
-        shown["story/effort"].values[:, 0], np.abs(run.nullspace_input).max(axis=1)
-    )
-    np.testing.assert_array_equal(
-        shown["story/distance"].values[:, 0], shown["worker/distance"].values[:, 0]
-    )
-    bare = sample_run(camera=None, nullspace_input=None, position_deviation=None)
-    assert [plot.title for plot in run_tabs(bare)[0].plots] == [
-        "Worker: distance from the robot [mm]"
+def test_the_story_shows_one_plot_of_each_topic():
+    story, *others = run_tabs(sample_run())
+    assert [plot.curves[0].path for plot in story.plots] == [
+        "camera/error",
+        "person/effort",
+        "person/position_deviation",
+        "worker/distance",
     ]
+    details = curves(others)
+    for path, shown in curves([story]).items():
+        np.testing.assert_array_equal(shown.values, details[path].values)
+    bare = sample_run(camera=None, nullspace_input=None, position_deviation=None)
+    (plot,) = run_tabs(bare)[0].plots
+    assert plot.title == "Distance of the worker from the robot and its load [mm]"
 
 
 def test_each_curve_has_a_name_a_colour_and_a_path():
-    tabs = run_tabs(sample_run())
+    _, *tabs = run_tabs(sample_run())
     every = [c for tab in tabs for plot in tab.plots for c in plot.curves]
     assert len({c.path for c in every}) == len(every)
     for c in every:
