@@ -11,7 +11,6 @@ from hrc_learn.experiments import run_recorder as film
 from hrc_learn.experiments.run_recorder import caption, frames
 from hrc_learn.log import Event
 from hrc_learn.sim import RenderingUnavailableError
-from hrc_learn.viz import palette
 
 
 @pytest.fixture(autouse=True)
