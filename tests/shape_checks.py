@@ -12,7 +12,7 @@ from typing import Any
 import beartype
 import jaxtyping
 
-_MOST = 500
+_MOST = 100
 _calls = 0
 
 
