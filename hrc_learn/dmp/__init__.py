@@ -3,7 +3,6 @@
 from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp import orientation_error as orientation_error
 from hrc_learn.dmp.closed_loop_step import DMPState as DMPState
-from hrc_learn.dmp.closed_loop_step import continue_motion as continue_motion
 from hrc_learn.dmp.dynamics import ExponentialPhase as ExponentialPhase
 from hrc_learn.dmp.dynamics import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.dynamics import PeriodicBasis as PeriodicBasis
@@ -40,7 +39,8 @@ from hrc_learn.dmp.response import response_of as response_of
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_orientation as fit_rhythmic_orientation
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_pose as fit_rhythmic_pose
-from hrc_learn.dmp.ridge import fit_ridge as fit_ridge
 from hrc_learn.dmp.samples import FitReport as FitReport
+from hrc_learn.dmp.solvers import fit_ridge as fit_ridge
 from hrc_learn.dmp.stepper import Stepper as Stepper
+from hrc_learn.dmp.trajectory import ContinuedTrajectory as ContinuedTrajectory
 from hrc_learn.dmp.trajectory import Trajectory as Trajectory

@@ -1,4 +1,4 @@
-"""State of a primitive in closed loop, its exact step, and motions continued under way.
+"""State of a primitive in closed loop, and its exact step.
 
 The equation is linear, so each coupling term has a particular motion that solves it alone and
 is known at both ends of a step. The difference between the state and the sum of these motions
@@ -255,60 +255,3 @@ def host_value(time: Tensor) -> Tensor | float:
         return time
     # Reading from another device would wait for all work queued there.
     return time.item() if time.is_cpu else time
-
-
-def continue_motion(
-    response: Response,
-    weights: Float[Tensor, "*batch D N"],
-    goal: Float[Tensor, "*batch D"],
-    position: Float[Tensor, "*batch D"],
-    velocity: Float[Tensor, "*batch D"],
-    *,
-    duration: Float[Tensor, "*batch"],
-    elapsed: Float[Tensor, "*batch"],
-    time: Float[Tensor, "*batch T"],
-) -> tuple[Float[Tensor, "*batch T D"], Float[Tensor, "*batch T D"]]:
-    """Continue from a position and a velocity with given weights and goal.
-
-    x(s) = F(s) w + (g, 0) + E(s - s_0) [x(s_0) - F(s_0) w - (g, 0)],   x = (y, y')
-
-    F is the response to the weights from rest at the goal and E the transition matrix of the
-    unforced spring, so the motion is exact, linear in (w, g, x(s_0)), and starts with the given
-    position and velocity. From s_0 = 0 it is `JointDMP.rollout`; from a later state of a
-    motion, the remainder of that motion. Gradients flow to all arguments.
-
-    Args:
-        response: Response of the primitive, without approach.
-        weights: Weights of the unscaled forcing term.
-        goal: g.
-        position: Current position.
-        velocity: Current velocity [1/s].
-        duration: tau [s] of the whole motion.
-        elapsed: Time since the start of the motion [s].
-        time: Times from now on [s], not negative.
-
-    Returns:
-        Position, and velocity [1/s], at those times.
-
-    Raises:
-        ValueError: The response has an approach.
-    """
-    if response.approach:
-        raise ValueError(
-            "a motion can be continued only with approach=0: it needs no start then"
-        )
-    tau, g = duration.double(), goal.double()
-    now = (elapsed.double() / tau)[..., None]
-    ahead = time.double() / tau[..., None]
-    # From rest at the goal.
-    ends = torch.stack([torch.zeros_like(g), g, g], dim=-1)
-    x = torch.cat([weights.double(), ends], dim=-1)
-
-    def moved(s: Tensor) -> Float[Tensor, "*batch S 2 D"]:
-        H = response.evaluate(s)[..., :2, :]
-        return (H.flatten(-3, -2) @ x.mT).unflatten(-2, (-1, 2))
-
-    state = torch.stack([position.double(), velocity.double() * tau[..., None]], dim=-2)
-    offset = state[..., None, :, :] - moved(now)
-    y, rate = (moved(now + ahead) + response.spring.propagator(ahead) @ offset).unbind(-2)
-    return y.to(weights), (rate / tau[..., None, None]).to(weights)

@@ -32,11 +32,10 @@ from hrc_learn.dmp._arguments import (
     to_tensor,
 )
 from hrc_learn.dmp.dynamics import GaussianBasis, SpringDamper, balanced_units
-from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.probabilistic_dmp import log_density
+from hrc_learn.dmp.probabilistic_dmp import gaussian
 from hrc_learn.dmp.ragged_times import spring_rows
 from hrc_learn.dmp.response import Response, response_of
-from hrc_learn.dmp.trajectory import Trajectory, output
+from hrc_learn.dmp.trajectory import ContinuedTrajectory, output
 
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function at which the modes of a motion are computed."""
@@ -163,32 +162,6 @@ class MotionHead(nn.Module):
         s, waiting = self._normalised(time, plan)
         return PlannedTrajectory(plan, s, waiting, self.response)
 
-    def primitive(
-        self,
-        parameters: Float[Tensor, "*batch P"],
-        start: Vectors,
-        start_velocity: Vectors | None = None,
-        *,
-        samples: int = 101,
-    ) -> JointDMP:
-        """Motion after its delay as a primitive, for steps, via points, files and export.
-
-        Args:
-            parameters: Parameters from a network.
-            start: (*batch, D).
-            start_velocity: Per second, (*batch, D).
-            samples: Number of samples of its default rollout.
-        """
-        plan = self._plan(parameters, start, start_velocity, None, None)
-        x, batch = plan.coordinates, plan.coordinates.shape[:-2]
-        return JointDMP.from_coordinates(
-            x,
-            plan.duration.expand(batch),
-            self.amplitude.to(x).expand(*batch, -1),
-            torch.linspace(0, 1, samples).to(x),
-            self.response,
-        )
-
     def distribution(
         self,
         parameters: Float[Tensor, "*batch P"],
@@ -310,13 +283,11 @@ class MotionHead(nn.Module):
         finite("parameters", parameters)
         linear = parameters[..., : self.n_linear].unflatten(-1, (self.columns, -1))
         like = linear[..., 0]
-        start = checked_vector("start", start, like)
-        rate = torch.zeros_like(start)
+        first = start = checked_vector("start", start, like)
+        velocity = torch.zeros_like(start)
         duration, delay = self._timing(parameters)
         if start_velocity is not None:
             velocity = checked_vector("start_velocity", start_velocity, like)
-            rate = velocity * duration[..., None]
-        first = start
         if origin is not None:
             if since is None:
                 raise ValueError("origin belongs to a motion that continues: give since too")
@@ -325,22 +296,18 @@ class MotionHead(nn.Module):
         centre = first if self.goal_centre is None else self.goal_centre.to(linear)
         goal = centre + scaled[..., -1]
         weights = scaled[..., :-1] @ self.modes.to(linear).mT
+        rate = velocity * duration[..., None]
         begun = rate if since is None else torch.zeros_like(rate)
         ends = torch.broadcast_tensors(begun, first, goal)
         weights = weights.expand(*ends[0].shape, -1)
         x = torch.cat([weights, torch.stack(ends, -1)], -1)
         if since is None:
-            return _Plan(x, duration, delay)
+            return _Plan(x, duration, delay, start, velocity)
         now = to_tensor(since, torch.float64, x.device)
         if readable(now) and not ((now >= 0) & (now < math.inf)).all():
             raise ValueError("since must be finite, non-negative seconds since the start")
         s = ((now - delay.double()) / duration.double()).clamp(min=0)
-        reached = Trajectory(
-            coordinates=x, s=s[..., None], duration=duration, response=self.response
-        )
-        off = start - reached.position[..., 0, :]
-        off_rate = rate - reached.velocity[..., 0, :] * duration[..., None]
-        return _Plan(x, duration, delay, s, torch.stack([off, off_rate], -1))
+        return _Plan(x, duration, delay, start, velocity, s)
 
     def _timing(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Duration and delay [s], without a batch axis if they are fixed."""
@@ -393,13 +360,14 @@ class _Plan:
     coordinates: Float[Tensor, "*batch D M"]
     duration: Float[Tensor, "*#batch"]
     delay: Float[Tensor, "*#batch"]
+    position: Float[Tensor, "*#batch D"]
+    velocity: Float[Tensor, "*#batch D"]
+    """Velocity at the position [1/s]."""
     since: Float[Tensor, "*#batch"] | None = None
-    """Normalised time of the state; None at the start."""
-    deviation: Float[Tensor, "*batch D 2"] | None = None
-    """Difference of the state, in y and dy/ds, to the motion of the coordinates."""
+    """Normalised time of this state; None at the start."""
 
 
-class PlannedTrajectory(Trajectory):
+class PlannedTrajectory(ContinuedTrajectory):
     """Motion that may have a delay, or continue from the state of another one."""
 
     def __init__(
@@ -411,11 +379,17 @@ class PlannedTrajectory(Trajectory):
     ):
         """Describe the motion of a plan, at rest while `waiting`."""
         super().__init__(
-            coordinates=plan.coordinates, s=s, duration=plan.duration, response=response
+            coordinates=plan.coordinates,
+            s=s,
+            duration=plan.duration,
+            response=response,
+            since=plan.since,
+            position=plan.position,
+            velocity=plan.velocity,
         )
         self.delay = plan.delay
         """Delay before the motion begins [s]."""
-        self._plan, self._waiting = plan, waiting
+        self._waiting = waiting
 
     @output
     def time(self) -> Float[Tensor, "*batch T"]:
@@ -426,12 +400,6 @@ class PlannedTrajectory(Trajectory):
     @full_precision
     def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
         y = super()._derivative(order)
-        plan = self._plan
-        if plan.deviation is not None:
-            assert plan.since is not None
-            back = spring_rows(self._response, self.s - plan.since[..., None], order)
-            tau = self.duration[..., None, None] ** order
-            y = y + back.to(y) @ (plan.deviation / tau).mT
         if order and self._waiting is not None:
             y = torch.where(self._waiting[..., None], 0.0, y)
         return y
@@ -475,12 +443,9 @@ class MotionDistribution:
             position: (*batch, T, D).
             noise: Standard deviation of each value, independent of the others.
         """
-        mean, root = self._moments(time)
-        y = to_tensor(position, mean.dtype, mean.device)
-        deviation = positive("noise", noise, mean)
-        z = (y - mean).flatten(-2) / deviation
-        size = z.shape[-1] * deviation.log()
-        return log_density(z, root.flatten(-3, -2) / deviation) - size
+        known = self._observed(time, noise)
+        y = to_tensor(position, known.loc.dtype, known.loc.device)
+        return known.log_prob(y.flatten(-2))
 
     def position(self, time: Times) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation at times [s], (*batch, T, D) each."""
@@ -508,9 +473,8 @@ class MotionDistribution:
 
     def _observed(self, time: Times, noise: float) -> LowRankMultivariateNormal:
         mean, root = self._moments(time)
-        mean, root = mean.flatten(-2), root.flatten(-3, -2)
-        variance = (positive("noise", noise, mean) ** 2).expand_as(mean)
-        return LowRankMultivariateNormal(mean, root, variance, validate_args=False)
+        deviation = positive("noise", noise, mean)
+        return gaussian(mean.flatten(-2), root.flatten(-3, -2), deviation)
 
     @full_precision
     def _moments(self, time: Times) -> tuple[Tensor, Tensor]:

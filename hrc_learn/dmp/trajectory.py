@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import broadcast_shapes, full_precision, readable
-from hrc_learn.dmp.ragged_times import motion
+from hrc_learn.dmp.ragged_times import motion, spring_rows
 from hrc_learn.dmp.response import Response, numpy_limit, product
 
 
@@ -163,3 +163,52 @@ class Trajectory(ArrayOutputs):
         return broadcast_shapes(
             self._coordinates.shape[:-2], self.s.shape[:-1], self.duration.shape
         )
+
+
+class ContinuedTrajectory(Trajectory):
+    """Motion that continues from any state; the difference to it decays as the spring does.
+
+    y(s) = H(s) x + E(s - s_0) [state - (H, H')(s_0) x],   E the unforced spring's motion
+
+    The motion is exact, linear in x and the state, and starts with the given position and
+    velocity. From a state of the motion itself, it is the remainder of that motion.
+    """
+
+    def __init__(
+        self,
+        *,
+        coordinates: Float[Tensor, "*#batch D M"],
+        s: Float[Tensor, "*#batch T"],
+        duration: Float[Tensor, "*#batch"],
+        response: Response,
+        since: Float[Tensor, "*#batch"] | None,
+        position: Float[Tensor, "*#batch D"],
+        velocity: Float[Tensor, "*#batch D"],
+    ):
+        """Describe a motion that passes a state; other arguments as for `Trajectory`.
+
+        Args:
+            coordinates: x of the whole motion.
+            s: Normalised times, not before `since`.
+            duration: Duration of the whole motion [s].
+            response: Response of the primitive.
+            since: Normalised time s_0 of the state; None: the motion starts as x does.
+            position: Position at that time.
+            velocity: Velocity there [1/s].
+        """
+        motion: Any = {"coordinates": coordinates, "duration": duration, "response": response}
+        super().__init__(s=s, **motion)
+        self._since = since
+        if since is not None:
+            reached = Trajectory(s=since[..., None], **motion)
+            off = position - reached.position[..., 0, :]
+            off_rate = (velocity - reached.velocity[..., 0, :]) * duration[..., None]
+            self._off = torch.stack([off, off_rate], dim=-1)
+
+    @full_precision
+    def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
+        y = super()._derivative(order)
+        if self._since is None:
+            return y
+        back = spring_rows(self._response, self.s - self._since[..., None], order)
+        return y + back.to(y) @ (self._off / self.duration[..., None, None] ** order).mT

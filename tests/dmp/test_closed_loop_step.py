@@ -10,6 +10,7 @@ from dmp_oracle import solve
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
+    ContinuedTrajectory,
     GaussianBasis,
     JointDMP,
     MovingGoalDMP,
@@ -18,7 +19,6 @@ from hrc_learn.dmp import (
     SplineBasis,
     SpringDamper,
     Stepper,
-    continue_motion,
     response_of,
 )
 from hrc_learn.dmp.closed_loop_step import host_value
@@ -271,12 +271,27 @@ def random_primitive(batch: tuple[int, ...], seed: int = 0) -> JointDMP:
     )
 
 
+def continued(weights, goal, position, velocity, *, duration, elapsed, time):
+    """Position and velocity of a motion from rest at its goal, from another state on."""
+    ends = torch.stack([torch.zeros_like(goal), goal, goal], -1)
+    since = elapsed.double() / duration
+    motion = ContinuedTrajectory(
+        coordinates=torch.cat([weights, ends], -1),
+        s=since[..., None] + time / duration[..., None],
+        duration=duration,
+        response=RESPONSE,
+        since=since,
+        position=position,
+        velocity=velocity,
+    )
+    return motion.position, motion.velocity
+
+
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
 def test_from_the_start_it_is_the_rollout(batch):
     dmp = random_primitive(batch)
     time = torch.linspace(0, 3, 7, dtype=torch.float64)
-    y, v = continue_motion(
-        RESPONSE,
+    y, v = continued(
         dmp.weights,
         dmp.goal,
         dmp.start,
@@ -296,8 +311,7 @@ def test_of_a_motion_left_alone_it_is_what_follows(elapsed):
     dmp = random_primitive((2,), seed=1)
     ahead = torch.linspace(0, 1, 5, dtype=torch.float64)
     cut = dmp.rollout(torch.tensor([elapsed]))
-    y, v = continue_motion(
-        RESPONSE,
+    y, v = continued(
         dmp.weights,
         dmp.goal,
         cut.position[:, 0],
@@ -319,8 +333,7 @@ def test_after_a_push_it_is_what_steps_come_to():
     for _ in range(10):
         state = dmp.step(state, 0.02, coupling=torch.full((3,), 40.0, dtype=torch.float64))
     time = 0.03 * torch.arange(1, 6, dtype=torch.float64)
-    y, v = continue_motion(
-        RESPONSE,
+    y, v = continued(
         dmp.weights,
         dmp.goal,
         state.position,
@@ -347,26 +360,9 @@ def test_gradients_reach_everything():
     )
 
     def motion(w, g, y, v, duration, elapsed):
-        return continue_motion(
-            RESPONSE, w, g, y, v, duration=duration, elapsed=elapsed, time=time
-        )
+        return continued(w, g, y, v, duration=duration, elapsed=elapsed, time=time)
 
     assert torch.autograd.gradcheck(motion, [x.requires_grad_() for x in arguments])
-
-
-def test_an_approach_cannot_be_continued():
-    dmp = random_primitive(())
-    with pytest.raises(ValueError, match="approach=0"):
-        continue_motion(
-            response_of(SpringDamper(), GaussianBasis(count=12), 1.0),
-            dmp.weights,
-            dmp.goal,
-            dmp.start,
-            dmp.start_velocity,
-            duration=dmp.duration,
-            elapsed=dmp.duration,
-            time=dmp.timestamps,
-        )
 
 
 @pytest.mark.parametrize("basis", [GaussianBasis(count=20), SplineBasis(count=20)], ids=str)

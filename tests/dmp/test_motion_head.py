@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from torch.distributions import MultivariateNormal, kl_divergence
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import MotionHead
+from hrc_learn.dmp import JointDMP, MotionHead
 
 HEADS = {
     "fixed": {"duration": 1.5},
@@ -66,14 +66,27 @@ def test_unit_parameters_deviate_by_the_amplitude():
     assert (size.diff() <= 1e-7 * size[0]).all()
 
 
-def test_is_the_primitive_that_it_makes(head):
+def primitive_of(head, z, start, velocity):
+    """The motion after its delay, from the definition of the parameters."""
+    linear = z[..., : head.n_linear].unflatten(-1, (2, -1))
+    weights = head.amplitude[:, None] * linear[..., :-1] @ head.modes.mT
+    centre = start if head.goal_centre is None else head.goal_centre
+    goal = centre + head.goal_scale * linear[..., -1]
+    duration = head(z, TIME, start).duration.expand(len(z))
+    ends = torch.stack([velocity * duration[:, None], start, goal], -1)
+    grid = torch.linspace(0, 1, 11).double()
+    x = torch.cat([weights, ends], -1)
+    return JointDMP.from_coordinates(x, duration, torch.ones_like(start), grid, head.response)
+
+
+def test_is_a_primitive_after_its_delay(head):
     z, start, velocity = (
         random(3, head.n_parameters),
         random(3, 2, seed=1),
         random(3, 2, seed=2),
     )
     motion = head(z, TIME, start, velocity)
-    dmp = head.primitive(z, start, velocity)
+    dmp = primitive_of(head, z, start, velocity)
     since_delay = (TIME - motion.delay[..., None]).clamp(min=0).expand(3, -1)
     alone = dmp.rollout(since_delay)
     torch.testing.assert_close(motion.position, alone.position)
@@ -114,7 +127,7 @@ def test_goes_on_from_any_state_to_another_goal(head):
     bend = (near.velocity[:, 2] - near.velocity[:, 0]) / (2 * h)
     torch.testing.assert_close(near.acceleration[:, 1], bend, atol=1e-5, rtol=1e-5)
     end = head(z, torch.tensor([30.0]).double(), state, rate, since=since)
-    goal = head.primitive(z, state).goal
+    goal = primitive_of(head, z, state, rate).goal
     torch.testing.assert_close(end.position[:, 0], goal, atol=1e-8, rtol=0)
 
 
@@ -317,7 +330,7 @@ def planned(z=None, time=(0.0, 1.0), start=(0.0, 0.0), **state):
 
 COMPILED = """
 import torch
-from hrc_learn.dmp import MotionHead
+from hrc_learn.dmp import JointDMP, MotionHead
 
 t = torch.linspace(0, 2, 30)
 for options in ({}, {"duration": (1.0, 2.0), "delay": 0.3}):

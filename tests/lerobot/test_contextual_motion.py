@@ -6,7 +6,7 @@ import pytest
 import torch
 from lerobot_samples import SampleWindows, reaching, write_dataset
 
-from hrc_learn.dmp import GaussianBasis, SpringDamper, continue_motion, response_of
+from hrc_learn.dmp import GaussianBasis, SpringDamper, Trajectory, response_of
 from hrc_learn.lerobot.policy import policy_base
 from hrc_learn.lerobot.policy.contextual_motion import ContextualMotion, fit_closed_form
 
@@ -61,17 +61,13 @@ def traced(motion, x):
     """A primitive's path at a hundred moments of its own duration, and that."""
     motion.base.data.copy_(x)  # durations count from it
     p = motion.primitives(x[None])
-    time = p.duration[:, None] * torch.linspace(0, 1, 100, dtype=torch.float64)
-    path, _ = continue_motion(
-        motion.response,
-        p.weights,
-        p.goal,
-        p.start,
-        p.start_velocity,
+    rate = p.start_velocity * p.duration[:, None]
+    path = Trajectory(
+        coordinates=torch.cat([p.weights, torch.stack([rate, p.start, p.goal], -1)], -1),
+        s=torch.linspace(0, 1, 100, dtype=torch.float64),
         duration=p.duration,
-        elapsed=torch.zeros(1).double(),
-        time=time,
-    )
+        response=motion.response,
+    ).position
     return path[0].detach(), p.duration.log().detach()
 
 

@@ -29,6 +29,11 @@ class Primitives:
     duration: Float[Tensor, "*batch"]
     """[s]"""
 
+    def from_rest(self) -> Float[Tensor, "*batch A M"]:
+        """Coordinates of the motion that begins at rest at its goal."""
+        ends = torch.stack([torch.zeros_like(self.goal), self.goal, self.goal], dim=-1)
+        return torch.cat([self.weights, ends], dim=-1)
+
 
 class ContextualMotion(nn.Module):
     """Primitives as a function of what is seen.

@@ -20,7 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
-from hrc_learn.dmp import GaussianBasis, SpringDamper, continue_motion, response_of
+from hrc_learn.dmp import ContinuedTrajectory, GaussianBasis, SpringDamper, response_of
 from hrc_learn.lerobot.policy.contextual_motion import (
     ContextualMotion,
     Primitives,
@@ -250,16 +250,18 @@ class DMPPolicy(MotionPolicy):
         """Motion after a state of the episode, by what is seen then."""
         clock = underway.elapsed + underway.lead
         primitives = self._primitives(underway.context, underway.features, seen, clock)
-        return continue_motion(
-            self.motion.response,
-            primitives.weights,
-            primitives.goal,
-            underway.position,
-            underway.velocity,
-            duration=primitives.duration,
-            elapsed=underway.elapsed,
-            time=time,
+        duration = primitives.duration.double()
+        since = underway.elapsed.double() / duration
+        motion = ContinuedTrajectory(
+            coordinates=primitives.from_rest().double(),
+            s=since[:, None] + time.double() / duration[:, None],
+            duration=duration,
+            response=self.motion.response,
+            since=since,
+            position=underway.position.double(),
+            velocity=underway.velocity.double(),
         )
+        return motion.position.to(time), motion.velocity.to(time)
 
     def _primitives(
         self, context: Tensor, first_seen: Tensor, seen: Tensor, clock: Tensor
