@@ -250,7 +250,7 @@ def _exported(package: Path, observation: WantedVelocity) -> _Filter:
     runner = PackageRunner(package)
     runner.observe(observation)
     runner.start(runner.observation["joint_position"])
-    excess = runner.command("safety.speed_excess")
+    excess = runner.command["safety.speed_excess"]
 
     def send(q: Tensor, u: Tensor, dt: float) -> tuple[Tensor, int]:
         runner.observation["joint_position"][:] = q.numpy()

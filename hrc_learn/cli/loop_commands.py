@@ -246,7 +246,7 @@ def serve(args: Serve) -> None:
         steps = round(duration * args.rate)
         measured = _run_serve(runner, arm, robot.chain, camera, dt, steps)
     figures = {"open_s": opened} | measured
-    counts = runner.state("safety.counts")
+    counts = runner.state["safety.counts"]
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
     _report(args, figures)
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
@@ -148,10 +149,10 @@ class IOLayout:
             [row for part in rows for row in range(part.start, part.stop)]
         ).long()
 
-    def arrays(self, vector: Float[Tensor, "rows *batch"]) -> dict[str, np.ndarray]:
+    def arrays(self, vector: Float[Tensor, "rows *batch"]) -> Mapping[str, np.ndarray]:
         """Views of a vector by field name, for reading and writing."""
         views = zip(self.rows, self.views(vector), strict=True)
-        return {name: view.numpy() for name, view in views}
+        return MappingProxyType({name: view.numpy() for name, view in views})
 
 
 class Vectors(NamedTuple):
@@ -240,18 +241,6 @@ CODE, DESCRIPTION = "step.o", "step.json"
 """Files of a compiled step: machine code, and the metadata as one JSON object."""
 
 
-@dataclass(frozen=True)
-class Package:
-    """A loaded compiled step."""
-
-    run: Callable[[list[Tensor]], object]
-    """Function of the three vectors that updates state and command in place."""
-    layouts: StepLayouts
-    """Layouts of the vectors."""
-    first_state: Tensor
-    """State vector of an arm at rest in its ready posture."""
-
-
 def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
     """Metadata of a package, as text that any language can read.
 
@@ -275,8 +264,12 @@ def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
     }
 
 
-def load(path: Path) -> Package:
+def load(path: Path) -> tuple[Callable[[list[Tensor]], object], StepLayouts, Tensor]:
     """Load the machine code of `export_step`.
+
+    Returns:
+        Function of the three vectors that updates state and command in place; layouts of the
+        vectors; and the state vector of an arm at rest in its ready posture.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -300,7 +293,7 @@ def load(path: Path) -> Package:
     shared = [layout.shared_rows() for layout in layouts[:2]] if batch else []
     run = NativeStep(path.read_bytes(), *sizes, shared)
     first = torch.tensor([float(x) for x in metadata[_STATE].split()], dtype=dtype)
-    return Package(run=run, layouts=layouts, first_state=first.reshape((-1, *batch)))
+    return run, layouts, first.reshape((-1, *batch))
 
 
 def _layouts(metadata: Mapping[str, str]) -> StepLayouts:

@@ -38,7 +38,11 @@ class StepRunner:
     Attributes:
         observation: Arrays that the step reads, by field, for example "joint_position" or
             "goals.vision.target"; flags are 0 or 1.
-        joint_velocity: Command of the last step [rad/s]; overwritten by the next.
+        state: Fields of the state, for example "safety.counts"; write into one for example
+            after an arm ignored a command.
+        command: Fields of the last command, for example "xi_x" or "safety.flags"; overwritten
+            by the next step.
+        joint_velocity: That field of the command [rad/s].
     """
 
     def __init__(
@@ -59,10 +63,10 @@ class StepRunner:
         self._vectors = Vectors(*(layout.empty() for layout in layouts))
         self._vectors.state.copy_(first_state)
         self._arguments = list(self._vectors)
-        self._state = layouts.state.arrays(self._vectors.state)
-        self._command = layouts.command.arrays(self._vectors.command)
-        self.observation = layouts.observation.arrays(self._vectors.observation)
-        self.joint_velocity: _Joints = self._command["joint_velocity"]
+        self.state, self.observation, self.command = (
+            layout.arrays(vector) for layout, vector in zip(layouts, self._vectors, strict=True)
+        )
+        self.joint_velocity: _Joints = self.command["joint_velocity"]
 
     def start(
         self,
@@ -85,8 +89,8 @@ class StepRunner:
             "safety.acceleration": joint_acceleration,
         }
         for field, value in known.items():
-            if value is not None and field in self._state:
-                self._state[field][...] = value
+            if value is not None and field in self.state:
+                self.state[field][...] = value
 
     def step(self) -> _Joints:
         """Take one step with the values in `observation`.
@@ -102,30 +106,6 @@ class StepRunner:
         vector = self._layouts.observation.pack(tensors_of(observation))
         self._vectors.observation.copy_(vector)
 
-    def command(self, field: str) -> np.ndarray:
-        """One field of the last command, for example "xi_x" or "safety.flags".
-
-        Raises:
-            ValueError: There is no such field.
-        """
-        return _named(field, self._command)
-
-    def state(self, field: str) -> np.ndarray:
-        """One field of the state, for example "safety.counts".
-
-        Raises:
-            ValueError: There is no such field.
-        """
-        return _named(field, self._state)
-
-    def set_state(self, field: str, value: Float[np.ndarray, "..."]) -> None:
-        """Replace one field of the state, for example after an arm ignored a command.
-
-        Raises:
-            ValueError: There is no such field.
-        """
-        _named(field, self._state)[...] = value
-
 
 @final
 class PackageRunner(StepRunner):
@@ -139,8 +119,7 @@ class PackageRunner(StepRunner):
             ValueError: This library did not write the file, it has changed since, or it was
                 written for another machine.
         """
-        loaded = load(package)
-        super().__init__(loaded.run, loaded.layouts, loaded.first_state)
+        super().__init__(*load(package))
 
 
 @final
@@ -157,12 +136,6 @@ class EagerRunner(StepRunner):
     @torch.inference_mode()
     def _run_eagerly(self, vectors: list[torch.Tensor]) -> None:
         self._packed(*vectors)
-
-
-def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    if field not in arrays:
-        raise ValueError(f"no field {field!r}; there are {', '.join(arrays)}")
-    return arrays[field]
 
 
 def open_step(

@@ -323,8 +323,8 @@ class ControlLoop:
         """Go on from what the box has where it has not got the last answer."""
         reported, acceleration = np.array(state.dq_d), np.array(state.ddq_d)
         if answer_was_lost(reported, acceleration, self._reported, self._sent):
-            self._runner.set_state("safety.velocity", reported)
-            self._runner.set_state("safety.acceleration", np.nan_to_num(acceleration))
+            self._runner.state["safety.velocity"][:] = reported
+            self._runner.state["safety.acceleration"][:] = np.nan_to_num(acceleration)
         self._reported = reported
 
     def _note(self, state: Any) -> None:

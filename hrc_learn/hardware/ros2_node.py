@@ -368,7 +368,7 @@ class ControllerNode:
     def _counts(self) -> dict[str, float]:
         """Steps in which each limit of the safety filter acted."""
         counts = (
-            self._runner.state("safety.counts").tolist() if hasattr(self, "_runner") else ()
+            self._runner.state["safety.counts"].tolist() if hasattr(self, "_runner") else ()
         )
         return {str(k): v for k, v in zip(INTERVENTIONS, counts, strict=False)}
 

@@ -122,7 +122,7 @@ class TestBatch:
 
     def test_it_equals_the_eager_step(self, package):
         controller, observation = controller_and_observation(panda.ready.expand(ARMS, 7))
-        assert_equal_steps(controller, observation, load(package).run, 250)
+        assert_equal_steps(controller, observation, load(package)[0], 250)
 
     def test_it_equals_the_eager_step_in_closed_loop(self, package):
         """Each step may add 1e-12 rad/s to the difference."""

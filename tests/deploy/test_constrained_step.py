@@ -74,8 +74,8 @@ def test_it_does_what_the_eager_one_does(observed, tmp_path: Path):
         for name in ("slowed", "violation", "solved"):
             field = f"safety.constraints.{name}"
             np.testing.assert_allclose(
-                compiled.command(field), eager.command(field), rtol=0, atol=1e-7
+                compiled.command[field], eager.command[field], rtol=0, atol=1e-7
             )
-        bound += bool(eager.command("safety.constraints.slowed") > 0.01)
+        bound += bool(eager.command["safety.constraints.slowed"] > 0.01)
         q = q + 0.002 * before
     assert bound > 50
