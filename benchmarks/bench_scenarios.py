@@ -30,7 +30,7 @@ from hrc_learn.dmp import (
     PoseDMP,
     ProbabilisticDMP,
 )
-from hrc_learn.dmp.coupling import offset_error, steering, velocity_coupling
+from hrc_learn.dmp.coupling import steering, velocity_coupling
 from hrc_learn.dmp.learned_motion import choose
 from hrc_learn.geometry import quaternion
 
@@ -188,7 +188,7 @@ def our_coupling() -> float:
     wanted = torch.tensor([0.5], dtype=F64)
     for _ in range(2000):
         (lead, follow), (v, w) = state.position[:, None], state.velocity[:, None]
-        error, rate = offset_error(lead, v, follow, w, wanted)
+        error, rate = wanted - (follow - lead), v - w
         push = velocity_coupling(
             gain * error, gain * rate, spring=dmp.spring, duration=state.duration
         )

@@ -1,8 +1,7 @@
 """Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
 `step` takes their results as `phase_stopping` or as `coupling`. Obstacles are given by points
-on their surfaces, the nearest of each, so that the terms need no shapes; see
-`nearest_on_sphere`.
+on their surfaces, the nearest of each, so that the terms need no shapes.
 
 Forces and the distance to a second arm act on the velocity (Gams et al. 2014, "Coupling
 movement primitives: interaction with the environment and bimanual tasks"). The spring opposes a
@@ -15,6 +14,9 @@ force still pulls: at rest, feedback alone leaves 1 / (1 + K gain) of the error,
 beta on a contact of stiffness k, 2 tau / beta between two arms. The feedback of one repetition
 as feed-forward of the next reduces it by the same factor again. A coupling is constant over
 each step, which is of first order in its length.
+
+Two arms keep an offset, error = wanted - (other - position), if one is coupled to minus the
+error and the other to plus that. To follow a leader, one arm takes the whole error.
 """
 
 import torch
@@ -106,20 +108,6 @@ def repulsion(
     return (strength * away / d).sum(-2)
 
 
-def nearest_on_sphere(
-    position: Float[Tensor, "*#batch 3"],
-    centre: Float[Tensor, "*#batch 3"],
-    radius: Float[Tensor, "*#batch"] | float,
-) -> Float[Tensor, "*batch 3"]:
-    """Point of a solid sphere nearest to `position` [m]; inside, `position` itself."""
-    offset = position - centre
-    distance = offset.norm(dim=-1, keepdim=True)
-    limit = radius[..., None] if isinstance(radius, Tensor) else radius
-    # The centre has no direction; it is inside and stays in place.
-    inwards = (limit / distance.clamp_min(torch.finfo(distance.dtype).tiny)).clamp_max(1)
-    return centre + offset * inwards
-
-
 def velocity_coupling(
     velocity: Float[Tensor, "*#batch D"],
     acceleration: Float[Tensor, "*#batch D"],
@@ -142,25 +130,3 @@ def velocity_coupling(
             damping.
     """
     return spring.alpha / duration[..., None] * velocity + (1 + lead) * acceleration
-
-
-def offset_error(
-    position: Float[Tensor, "*#batch D"],
-    velocity: Float[Tensor, "*#batch D"],
-    other: Float[Tensor, "*#batch D"],
-    other_velocity: Float[Tensor, "*#batch D"],
-    wanted: Float[Tensor, "*#batch D"],
-) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D"]]:
-    """Wanted minus actual offset, other - position, and its rate.
-
-    Two arms keep their offset if one is coupled to minus gain * error and the other to plus
-    that; to follow a leader, one arm takes the whole error.
-
-    Args:
-        position: Position of the first arm [m].
-        velocity: Velocity of the first arm [m/s].
-        other: Position of the second arm [m], which plus the error moves.
-        other_velocity: Velocity of the second arm [m/s].
-        wanted: Offset to keep.
-    """
-    return wanted - (other - position), velocity - other_velocity

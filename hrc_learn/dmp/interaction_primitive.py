@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._arguments import Points, Times, positive, to_tensor
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, log_density
+from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, gaussian
 from hrc_learn.dmp.samples import padded
 
 DURATIONS = 31
@@ -118,12 +118,12 @@ class InteractionPrimitive:
             )
         if values.isnan().all():
             raise ValueError("no value of the person was observed")
-        positive("noise", noise, values)
+        deviation = positive("noise", noise, values)
         steps = torch.linspace(-3, 3, DURATIONS, dtype=torch.float64)
         duration = (self.log_duration[:, :1] + self.log_duration[:, 1:] * steps).exp()
         likelihood = torch.stack(
             [
-                self._log_likelihood(model, seen_at / tau[:, None], values, noise)
+                self._log_likelihood(model, seen_at / tau[:, None], values, deviation)
                 for model, tau in zip(self.models, duration, strict=True)
             ]
         )
@@ -152,15 +152,16 @@ class InteractionPrimitive:
         model: ProbabilisticDMP[JointDMP],
         s: Float[Tensor, "G n"],
         values: Float[Tensor, "n H"],
-        noise: float,
+        noise: Tensor,
     ) -> Float[Tensor, "G"]:
         """Log density of the observation for the normalised times of each duration."""
         rows = model.primitive.response.evaluate(s)[:, :, 0]
         mean = rows @ model.mean[: self.observed].mT
         spread = model.spread.view(*model.mean.shape, -1)[: self.observed]
         seen = ~values.isnan().flatten()
-        root = torch.einsum("gnm,hmr->gnhr", rows, spread).flatten(1, 2)[:, seen] / noise
-        return log_density(((values - mean).flatten(1)[:, seen]) / noise, root)
+        root = torch.einsum("gnm,hmr->gnhr", rows, spread).flatten(1, 2)[:, seen]
+        known = gaussian(mean.flatten(1)[:, seen], root, noise)
+        return known.log_prob(values.flatten()[seen])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

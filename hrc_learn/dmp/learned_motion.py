@@ -31,7 +31,7 @@ from hrc_learn.dmp.probabilistic_dmp import (
     mean_primitive,
     with_common_reference,
 )
-from hrc_learn.dmp.ridge import fit_ridge
+from hrc_learn.dmp.solvers import fit_ridge
 from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel, write_model
 

@@ -4,7 +4,6 @@ Orientations and poses move linearly in columns, so everything is computed on th
 their `motion`.
 """
 
-import math
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -376,8 +375,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         mean, root = self._observe(self.primitive.motion.response.evaluate(s)[:, 0])
         lasting = self.primitive.motion.duration.double().log().reshape(1)
         mean, root = torch.cat([mean, lasting]), torch.cat([root, self.timing[None]])
-        variance = positive("noise", noise, mean) ** 2
-        return LowRankMultivariateNormal(mean, root, variance.expand(len(mean)))
+        return gaussian(mean, root, positive("noise", noise, mean))
 
     def entropy(self, noise: float) -> Float[Tensor, ""]:
         """Entropy of motion and duration observed with this noise; see `observed`."""
@@ -408,8 +406,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         motion = self.primitive.motion
         mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])
         seen = ~via.position.isnan().reshape(-1)
-        z = (via.position.reshape(-1) - mean)[seen] / deviation
-        return log_density(z, root[seen] / deviation) - len(z) * deviation.log()
+        values = via.position.reshape(-1)[seen]
+        return gaussian(mean[seen], root[seen], deviation).log_prob(values)
 
     def _via(
         self,
@@ -484,15 +482,13 @@ def gaussians_of_modes[P: MotionPrimitive](
     ]
 
 
-def log_density(
-    z: Float[Tensor, "*batch n"], root: Float[Tensor, "*batch n rank"]
-) -> Float[Tensor, "*batch"]:
-    """Log density of a Gaussian with covariance I + root root', by Woodbury's identity."""
-    factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
-    part = torch.linalg.solve_triangular(factor, root.mT @ z[..., None], upper=False)
-    square = z.square().sum(-1) - part.square().sum((-2, -1))
-    size = z.shape[-1] * math.log(2 * math.pi)
-    return -(square + size) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+def gaussian(
+    mean: Float[Tensor, "*batch n"], root: Float[Tensor, "*batch n rank"], noise: Tensor
+) -> LowRankMultivariateNormal:
+    """Gaussian with covariance root root' + noise^2 I."""
+    return LowRankMultivariateNormal(
+        mean, root, noise.square().expand_as(mean), validate_args=False
+    )
 
 
 def _element(options: Any, index: int) -> dict[str, Any]:

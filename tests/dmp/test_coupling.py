@@ -4,7 +4,6 @@ from demo_motions import minimum_jerk
 
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.coupling import (
-    nearest_on_sphere,
     phase_stopping,
     repulsion,
     steering,
@@ -89,17 +88,6 @@ def test_repulsion_is_the_gradient_of_its_potential():
     (gradient,) = torch.autograd.grad(potential.sum(), position)
     torch.testing.assert_close(repulsion(position, obstacles, reach=0.4), -gradient)
     assert (gradient == 0).any(dim=-1).any()
-
-
-def test_nearest_points_lie_on_the_obstacle():
-    rng = torch.Generator().manual_seed(0)
-    position = 2 * torch.randn(200, 3, generator=rng, dtype=torch.float64)
-    centre = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
-    on_sphere = nearest_on_sphere(position, centre, 0.7)
-    outside = (position - centre).norm(dim=-1) > 0.7
-    radii = (on_sphere - centre).norm(dim=-1)
-    torch.testing.assert_close(radii[outside], torch.full_like(radii[outside], 0.7))
-    torch.testing.assert_close(on_sphere[~outside], position[~outside])
 
 
 def test_a_held_robot_is_waited_for():

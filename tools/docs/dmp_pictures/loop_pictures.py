@@ -9,8 +9,6 @@ from matplotlib.patches import Circle
 
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.coupling import (
-    nearest_on_sphere,
-    offset_error,
     phase_stopping,
     repulsion,
     steering,
@@ -102,7 +100,8 @@ def obstacles(figure: Figure) -> None:
         return {"coupling": steering(state.position, state.velocity, ball[None], **away)}
 
     def repel(_now: float, state) -> dict:
-        near = nearest_on_sphere(state.position, ball, radius)[None]
+        away = state.position - ball
+        near = (ball + away * (radius / away.norm()).clamp_max(1))[None]
         return {"coupling": repulsion(state.position, near, reach=0.1, gain=1e-4)}
 
     for axes, change, title in zip(
@@ -168,7 +167,7 @@ def _carry(axes) -> None:
 
     def change(_now: float, state) -> dict:
         position, velocity = state.position, state.velocity
-        error, rate = offset_error(position[0], velocity[0], position[1], velocity[1], offset)
+        error, rate = offset - (position[1] - position[0]), velocity[0] - velocity[1]
         pair = torch.stack([-error, error]), torch.stack([-rate, rate])
         push = velocity_coupling(
             15 * pair[0], 15 * pair[1], spring=dmp.spring, duration=state.duration
