@@ -115,6 +115,16 @@ def test_the_null_space_gives_way_by_as_little_as_lets_the_task_go_on():
     assert compromises > 5
 
 
+def test_bounds_that_exclude_each_other_are_exceeded_alike():
+    """Joints 1 and 2 move against each other in the null space, and both have to give way."""
+    J = torch.eye(7, dtype=torch.float64)[1:]
+    J[0, 0] = 1.0  # the null space is along (1, -1, 0, ...)
+    task = torch.tensor([1.0, 0.6, 0, 0, 0, 0, 0], dtype=torch.float64)
+    upper = torch.full((7,), 0.5, dtype=torch.float64)
+    result = null_space_giving_way(J, task, torch.zeros_like(task), -upper, upper)
+    torch.testing.assert_close(task + result, task.new_tensor([0.8, 0.8, 0, 0, 0, 0, 0]))
+
+
 def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
     q, task = panda.ready, torch.zeros(7, dtype=torch.float64)
     null = self_motion(q, 0.5)

@@ -10,6 +10,7 @@ from cakes import KIND, cake, contents, fill
 from hrc_learn.store import (
     MADE_BY,
     MANIFEST,
+    Kind,
     delete_files,
     new_folder,
     replacing,
@@ -79,6 +80,20 @@ def test_files_of_other_origin_are_carried_over_on_request(
         assert contents(tmp_path) == cake(text) | own
     with pytest.raises(FileExistsError, match="link and 2 more"):
         fill(out, "last", overwrite=True)
+
+
+@pytest.mark.parametrize("made", ["", "extra", "extra/own"])
+def test_foreign_folders_are_carried_over_whatever_the_new_folder_has(tmp_path, made):
+    """Also out of a folder that we wrote once and no longer write."""
+    out, plain = tmp_path / "out", Kind(name="plain")
+    with replacing(out, plain) as folder:
+        (folder / "extra").mkdir(parents=True)
+    (out / "extra" / "own" / "empty").mkdir(parents=True)
+    (out / "extra" / "own" / "mine").write_text("years")
+    with replacing(out, plain, overwrite=True, others="keep") as folder:
+        (folder / made).mkdir(parents=True)
+    assert contents(tmp_path) == {"out/extra/own/mine": "years"}
+    assert (out / "extra" / "own" / "empty").is_dir()
 
 
 def test_a_foreign_file_whose_name_is_taken_is_kept_aside(tmp_path):

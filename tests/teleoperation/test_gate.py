@@ -199,6 +199,17 @@ def test_hands_are_understood():
         session_message(json.dumps({"type": "hands", "grips": [turned]}))
 
 
+@pytest.mark.parametrize("length", [0.998, 0.9995, 1.0005, 1.002])
+def test_orientations_are_unit_quaternions_to_single_precision(length):
+    end = {"hand": "right", "joint": None, "start": [0, 0, 0], "pointer": [0, 0, 1]}
+    raw = json.dumps({"type": "hands", "grips": [end | {"orientation": [0, length, 0, 0]}]})
+    if abs(length - 1) < 1e-3:
+        assert session_message(raw).grips[0].orientation[1] == length
+    else:
+        with pytest.raises(MessageError, match="unit quaternion"):
+            session_message(raw)
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_no_number_is_let_through_that_is_none(number):
     import msgspec
