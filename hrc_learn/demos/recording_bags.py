@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.recording_files import Field, Recording, array_field
+from hrc_learn.demos.recording_files import Field, Recording, array_field, longest_hold
 from hrc_learn.demos.recording_messages import (
     TOOL,
     Messages,
@@ -27,8 +27,6 @@ from hrc_learn.demos.recording_messages import (
     stamp_of,
 )
 
-_STALE, _PERIODS = 0.2, 3.0
-"""A topic that is silent for longer than this time [s] and number of its periods has a gap."""
 _SHORTEST = 0.5
 """Parts between gaps that are shorter are left out [s]."""
 _SAME_CLOCK = 0.5
@@ -280,7 +278,7 @@ def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
     steps = np.diff(time)
     if not len(steps):
         return [(-np.inf, np.inf)]
-    wide = np.flatnonzero(steps > max(_STALE, _PERIODS * float(np.median(steps))))
+    wide = np.flatnonzero(steps > longest_hold(time))
     return [(float(time[k]), float(time[k + 1])) for k in wide]
 
 

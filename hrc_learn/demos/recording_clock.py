@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from hrc_learn.demos.read.units import unit_factor
-from hrc_learn.demos.recording_files import Recording, is_time, time_unit_in
+from hrc_learn.demos.recording_files import Recording, is_time, longest_hold, time_unit_in
 from hrc_learn.demos.recording_meaning import Meaning
 from hrc_learn.demos.recording_names import ImportOptions
 
@@ -15,12 +15,8 @@ _EPOCH = (1e9, 3e9)
 """Stamps that count from 1970, in the years 2001 to 2065 [s]."""
 _STEPS = (1 / 1500, 0.5)
 """Plausible steps between stamps [s]: 2 Hz to 1.5 kHz."""
-_STALE = 0.2
-"""Age above which a held value no longer counts as measured [s], or three of its periods."""
 _JUMP = 10.0
 """Gap between stamps that is reported, as a multiple of the usual one."""
-
-
 _FASTER = 1.5
 """States per image from which states of topics are thinned to the images."""
 
@@ -59,9 +55,7 @@ def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOption
         silent = np.flatnonzero(frames[name][start:stop] < 0)
         if len(silent):
             at = time[start + silent[0]] - time[0]
-            text = (
-                f"is silent for more than {_STALE} s at {at:.2f} s: split the recording there"
-            )
+            text = f"is silent for too long at {at:.2f} s: split the recording there"
             raise recording.error(text, name)
     if partial:
         cut = len(time) - (stop - start)
@@ -190,6 +184,5 @@ def _latest(
         raise recording.error(f"{text}, and no stamps are its own", name)
     # The tolerance is for stamps that were rounded.
     index = np.searchsorted(stamps, time + 1e-6, side="right") - 1
-    usual = float(np.median(np.diff(stamps))) if length > 1 else 0.0
-    old = time - stamps[np.maximum(index, 0)] > max(_STALE, 3 * usual)
+    old = time - stamps[np.maximum(index, 0)] > longest_hold(stamps)
     return np.where(old, -1, index)

@@ -1,7 +1,7 @@
 """Recordings as fields whose frames are read when they are used, and their episodes."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float64, Shaped
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import column_places
@@ -134,6 +134,11 @@ class Recording:
         return min(stamps, key=rank, default="")
 
 
+def longest_hold(stamps: Float64[np.ndarray, " frames"]) -> float:
+    """Age up to which a value counts as measured [s]: 0.2 s, or three of its periods."""
+    return max(0.2, 3 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.2
+
+
 def unit_in_words(unit: str) -> str:
     """Unit in the words of `read.units`, from one that a file declares."""
     plain = unit.strip()
@@ -171,7 +176,8 @@ def make_field(
     sides = shape[1:3] if shape[3:4] in ((1,), (3,), (4,)) else shape[-2:]
     large = axes >= 3 and min(sides) >= _SMALLEST_IMAGE
     if dtype.kind in "SUOT":
-        kind = "text"
+        shape = shape[:1]
+        kind = "encoded" if dtype.kind == "O" and is_encoded(read(0, 1)[0]) else "text"
     elif numeric and large and "depth" in name.lower():
         kind = "depth"
     elif numeric and large and (axes == 4 or (axes == 3 and dtype == np.uint8)):
@@ -216,20 +222,13 @@ class StreamRead:
 
 def is_encoded(content: Any) -> bool:
     """True if the bytes begin as a JPEG or PNG file does."""
-    data = content if isinstance(content, bytes) else np.asarray(content)[:4].tobytes()
+    data = content if isinstance(content, bytes) else np.ravel(content)[:4].tobytes()
     return data.startswith((b"\xff\xd8\xff", b"\x89PNG"))
 
 
 def array_field(name: str, array: np.ndarray, **details: Any) -> Field:
     """A field of an array in memory."""
     return make_field(name, array.shape, array.dtype, lambda a, b: array[a:b], **details)
-
-
-def bytes_field(items: Sequence[bytes]) -> Field:
-    """A field of one string of bytes for each frame: image files, or text."""
-    kind: Kind = "encoded" if items and is_encoded(items[0]) else "text"
-    read = lambda a, b: np.array(items[a:b], dtype=object)  # noqa: E731
-    return Field(shape=(len(items),), kind=kind, read=read)
 
 
 def split_episodes(

@@ -25,8 +25,6 @@ from hrc_learn.demos.recording_files import (
     Recording,
     StreamRead,
     array_field,
-    bytes_field,
-    is_encoded,
     make_field,
     natural,
     split_episodes,
@@ -96,19 +94,18 @@ def _known_reader(path: Path) -> Callable[..., list[Recording]] | None:
     return None
 
 
+def _of_arrays(path: Path, arrays: Mapping[str, np.ndarray], **details: Any) -> list[Recording]:
+    fields = {name: array_field(name, array) for name, array in arrays.items()}
+    return split_episodes(path, fields, **details)
+
+
 def _read_text(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
-    table = read_text_table(path, columns)
-    return split_episodes(path, {name: array_field(name, v) for name, v in table.items()})
+    return _of_arrays(path, read_text_table(path, columns))
 
 
 def read_parquet(path: Path) -> list[Recording]:
     """Episodes of a Parquet file."""
-    table = read_parquet_table(path)
-    fields = {
-        name: bytes_field(values) if isinstance(values, list) else array_field(name, values)
-        for name, values in table.items()
-    }
-    return split_episodes(path, fields)
+    return _of_arrays(path, read_parquet_table(path))
 
 
 def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
@@ -117,8 +114,7 @@ def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
     _attributes({n: a[()] for n, a in arrays.items() if not a.shape}, details)
     if UNNAMED in arrays:
         arrays = _columns_of(path, arrays[UNNAMED], columns)
-    fields = {name: array_field(name, array) for name, array in arrays.items() if array.shape}
-    return split_episodes(path, fields, **details)
+    return _of_arrays(path, {n: array for n, array in arrays.items() if array.shape}, **details)
 
 
 def _numpy_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
@@ -160,37 +156,30 @@ def read_hdf5(path: Path) -> list[Recording]:
 
     fields: dict[str, Field] = {}
     details: dict[str, Any] = {}
-
-    def visit(group: h5py.Group) -> None:
-        _attributes(group.attrs, details)
-        for name in map(str, group):
-            place = f"{group.name}/{name}".strip("/")
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+    links: dict[str, Any] = {}
+    with h5py.File(path, "r") as file:
+        _attributes(file.attrs, details)
+        file.visititems_links(links.__setitem__)
+        for place, link in links.items():
+            if not isinstance(link, h5py.HardLink):
                 raise DatasetError(_LINK, file=path, key=place)
-            node = group[name]
+            node = file[place]
             if isinstance(node, h5py.Group):
-                visit(node)
+                _attributes(node.attrs, details)
             elif not isinstance(node, h5py.Dataset):
                 continue  # a type of its own holds no numbers
             elif node.external or node.is_virtual:
-                text = "is kept in another file: not opened"
-                raise DatasetError(text, file=path, key=place)
+                raise DatasetError("is kept in another file: not opened", file=path, key=place)
             elif node.shape == ():
-                _attributes({name: node[()]}, details)
+                _attributes({place.rpartition("/")[2]: node[()]}, details)
             elif node.shape and 0 not in node.shape and not node.dtype.names:
-                add(place, node)
-
-    def add(place: str, node: h5py.Dataset) -> None:
-        read = partial(_read_hdf5, path, place)
-        if node.dtype.kind != "O":
-            unit = unit_in_words(_text(node.attrs.get("units", "")))
-            fields[place] = make_field(place, node.shape, node.dtype, read, unit=unit)
-        elif h5py.check_string_dtype(node.dtype) or h5py.check_vlen_dtype(node.dtype):
-            kind = "encoded" if is_encoded(node[0]) else "text"
-            fields[place] = Field(shape=node.shape[:1], kind=kind, read=read)
-
-    with h5py.File(path, "r") as file:
-        visit(file)
+                read, unit = (
+                    partial(_read_hdf5, path, place),
+                    _text(node.attrs.get("units", "")),
+                )
+                fields[place] = make_field(
+                    place, node.shape, node.dtype, read, unit=unit_in_words(unit)
+                )
     return split_episodes(path, fields, **details)
 
 
@@ -258,25 +247,23 @@ def read_mat(path: Path) -> list[Recording]:
         content: dict = loadmat(path, simplify_cells=True)
     except NotImplementedError:  # version 7.3 is HDF5, which keeps arrays transposed
         return [_frames_first(one) for one in read_hdf5(path)]
-    fields: dict[str, Field] = {}
     details: dict[str, Any] = {}
     content = {k: v for k, v in content.items() if not k.startswith("__")}
-    _flatten(content, "", fields)
     _attributes({k: v for k, v in content.items() if np.ndim(v) == 0}, details)
-    return [_frames_first(one) for one in split_episodes(path, fields, **details)]
+    return [_frames_first(one) for one in _of_arrays(path, dict(_within(content)), **details)]
 
 
-def _flatten(value: Any, place: str, fields: dict[str, Field]) -> None:
-    """Collect the arrays of nested structures and cells."""
+def _within(value: Any, place: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays of nested structures and cells, by their places."""
     if isinstance(value, np.ndarray) and value.dtype.hasobject:
         value = list(value.ravel())
     if isinstance(value, list):
-        value = {str(number): item for number, item in enumerate(value)}
+        value = dict(enumerate(value))
     if isinstance(value, Mapping):
         for name, item in value.items():
-            _flatten(item, f"{place}/{name}".lstrip("/"), fields)
+            yield from _within(item, f"{place}/{name}".lstrip("/"))
     elif isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "fiub":
-        fields[place] = array_field(place, value)
+        yield place, value
 
 
 def _frames_first(one: Recording) -> Recording:
@@ -316,7 +303,7 @@ def _rlds_episode(path: Path, number: int, place: tuple[int, int]) -> Recording:
             def read(start: int, stop: int, name: str = name) -> np.ndarray:
                 return np.array(_rlds_record(path, *place)[name][start:stop], dtype=object)
 
-            found[short] = replace(bytes_field(values), read=read)
+            found[short] = make_field(short, (len(values),), np.dtype(object), read)
             if short.split("/")[-1] in _TASKS:
                 task = task or values[0].decode(errors="replace")
         elif len(values) % frames:

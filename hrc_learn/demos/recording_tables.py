@@ -136,11 +136,9 @@ def _parsed(
             raise DatasetError(
                 f"{text} {delimiter!r}: {words[wrong[0]]!r}", file=path, key=name
             )
-    found = _arrow_columns(path, table)
-    numbers = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
-    if not numbers:
+    if not (found := _arrow_columns(path, table)):
         raise DatasetError("holds no column of numbers", file=path)
-    return numbers
+    return found
 
 
 def _without_index(path: Path, table: Table) -> Table:
@@ -156,7 +154,7 @@ def _without_index(path: Path, table: Table) -> Table:
     return table
 
 
-def read_parquet_table(path: Path) -> dict[str, np.ndarray | list[bytes]]:
+def read_parquet_table(path: Path) -> Table:
     """Columns of a Parquet file: numbers, vectors of one length, and bytes of image files.
 
     Raises:
@@ -168,19 +166,16 @@ def read_parquet_table(path: Path) -> dict[str, np.ndarray | list[bytes]]:
         table = pq.read_table(path).flatten()  # {bytes, path} of images become columns
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"cannot be read as Parquet: {error}", file=path) from error
-    found = _arrow_columns(path, table)
-    numbers = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
-    kept = _without_index(path, dict(numbers))
-    return {name: v for name, v in found.items() if name not in numbers or name in kept}
+    return _without_index(path, _arrow_columns(path, table))
 
 
-def _arrow_columns(path: Path, table: pa.Table) -> dict[str, np.ndarray | list[bytes]]:
+def _arrow_columns(path: Path, table: pa.Table) -> Table:
     """Columns of numbers, of vectors and of bytes; all others are left out."""
-    found: dict[str, np.ndarray | list[bytes]] = {}
+    found: Table = {}
     for name in table.column_names:
         column = table[name].combine_chunks()
         if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
-            found[name.removesuffix(".bytes")] = column.to_pylist()
+            found[name.removesuffix(".bytes")] = column.to_numpy(zero_copy_only=False)
         elif pa.types.is_timestamp(column.type):
             stamps = column.cast(pa.timestamp("ns")).cast(pa.int64())
             found[name] = stamps.to_numpy() * 1e-9

@@ -436,7 +436,7 @@ def test_frames_before_a_sensor_speaks_are_cut_and_a_silent_one_is_named(tmp_pat
     assert "50 frames without tool/gripper are cut" in one.notes[0]
     arrays["tool/time"] = np.concatenate([time[:50:5], time[100::5]])
     write_hdf5(tmp_path / "gap.h5", arrays)
-    with pytest.raises(DatasetError, match=r"gap.h5, tool/gripper|silent for more than 0.2 s"):
+    with pytest.raises(DatasetError, match=r"gap.h5, tool/gripper|silent for too long at"):
         list(plan(tmp_path / "gap.h5").episodes())
 
 
