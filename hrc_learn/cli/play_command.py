@@ -156,18 +156,13 @@ def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -
 def _recording(args: Play, robot: Arm, motion: PlayedMotion) -> RunRecording:
     assert motion.joints is not None
     assert motion.position is not None
-    limits = robot.limits
     return RunRecording(
         title=f"{args.model.name} played by {robot.name}",
         time=motion.time,
         joint_names=robot.chain.joint_names,
         joint_position=motion.joints,
         joint_velocity=np.gradient(motion.joints, DT, axis=0),
-        joint_limits=JointRanges(
-            lower=limits.lower.numpy(),
-            upper=limits.upper.numpy(),
-            velocity=limits.velocity.numpy(),
-        ),
+        joint_limits=JointRanges.of(robot.limits),
         position=motion.position,
         plan_path=motion.position,
         bodies=arm_bodies(robot, motion.joints),

@@ -121,7 +121,7 @@ def record(
         joint_names=cell.chain.joint_names,
         joint_position=log["joint_position"],
         joint_velocity=log["joint_velocity"],
-        joint_limits=joint_ranges(cell.chain),
+        joint_limits=JointRanges.of(cell.chain.limits),
         demo_joint_position=_matching_demonstration(log, plans, demonstration),
         position=true_tool(motion, world, len(log)).position.numpy(),
         demo_path=None if demonstration is None else demonstration.position,
@@ -161,14 +161,6 @@ def region_of_vision(workplace: Workplace, servo: VisualServoConfig) -> Box:
     """Box above the table in which the vision region takes over."""
     x, y, z = workplace.hover().position.tolist()
     return Box(centre=(x, y, z), half_size=servo.half_size)
-
-
-def joint_ranges(chain: SerialChain) -> JointRanges:
-    """Limits of an arm, to be drawn with its joint positions."""
-    limits = chain.limits
-    return JointRanges(
-        lower=limits.lower.numpy(), upper=limits.upper.numpy(), velocity=limits.velocity.numpy()
-    )
 
 
 def push_arrows(

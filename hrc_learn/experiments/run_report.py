@@ -13,8 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from hrc_learn.experiments.placing_metrics import PlacingRun
 from hrc_learn.experiments.placing_trial import SPACES, demonstrated_path
-from hrc_learn.experiments.run_recorder import joint_ranges
-from hrc_learn.log import Event, RunRecording
+from hrc_learn.log import Event, JointRanges, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
     STYLE,
@@ -296,4 +295,4 @@ def placing_joints_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
         placed = run.placings["pose", shelf]
         label = f"{shelf} shelf"
         curves.append(JointCurves(label, placed.time, placed.joint_position, colour))
-    return joint_grid_figure(chain.joint_names, curves, joint_ranges(chain))
+    return joint_grid_figure(chain.joint_names, curves, JointRanges.of(chain.limits))

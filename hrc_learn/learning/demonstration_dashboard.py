@@ -19,7 +19,6 @@ from hrc_learn.demos.charts import demonstration_charts, own_unit
 from hrc_learn.demos.dataset_arm import DatasetArm
 from hrc_learn.demos.images import CameraImages
 from hrc_learn.demos.read.units import UnitDecision
-from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.log import JointRanges
 from hrc_learn.viz import palette
@@ -49,13 +48,6 @@ _CODECS = {
     "hevc": rr.VideoCodec.H265,
     "vp9": rr.VideoCodec.VP9,
 }
-
-
-def panda_ranges(joint_names: Sequence[str]) -> JointRanges | None:
-    """Joint ranges of a Panda, None for other joints."""
-    if tuple(joint_names) != panda.joint_names:
-        return None
-    return JointRanges(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from hrc_learn.jacobian import CellErrors, EvidenceResult
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.demonstration_dashboard import panda_ranges
 from hrc_learn.learning.primitive_fitting import FittedPrimitives
 from hrc_learn.learning.visual_servo_fitting import Demonstrations, feature_trajectories
 from hrc_learn.log import JointRanges
@@ -101,7 +100,8 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     limits, paths, reproduced = None, (), ()
     if channel != "joint":
         paths, reproduced = cut(demos), cut(made)
-    elif motions.joint_unit == "rad" and (limits := panda_ranges(motions.joint_names)):
+    elif (motions.joint_names, motions.joint_unit) == (panda.joint_names, "rad"):
+        limits = JointRanges.of(panda.limits)
         paths = cut(panda.forward(demos.double()).position)
         reproduced = cut(panda.forward(made.double()).position)
     residual = {}

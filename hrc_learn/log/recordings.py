@@ -5,6 +5,7 @@ A field that is None or empty drops its panel or figure. Times are seconds from 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -24,6 +25,12 @@ class JointRanges:
     """[rad]"""
     velocity: Float[np.ndarray, " joints"] | None = None
     """Largest speeds [rad/s]."""
+
+    @classmethod
+    def of(cls, limits: Any) -> "JointRanges":
+        """Ranges and speeds of an arm's limits (`kinematics.JointLimits`)."""
+        names = ("lower", "upper", "velocity")
+        return cls(**{name: getattr(limits, name).numpy() for name in names})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
