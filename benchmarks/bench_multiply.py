@@ -24,7 +24,7 @@ import torch
 from hrc_learn import cli
 from hrc_learn.cli.arguments import Multiply
 from hrc_learn.cli.multiply_command import Multiplication, Settings
-from hrc_learn.experiments.motion_judge import JudgeConfig, Judges, Trial
+from hrc_learn.experiments.motion_judge import JudgeConfig, Trial, judging
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics.inverse import follow_poses
 from hrc_learn.learning.multiply_motions import Draws, frame_of
@@ -73,12 +73,9 @@ def compared(job: Multiplication, attempts: int) -> dict[str, float]:
     theirs = [rigid(job, draws, k) for k in range(attempts)]
     figures: dict[str, float] = {}
     fps = job.source.fps
-    with Judges(job.judge, job.choice, fps, 0.08) as judges:
+    with judging(job.judge, job.choice, fps, 0.08) as judge:
         for name, trials in (("primitives", ours), ("rigid", theirs)):
-            reasons = [
-                reason or next(iter(judges.replays([trial]))).failure
-                for trial, reason in trials
-            ]
+            reasons = [reason or next(iter(judge([trial]))).failure for trial, reason in trials]
             jerks = [np.diff(trial.joints, n=3, axis=0) * fps**3 for trial, _ in trials]
             figures[f"{name}_success_rate"] = reasons.count("") / attempts
             figures[f"{name}_jerk_rms"] = float(

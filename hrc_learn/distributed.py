@@ -1,12 +1,15 @@
 """Work divided over processes.
 
 The functions join the processes that `torchrun` starts; in a single process they do nothing, so
-that the same code serves both. `ByValue` serves processes that a program starts by itself.
+that the same code serves both. `worker_pool` and `ByValue` serve processes that a program
+starts by itself.
 """
 
+import multiprocessing
 import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -28,6 +31,22 @@ class ByValue:
 
     def __reduce__(self) -> tuple[object, ...]:
         return pickle.loads, (self._content,)
+
+
+@contextmanager
+def worker_pool(
+    number: int, begin: Callable[..., object], *given: object
+) -> Iterator[ProcessPoolExecutor]:
+    """Processes that start afresh, each by `begin(*given)`; open work ends with the block.
+
+    A forked process would inherit locks of threads that do not exist in it.
+    """
+    context, sent = multiprocessing.get_context("spawn"), tuple(map(ByValue, given))
+    with ProcessPoolExecutor(number, context, initializer=begin, initargs=sent) as pool:
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 @contextmanager

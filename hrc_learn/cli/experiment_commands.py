@@ -27,7 +27,6 @@ from hrc_learn.experiments.collaboration_experiment import CollaborationExperime
 from hrc_learn.experiments.collaboration_trial import Disturbances
 from hrc_learn.experiments.experiment import (
     Experiment,
-    LiveViewConfig,
     RunOptions,
     run_experiment,
 )
@@ -70,11 +69,10 @@ _SIMULATED_ONLY = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Settings:
-    """Settings of the experiment, a real arm and the live view."""
+    """Settings of the experiment and of a real arm."""
 
     experiment: Experiment[Any]
     site: ArmSite = field(default_factory=ArmSite)
-    serving: LiveViewConfig = field(default_factory=LiveViewConfig)
     processes: int = 1
     """Processes that run the trials."""
     film: bool = True
@@ -106,7 +104,6 @@ def run(args: Run) -> int:
         trials=args.trials,
         processes=settings.processes,
         serve=args.serve,
-        serving=settings.serving,
         film=settings.film,
         overwrite=args.overwrite,
         json=args.json,

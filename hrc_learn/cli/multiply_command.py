@@ -18,7 +18,7 @@ from hrc_learn.cli.arguments import Multiply
 from hrc_learn.demos import open_demos
 from hrc_learn.demos.dataset_arm import arm_of_dataset
 from hrc_learn.demos.issues import aligned
-from hrc_learn.experiments.motion_judge import JudgeConfig, Judges, Replay, Trial
+from hrc_learn.experiments.motion_judge import Judge, JudgeConfig, Replay, Trial, judging
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.learning.multiply_dataset import MultipliedColumns, MultipliedWriter, pose_of
@@ -201,13 +201,13 @@ class Multiplication:
         physics = nullcontext()
         if self.judge.scene:
             widest = max(widths, default=1.0)
-            physics = Judges(self.judge, self.choice, self.source.fps, widest)
-        with writer.claimed(), physics as judges, Progress(transient=True) as progress:
+            physics = judging(self.judge, self.choice, self.source.fps, widest)
+        with writer.claimed(), physics as judge, Progress(transient=True) as progress:
             bar, done = progress.add_task("Multiplying", total=wanted), len(writer.provenance)
             first = 1 + writer.provenance[-1]["attempt"] if done else 0
             failed: dict[int, str] = {}
             attempts = itertools.chain.from_iterable(
-                self._attempts(range(at, at + _CHUNK), judges)
+                self._attempts(range(at, at + _CHUNK), judge)
                 for at in itertools.count(first, _CHUNK)
             )
             while len(writer.provenance) < wanted:
@@ -226,14 +226,14 @@ class Multiplication:
         return Counter(r for each in writer.provenance for r in each["failed"].values())
 
     def _attempts(
-        self, attempts: range, judges: Judges | None
+        self, attempts: range, judge: Judge | None
     ) -> Iterator[tuple[int, tuple[dict, str, dict[str, Any]] | str]]:
         """Columns, task and origin of each episode, or the reason why a motion failed."""
         draws = self.draw(attempts)
         made = self.motions.motions(draws)
         trials = [self.trial(draws, motion, k) for k, motion in enumerate(made)]
         good = [t for t, motion in zip(trials, made, strict=True) if not motion.reason]
-        replays = map(self._planned, good) if judges is None else judges.replays(good)
+        replays = map(self._planned, good) if judge is None else judge(good)
         for k, attempt in enumerate(attempts):
             replay = None if made[k].reason else next(replays)
             if replay is None or replay.failure:

@@ -16,7 +16,6 @@ from hrc_learn.experiments.collaboration_trial import (
 )
 from hrc_learn.experiments.experiment import RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
-from hrc_learn.experiments.run_measures import worker_distance
 from hrc_learn.experiments.run_recorder import record, region_of_vision
 from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
@@ -129,11 +128,8 @@ class CollaborationExperiment(CollaborationScenario):
         return {"run": recording}
 
     def log(self, run: CollaborationRun) -> LoggedSteps:
-        """Log of the whole job; with a worker also the true distance to them [m]."""
-        log = run.cell.log
-        if run.visit is None:
-            return log
-        return log.with_columns(person_distance_true=worker_distance(run.motion, len(log)))
+        """Log of the whole job."""
+        return run.cell.log
 
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]

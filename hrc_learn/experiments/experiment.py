@@ -9,7 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -130,16 +130,6 @@ def evaluate_all[Run](
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveViewConfig:
-    """Port and rate of the live dashboard of a run."""
-
-    port: int = 9090
-    """Port of the page."""
-    period: float = 0.25
-    """Time between two updates [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """Options common to all experiments: repetition, outputs and live dashboard."""
 
@@ -154,8 +144,6 @@ class RunOptions:
     """Number of parallel trials."""
     serve: bool = False
     """Serve the dashboard of the run in the browser while it goes on."""
-    serving: LiveViewConfig = field(default_factory=LiveViewConfig)
-    """Port of the dashboard, with --serve."""
     film: bool = True
     """Make a film of the run, in the folder and in the report."""
     overwrite: bool = False
@@ -188,9 +176,7 @@ def run_experiment[Run](
     configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
     console, study, view = Console(), experiment.study(), no_live_view
     if options.serve:
-        view = live_view(
-            experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
-        )
+        view = live_view(experiment.title, lambda at: console.print(f"Dashboard at {at}"))
     # Next to the folder, which exists only when all is done: interrupted trials resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
     try:
@@ -240,7 +226,7 @@ def _write_recordings[Run](
     return run_film, experiment.sections(run, recordings)
 
 
-def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]) -> LiveView:
+def live_view(title: str, on_open: Callable[[str], None]) -> LiveView:
     """Serve the dashboard of a run on a page of its own.
 
     The loop pays for its log only: another thread makes and sends recordings of the run so
@@ -248,7 +234,6 @@ def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]
 
     Args:
         title: Title of the dashboard.
-        config: Port and rate.
         on_open: Called with the address of the page.
     """
 
@@ -261,9 +246,9 @@ def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]
         def snapshot() -> RunRecording | None:
             return record(title, cell, world, motion) if len(motion) else None
 
-        with serve_stream(config.port) as server:
+        with serve_stream() as server:
             on_open(server.viewer)
-            with live_dashboard(server.stream, snapshot, period=config.period):
+            with live_dashboard(server.stream, snapshot):
                 yield
 
     return watch

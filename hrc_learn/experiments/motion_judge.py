@@ -7,12 +7,12 @@ for other scenes.
 
 from __future__ import annotations
 
-import multiprocessing
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.distributed import ByValue
+from hrc_learn.distributed import ByValue, worker_pool
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import PhysicsError
@@ -253,8 +253,7 @@ _JUDGE: list[CellJudge | SceneJudge] = []
 """Judge of this process."""
 
 
-def _begin(given: tuple[JudgeConfig, ArmChoice, float, float]) -> None:
-    config, robot, fps, widest = given
+def _begin(config: JudgeConfig, robot: ArmChoice, fps: float, widest: float) -> None:
     torch.set_num_threads(1)
     _JUDGE[:] = [config.open(robot, fps, widest)]
 
@@ -263,35 +262,20 @@ def _replay(trial: Trial) -> Replay:
     return replay(_JUDGE[0], trial)
 
 
-class Judges:
-    """Judges in several processes."""
+type Judge = Callable[[Sequence[Trial]], Iterator[Replay]]
+"""Function that replays motions, in their order."""
 
-    def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float, widest: float):
-        """Start them; arguments and errors as for `JudgeConfig.open`."""
-        self._given = (config, robot, fps, widest)
-        self._pool: ProcessPoolExecutor | None = None
 
-    def __enter__(self) -> Judges:
-        config = self._given[0]
-        # Opened here first, so that a mistake is one error of this process.
-        _begin(self._given)
-        if config.processes > 1:
-            sent: Any = ByValue(self._given)
-            self._pool = ProcessPoolExecutor(
-                config.processes,
-                multiprocessing.get_context("spawn"),
-                initializer=_begin,
-                initargs=(sent,),
-            )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-    def replays(self, trials: Sequence[Trial]) -> Iterator[Replay]:
-        """Replays in the order of the motions."""
-        if self._pool is None:
-            return map(_replay, trials)
-        sent: Any = map(ByValue, trials)
-        return self._pool.map(_replay, sent)
+@contextmanager
+def judging(
+    config: JudgeConfig, robot: ArmChoice, fps: float, widest: float
+) -> Iterator[Judge]:
+    """Judge in several processes; arguments and errors as for `JudgeConfig.open`."""
+    given = (config, robot, fps, widest)
+    # Opened here first, so that a mistake is one error of this process.
+    _begin(*given)
+    if config.processes <= 1:
+        yield partial(map, _replay)
+        return
+    with worker_pool(config.processes, _begin, *given) as pool:
+        yield lambda trials: pool.map(_replay, map(ByValue, trials))

@@ -2,16 +2,15 @@
 
 import gc
 import math
-import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from hrc_learn.distributed import ByValue
+from hrc_learn.distributed import ByValue, worker_pool
 from hrc_learn.store import Claim, json_text, naming, new_file, parse_json, sync_file
 
 # Keys of a line of the file: one JSON object per trial. The first line of the file holds the
@@ -206,21 +205,14 @@ def _trials(
     if processes <= 1:
         yield from (_trial(run, seed, failures) for seed in seeds)
         return
-    # A forked process would inherit locks of threads that do not exist in it.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        processes, context, initializer=torch.set_num_threads, initargs=(1,)
-    ) as pool:
+    with worker_pool(processes, torch.set_num_threads, 1) as pool:
         sent: Any = ByValue(run)
         waiting = {pool.submit(_trial, sent, seed, failures) for seed in seeds}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                # Keep the successful trials before an error stops everything.
-                for future in sorted(done, key=lambda f: f.exception() is not None):
-                    yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            # Keep the successful trials before an error stops everything.
+            for future in sorted(done, key=lambda f: f.exception() is not None):
+                yield future.result()
 
 
 def _trial(run: TrialRun, seed: int, failures: tuple[type[Exception], ...]) -> Trial:

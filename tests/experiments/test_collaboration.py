@@ -322,11 +322,9 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     assert values["contacts_with_the_worker"] == 0
     assert 0.3 < distance.min() < 3.0
     assert values["separation_violations"] == 0
-    log = experiment.CollaborationExperiment.log(None, job)
-    np.testing.assert_array_equal(log["person_distance_true"], distance)
+    log = job.cell.log
     assert np.isfinite(log["person_distance"]).all()
     assert (log["person_age"] >= 0).all()
-    np.testing.assert_array_equal(log["time"], job.cell.log["time"])
     assert job.near_worker.margin.shape == (steps,)
     run = record("test", job.cell, job.world, job.motion)
     assert {"worker_head", "worker_hand_left", "worker_item"} <= {b.name for b in run.bodies}

@@ -8,7 +8,7 @@ import pytest
 import torch
 from multiply_samples import END, block, demonstrations
 
-from hrc_learn.experiments.motion_judge import JudgeConfig, Judges, Trial
+from hrc_learn.experiments.motion_judge import JudgeConfig, Trial, judging
 from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.sim.arm_model import ArmModelConfig, add_arm
 
@@ -61,8 +61,8 @@ def trial(at):
 @pytest.mark.simulation
 def test_only_what_the_success_function_accepts_succeeds(scene, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    with Judges(settings(scene), ArmChoice(), 20.0, 0.08) as judges:
-        good, bad = judges.replays([trial(PLACE), trial(block(0.45, 0.20, 0.0))])
+    with judging(settings(scene), ArmChoice(), 20.0, 0.08) as judge:
+        good, bad = judge([trial(PLACE), trial(block(0.45, 0.20, 0.0))])
     assert good.failure == ""
     assert good.objects["block"][-1, 2] == pytest.approx(0.13, abs=0.01)
     assert good.joints.shape == (END, 7)

@@ -7,7 +7,7 @@ import rerun as rr
 import torch
 from rrd_reading import Rrd
 
-from hrc_learn.experiments.experiment import LiveViewConfig, live_view
+from hrc_learn.experiments.experiment import live_view
 from hrc_learn.experiments.run_recorder import push_arrows
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
@@ -19,10 +19,10 @@ from hrc_learn.teleoperation import dashboard_page as servers
 
 def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
     @contextmanager
-    def into_a_file(port):
+    def into_a_file():
         stream = rr.RecordingStream("test")
         stream.save(tmp_path / "live.rrd")
-        yield servers.DashboardServer(stream, f"http://viewer:{port}")
+        yield servers.DashboardServer(stream, "http://viewer")
         stream.disconnect()
 
     monkeypatch.setattr(servers, "serve_stream", into_a_file)
@@ -37,14 +37,13 @@ def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
         human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
-    config = LiveViewConfig(port=1, period=0.01)
     with (
         torch.inference_mode(),
-        live_view("Held", config, opened.append)(cell, world, motion),
+        live_view("Held", opened.append)(cell, world, motion),
     ):
         cell.begin_phase("hold")
         cell.hold_pose(0.3)
-    assert opened == ["http://viewer:1"]
+    assert opened == ["http://viewer"]
     rrd = Rrd(tmp_path / "live.rrd")
     path = "joints/panda_joint4/position"
     order = np.argsort(rrd.time(path), kind="stable")

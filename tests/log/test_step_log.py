@@ -32,23 +32,6 @@ def test_whole_first_values_do_not_cut_later_ones():
     assert log["joint"][1].tolist() == [0.5, 1.5]
 
 
-@pytest.mark.parametrize("steps", [1, 8, 17])
-def test_columns_can_be_added_to_a_log(steps):
-    log = filled(steps, block=8)
-    log.event(0.1, "begun")
-    far = np.arange(2.0 * steps).reshape(steps, 2)
-    more = log.with_columns(far=far, seen=np.ones(steps, bool))
-    assert more.names == (*log.names, "far", "seen")
-    for name in log.names:
-        np.testing.assert_array_equal(more[name], log[name])
-    np.testing.assert_array_equal(more["far"], far)
-    assert more["seen"].dtype == bool
-    assert more.events == log.events
-    assert "far" not in log
-    with pytest.raises(ValueError, match="new columns"):
-        log.with_columns(far=np.zeros(steps + 1))
-
-
 def test_a_column_is_a_copy():
     log = filled(3)
     log["joint"][:] = 99
