@@ -5,15 +5,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
 
 from hrc_learn.demos.dataset_writer import DatasetWriter
-from hrc_learn.demos.demonstration import JOINT_FIELDS, Demonstration
+from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError, aligned
-from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
+from hrc_learn.demos.read.quantities import demonstration_fields
 from hrc_learn.demos.recorded_episode import columns_for, rotation_vectors
 from hrc_learn.demos.recording_clock import clock_of_state
 from hrc_learn.demos.recording_files import Field, Recording
@@ -229,9 +228,10 @@ def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> 
         return values
 
     quantities = {r: rows(s.columns) for r, s in meaning.selections.items() if r != "time"}
+    factors = {role: decision.factor for role, decision in meaning.decisions.items()}
     extra = {key: rows(places) for key, (places, _) in meaning.kept.items()}
     if meaning.kept.get("action", ((), ()))[1] == ("gripper.pos",) and "gripper" in quantities:
-        extra["action"] = extra["action"] * meaning.decisions["gripper"].factor
+        extra["action"] = extra["action"] * factors["gripper"]
     try:
         demo = Demonstration(
             time=time - time[0],
@@ -241,32 +241,13 @@ def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> 
             # LeRobot counts frames at a whole rate; true stamps are kept in their own column.
             fps=options.fps or max(1, round(1 / step)),
             extra=extra,
-            **_fields(quantities, meaning),
+            **demonstration_fields(quantities, factors),
         )
     except ValueError as error:
         raise recording.error(str(error)) from error
     cameras = meaning.cameras.items()
     images = {camera: (recording.fields[name], clock.frames[name]) for camera, name in cameras}
     return Episode(demonstration=demo, images=images, notes=clock.notes)
-
-
-def _fields(quantities: dict[str, np.ndarray], meaning: Meaning) -> dict[str, Any]:
-    """Fields of a demonstration in SI units, from quantities in the units on disk."""
-    values = {r: v * meaning.decisions[r].factor for r, v in quantities.items()}
-    known = (*JOINT_FIELDS, "position", "feature")
-    fields: dict[str, Any] = {r: values[r] for r in known if r in values}
-    if "gripper" in values:
-        opening = values["gripper"]
-        # Two fingers of opposite signs, as robomimic keeps them, open by their distance.
-        two = opening.shape[1] == 2
-        fields["gripper"] = opening[:, 0] - opening[:, 1] if two else opening[:, 0]
-    if "pose_matrix" in values:  # in a transform, the translation alone has a unit
-        values["pose_matrix"] = quantities["pose_matrix"]
-        moved = transforms(quantities["pose_matrix"])[:, :3, 3].numpy()
-        fields.setdefault("position", moved * meaning.decisions["pose_matrix"].factor)
-    for role in [role for role in ORIENTATION_ROLES if role in values][:1]:
-        fields["orientation"] = to_quaternion(role, values[role])
-    return fields
 
 
 def _images(

@@ -1,12 +1,15 @@
 """Quantities of a dataset: their roles, and encodings of orientation."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.geometry import quaternion
 
 
@@ -61,6 +64,40 @@ ORIENTATION_ROLES = (
 
 INDEX_KEYS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Index columns that LeRobot maintains."""
+
+
+def demonstration_fields(
+    quantities: Mapping[str, Float64[np.ndarray, "frames _columns"]],
+    factors: Mapping[str, float | Float64[np.ndarray, " _columns"]],
+) -> dict[str, Any]:
+    """Fields of a `Demonstration` in SI units, all but its time.
+
+    Args:
+        quantities: Quantities in the units on disk, by role.
+        factors: SI units in the unit on disk, by role.
+
+    Raises:
+        ValueError: The orientations are invalid.
+    """
+    values = {
+        r: x if np.all(factors[r] == 1) else x * factors[r] for r, x in quantities.items()
+    }
+    known = (*JOINT_FIELDS, "position", "feature")
+    fields: dict[str, Any] = {role: values[role] for role in known if role in values}
+    if "gripper" in values:
+        opening = values["gripper"]
+        # Two fingers of opposite signs, as robomimic keeps them, open by their distance.
+        two = opening.shape[1] == 2
+        fields["gripper"] = opening[:, 0] - opening[:, 1] if two else opening[:, 0]
+    if "feature_visible" in values:
+        fields["feature_visible"] = values["feature_visible"][:, 0] > 0
+    if "pose_matrix" in values:  # in a transform, the translation alone has a unit
+        values["pose_matrix"] = quantities["pose_matrix"]
+        moved = transforms(values["pose_matrix"])[:, :3, 3].numpy()
+        fields.setdefault("position", moved * factors["pose_matrix"])
+    for role in [role for role in ORIENTATION_ROLES if role in values][:1]:
+        fields["orientation"] = to_quaternion(role, values[role])
+    return fields
 
 
 def to_quaternion(

@@ -10,7 +10,6 @@ from typing import Protocol, overload, runtime_checkable
 import numpy as np
 
 from hrc_learn.demos.demonstration import (
-    JOINT_FIELDS,
     Demonstration,
     DemonstrationSet,
     joint_columns,
@@ -34,7 +33,7 @@ from hrc_learn.demos.read.frames import (
     read_quantities,
 )
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
-from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
+from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, demonstration_fields
 from hrc_learn.demos.read.units import (
     Quantities,
     UnitDecision,
@@ -384,16 +383,15 @@ class DemonstrationSource(Sequence[Demonstration]):
         Raises:
             DatasetError: Its stamps do not increase, or its orientations are invalid.
         """
-        entry, frames, values = episode.entry, episode.frames, {}
-        for role, on_disk in episode.quantities.items():
-            factor = self.units[role].factor
-            values[role] = on_disk if np.all(factor == 1) else on_disk * factor
-        time = frame_timestamps(self.folder, entry, frames, values.get("time"))
-        fields = {r: values[r] for r in (*JOINT_FIELDS, "position", "feature") if r in values}
-        if "gripper" in values:
-            fields["gripper"] = values["gripper"][:, 0]
-        if "feature_visible" in values:
-            fields["feature_visible"] = values["feature_visible"][:, 0] > 0
+        entry, frames, quantities = episode.entry, episode.frames, episode.quantities
+        factors = {role: self.units[role].factor for role in quantities}
+        stamps = quantities["time"] * factors["time"] if "time" in quantities else None
+        time = frame_timestamps(self.folder, entry, frames, stamps)
+        try:
+            fields = demonstration_fields(quantities, factors)
+        except ValueError as error:
+            key = next(role for role in ORIENTATION_ROLES if role in quantities)
+            raise entry.error(str(error), key=key) from error
         task = entry.tasks[0] if entry.tasks else ""
         if not entry.tasks and "task_index" in frames:
             task = self.folder.tasks.get(int(frames["task_index"][0, 0]), "")
@@ -405,27 +403,8 @@ class DemonstrationSource(Sequence[Demonstration]):
             task=task,
             joint_names=self.columns.joint_names,
             extra={key: frames[key].astype(float) for key in self.columns.extra},
-            **fields | self._pose(episode, values),
+            **fields,
         )
         if self._extracted is not None:
             demo = self._extracted.attach(demo, if_known=True)
         return demo.select_joints(self.joint_names)
-
-    def _pose(
-        self, episode: RawEpisode, values: Mapping[str, np.ndarray]
-    ) -> dict[str, np.ndarray]:
-        """Orientation, and position if a 4x4 transform holds both."""
-        role = next((role for role in ORIENTATION_ROLES if role in values), None)
-        if role is None:
-            return {}
-        # In a transform, the translation alone has a unit.
-        is_matrix = role == "pose_matrix"
-        numbers = episode.quantities[role] if is_matrix else values[role]
-        try:
-            pose = {"orientation": to_quaternion(role, numbers)}
-        except ValueError as error:
-            raise episode.entry.error(str(error), key=role) from error
-        if is_matrix and "position" not in values:
-            translation = transforms(numbers)[:, :3, 3].numpy()
-            pose["position"] = translation * self.units[role].factor
-        return pose
