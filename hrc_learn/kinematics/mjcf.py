@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -215,12 +216,15 @@ class _Reader:
             return float(np.abs(model.jnt_actfrcrange[j]).max())
         for a in range(model.nu):
             if model.actuator_trntype[a] == 0 and model.actuator_trnid[a, 0] == j:
+                force = math.inf
                 if model.actuator_forcelimited[a]:
-                    return float(np.abs(model.actuator_forcerange[a]).max())
+                    force = np.abs(model.actuator_forcerange[a]).max()
                 motor = model.actuator_biastype[a] == 0 and model.actuator_gaintype[a] == 0
                 if motor and model.actuator_ctrllimited[a]:
-                    gain = model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0]
-                    return float(abs(gain) * np.abs(model.actuator_ctrlrange[a]).max())
+                    control = np.abs(model.actuator_ctrlrange[a]).max()
+                    force = min(force, abs(model.actuator_gainprm[a, 0]) * control)
+                if force < math.inf:
+                    return float(abs(model.actuator_gear[a, 0]) * force)
         return None
 
     def _followers(self) -> dict[int, tuple[str, float, float]]:

@@ -346,6 +346,31 @@ def mjcf(equality: str = "", keyframe: str = "") -> str:
     return MJCF.format(bodies=bodies, equality=equality, keyframe=keyframe)
 
 
+ACTUATORS = """<actuator>
+<motor joint="j1" gear="5" ctrlrange="-3 2"/>
+<motor joint="j2" gear="50" forcerange="-1 4"/>
+<motor joint="j3" gear="-2" ctrlrange="-3 3" forcerange="-4 2.5"/>
+<general joint="j4" gear="3" gainprm="7" ctrlrange="-1 2"/>
+<position joint="j5" gear="2" kp="100" forcerange="-6 5"/>
+<motor joint="j6" gear="90" ctrlrange="-1 1"/>
+</actuator></mujoco>"""
+
+
+def test_torque_limits_are_what_the_actuators_can_do_in_mujoco(tmp_path):
+    text = mjcf().replace("</mujoco>", ACTUATORS)
+    text = text.replace('<joint name="j6"', '<joint name="j6" actuatorfrcrange="-8 9"')
+    model = mujoco.MjModel.from_xml_string(text)
+    data, most = mujoco.MjData(model), np.zeros(6)
+    for control in (-1e6, 1e6):
+        data.ctrl[:] = control
+        mujoco.mj_forward(model, data)
+        most = np.maximum(most, np.abs(data.qfrc_actuator))
+    limits = load(tmp_path, text, ".xml").limits
+    np.testing.assert_allclose(limits.torque, most)
+    free = load(tmp_path, mjcf(), ".xml").limits
+    assert bool((free.torque == torch.inf).all())
+
+
 TIE = '<joint joint1="j3" joint2="j2" polycoef="0 1 0 0 0" active="{}"/>'
 
 

@@ -152,3 +152,31 @@ def test_the_numbers_are_those_of_the_urdf_with_franky_sim():
             (curve, "deceleration_limit", limits.deceleration),
         ):
             assert float(tag.get(name, "nan")) == float(ours[i])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_a_path_that_lasts_as_many_times_longer_keeps_its_limits(order):
+    """Of t^n the difference of order n is exactly n! dt^n, and those above are zero."""
+    bounds = {"lower": -torch.ones(2), "upper": torch.ones(2)}
+    kinds = ("velocity", "acceleration", "jerk")
+    limits = JointLimits(
+        vintage="test",
+        torque=torch.ones(2),
+        **bounds,
+        **{
+            kind: torch.tensor([1e9, 0.5 if n == order else 1e9])
+            for n, kind in enumerate(kinds, 1)
+        },
+    )
+    dt, t = 0.01, 0.01 * torch.arange(40, dtype=torch.float64)
+    # At joint 2 a constant 4 in this derivative.
+    path = torch.stack([t, 4 * t**order / math.factorial(order)], -1)
+    factor, at = limits.excess(path, dt)
+    assert factor == pytest.approx(8.0 ** (1 / order), rel=1e-6)
+    assert at == 2 * (order - 1) + 1
+    slower, _ = limits.excess(path, float(factor) * dt)
+    assert slower == pytest.approx(1.0, rel=1e-6)
+    both, _ = limits.excess(torch.stack([path, 2 * path]), dt, kinds[:order])
+    assert both.tolist() == pytest.approx([8.0 ** (1 / order), 16.0 ** (1 / order)], rel=1e-6)
+    resting = torch.cat([path, path[-1:].expand(5, 2)])
+    assert limits.excess(resting, dt)[0] >= factor
