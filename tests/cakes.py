@@ -4,15 +4,16 @@ from pathlib import Path
 
 from hrc_learn.store import MANIFEST, Kind, replacing
 
-KIND = Kind(name="cake", files=("mark", "result", "layers/*"))
+KIND = Kind(name="cake")
+EXTENDED = Kind(name="cake", files=("mark", "result", "layers/*"))
 
 
 class WorkFailedError(Exception):
     pass
 
 
-def fill(path, text: str, overwrite: bool = False, **options) -> None:
-    with replacing(path, KIND, overwrite, **options) as folder:
+def fill(path, text: str, overwrite: bool = False, kind: Kind = KIND) -> None:
+    with replacing(path, kind, overwrite) as folder:
         (folder / "layers").mkdir(parents=True)
         (folder / "mark").touch()
         (folder / "result").write_text(text)

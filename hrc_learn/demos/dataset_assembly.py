@@ -354,7 +354,6 @@ def finish(root: Path, claim: store.Claim) -> None:
             claim,
             store.DATASET,
             overwrite=episodes is not None,
-            others="keep",
             source=header.id,
         ) as new:
             assemble(paths, new, earlier=None if episodes is None else root)

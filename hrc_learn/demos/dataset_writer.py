@@ -116,7 +116,7 @@ class DatasetWriter:
         try:
             self._earlier = self._continue() if append else None
             if append:
-                self._claim.require_replaceable(DATASET, True, foreign=True, adopt=True)
+                self._claim.require_replaceable(DATASET, True)
             begin(self.root, self.episodes if append else None)
         except BaseException:
             self._claim.release()

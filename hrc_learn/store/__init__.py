@@ -21,12 +21,6 @@ Only files that the manifest of an older result lists are ever deleted, and a fo
 files is not replaced. A path through a symbolic link keeps the link and replaces its target.
 """
 
-from hrc_learn.store._claim import BusyError as BusyError
-from hrc_learn.store._claim import Claim as Claim
-from hrc_learn.store._claim import InTheWayError as InTheWayError
-from hrc_learn.store._claim import recover as recover
-from hrc_learn.store._claim import resolved as resolved
-from hrc_learn.store._claim import settle as settle
 from hrc_learn.store._folder import DATASET as DATASET
 from hrc_learn.store._folder import DISK_ERRORS as DISK_ERRORS
 from hrc_learn.store._folder import EXPORT as EXPORT
@@ -50,9 +44,15 @@ from hrc_learn.store._reading import json_text as json_text
 from hrc_learn.store._reading import parse_json as parse_json
 from hrc_learn.store._reading import read_json as read_json
 from hrc_learn.store._reading import read_toml as read_toml
+from hrc_learn.store._writing import BusyError as BusyError
+from hrc_learn.store._writing import Claim as Claim
+from hrc_learn.store._writing import InTheWayError as InTheWayError
 from hrc_learn.store._writing import new_file as new_file
 from hrc_learn.store._writing import new_folder as new_folder
 from hrc_learn.store._writing import read_made_by as read_made_by
+from hrc_learn.store._writing import recover as recover
 from hrc_learn.store._writing import replacing as replacing
+from hrc_learn.store._writing import resolved as resolved
+from hrc_learn.store._writing import settle as settle
 from hrc_learn.store._writing import write_json as write_json
 from hrc_learn.store._writing import write_text as write_text

@@ -194,7 +194,11 @@ class Kind:
 
     name: str
     files: tuple[str, ...] = ()
-    """Patterns of the files that an adopted folder without a manifest owns; * matches / too."""
+    """Patterns of the files of a folder that can be extended; * matches / too.
+
+    Such a folder may lack a manifest, and its foreign files are carried over. Without patterns,
+    a folder that holds foreign files is not replaced.
+    """
 
 
 MODEL = Kind(name="saved model")
@@ -214,14 +218,12 @@ DATASET = Kind(
 )
 
 
-def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] | None:
+def owned_entries(folder: Path, kind: Kind) -> set[str] | None:
     """Entries of a folder that its writer made, and that may be deleted with it.
 
     Args:
         folder: The folder.
         kind: Expected kind.
-        adopt: Accept the folder as one of the kind without a manifest too, and all files with
-            matching names as its own.
 
     Returns:
         Relative paths, those of folders with "/" at the end; None for a folder of another
@@ -233,12 +235,11 @@ def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] 
     if not present:
         return set()  # nothing could be lost
     manifest = _read_manifest(folder)
-    if (manifest is None and not adopt) or (
-        manifest is not None and manifest.kind != kind.name
-    ):
+    known = bool(kind.files) if manifest is None else manifest.kind == kind.name
+    if not known:
         return None
     owned = set() if manifest is None else _listed(folder, manifest)
-    if adopt:
+    if kind.files:
         owned |= {entry for entry in present if matches(entry, kind.files)}
         owned |= {f"{parent.as_posix()}/" for entry in owned for parent in Path(entry).parents}
     return present & owned

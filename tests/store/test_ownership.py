@@ -5,7 +5,7 @@ import json
 import os
 
 import pytest
-from cakes import KIND, cake, contents, fill
+from cakes import EXTENDED, KIND, cake, contents, fill
 
 from hrc_learn.store import (
     MADE_BY,
@@ -49,7 +49,7 @@ def test_a_folder_without_a_manifest_is_not_ours(tmp_path):
     with pytest.raises(FileExistsError, match="not ours to overwrite"):
         fill(tmp_path / "out", "new", overwrite=True)
     assert contents(tmp_path) == cake("old")
-    fill(tmp_path / "out", "new", overwrite=True, others="keep")
+    fill(tmp_path / "out", "new", overwrite=True, kind=EXTENDED)
     assert contents(tmp_path) == cake("new")
 
 
@@ -60,7 +60,7 @@ def test_an_empty_folder_may_be_filled(tmp_path):
 
 
 @pytest.mark.parametrize("file_system_has_links", [True, False])
-def test_files_of_other_origin_are_carried_over_on_request(
+def test_files_of_other_origin_are_carried_over_if_it_can_be_extended(
     file_system_has_links, tmp_path, monkeypatch
 ):
     def refuse(*_, **__):
@@ -74,7 +74,7 @@ def test_files_of_other_origin_are_carried_over_on_request(
     (out / "notes" / "mine").write_text("years")
     (out / "link").symlink_to("notes/mine")
     for text in ("new", "newer"):  # and are not taken for results afterwards
-        fill(out, text, overwrite=True, others="keep")
+        fill(out, text, overwrite=True, kind=EXTENDED)
         assert (out / "link").is_symlink()
         own = {"out/notes/mine": "years", "out/link": "years"}
         assert contents(tmp_path) == cake(text) | own
@@ -102,7 +102,7 @@ def test_a_foreign_file_whose_name_is_taken_is_kept_aside(tmp_path):
     (out / "notes").write_text("years")
 
     def write() -> None:
-        with replacing(out, KIND, overwrite=True, others="keep") as folder:
+        with replacing(out, EXTENDED, overwrite=True) as folder:
             folder.mkdir()
             (folder / "notes").write_text("others")
 

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from cakes import cake, contents, fill
+from cakes import EXTENDED, KIND, cake, contents, fill
 from power_cuts import cut_off
 
 import hrc_learn
@@ -49,16 +49,16 @@ def test_a_file_cut_off_at_any_step_is_the_old_or_the_new(tmp_path, mend):
     assert contents(tmp_path) == {"file": "new"}
 
 
-@pytest.mark.parametrize("others", ["refuse", "keep"])
+@pytest.mark.parametrize("kind", [KIND, EXTENDED])
 @pytest.mark.parametrize("before", [True, False])
-def test_a_folder_cut_off_at_any_step_is_the_old_or_the_new(tmp_path, before, others):
+def test_a_folder_cut_off_at_any_step_is_the_old_or_the_new(tmp_path, before, kind):
     """What was there before is there whole, or what replaces it is."""
     out, last = tmp_path / "out", 0
-    own = {"out/notes": "mine"} if others == "keep" and before else {}
+    own = {"out/notes": "mine"} if kind is EXTENDED and before else {}
 
     def begin() -> None:
         if out.exists():
-            fill(out, "old", overwrite=True, others=others)
+            fill(out, "old", overwrite=True, kind=kind)
         elif before:
             fill(out, "old")
         if own and not (out / "notes").exists():
@@ -72,7 +72,7 @@ def test_a_folder_cut_off_at_any_step_is_the_old_or_the_new(tmp_path, before, ot
         begin()
 
     reset()
-    for step in cut_off(lambda: fill(out, "new", overwrite=True, others=others)):
+    for step in cut_off(lambda: fill(out, "new", overwrite=True, kind=kind)):
         recover(out)
         assert contents(tmp_path) in (cake("old") | own if before else {}, cake("new") | own)
         last = step

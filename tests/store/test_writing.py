@@ -132,7 +132,8 @@ def test_results_say_what_they_were_made_from(tmp_path):
 
 
 def test_a_folder_remembers_the_identifier_of_its_source(tmp_path):
-    fill(tmp_path / "made", "new", source="recording 7")
+    with replacing(tmp_path / "made", KIND, source="recording 7") as folder:
+        folder.mkdir()
     assert store.source_of(tmp_path / "made") == "recording 7"
     (tmp_path / "foreign").mkdir()
     assert store.source_of(tmp_path / "foreign") == ""
