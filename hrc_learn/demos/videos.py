@@ -18,7 +18,7 @@ from jaxtyping import Float64, Shaped, UInt8
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import path_in, read_rows
-from hrc_learn.demos.read.dataset_folder import DatasetFolder, episode_lists
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, episode_lists, places_v2
 from hrc_learn.demos.read.metadata import Statistics, image_statistics
 from hrc_learn.store import sync_file
 
@@ -101,8 +101,7 @@ def _segments_v2(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment
     """The same for the versions 2, which keep one file per episode and camera."""
     size = int(folder.info.get("chunks_size", 1000))
     for entry in folder.episodes:
-        chunk = entry.index // size
-        places = {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": entry.index}
+        places = places_v2(entry.index, size)
         for key in video_keys(folder):
             times = (0.0, entry.length / folder.fps)
             yield entry.index, key, _segment(folder, key, times, **places)

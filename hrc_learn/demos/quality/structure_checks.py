@@ -158,8 +158,8 @@ def statistics_fit(
     folder: DatasetFolder, features: Sequence[FeatureProfiles]
 ) -> Iterator[Issue]:
     """Statistics that agree with the data."""
-    path = folder.root / _STATISTICS
-    recorded = read_json(path) if path.exists() else {}
+    exists = (folder.root / _STATISTICS).exists()
+    recorded = read_json(folder.root, _STATISTICS) if exists else {}
     for feature in features:
         stated, width = recorded.get(feature.key), len(feature.names)
         if stated is None:

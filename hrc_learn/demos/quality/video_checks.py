@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
-from hrc_learn.demos.read.dataset_files import is_inside, require_file
+from hrc_learn.demos.read.dataset_files import require_file
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.videos import VideoSegment, image_at, read_segments, video_keys
 
@@ -72,9 +72,7 @@ def _check_camera(
             report.add(warning(message=text, **place))
             return
         try:
-            require_file(path, name, first)
-            if not is_inside(folder.root, name):
-                raise DatasetError("leads out of the dataset: it is not followed")
+            require_file(folder.root, name, first)
             stream = _read_stream(path)
             report.run(_size_and_rate, folder, stream, place)
             report.run(_length, folder, shown, stream, place)

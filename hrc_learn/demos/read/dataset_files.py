@@ -26,14 +26,20 @@ _FIELD = re.compile(r"\{([a-z_]+)(?::0?(\d{1,2})d)?\}")
 _OUTSIDE = "leads out of the dataset: it is not followed"
 
 
-def require_file(path: Path, name: str | Path, episode: int | None = None) -> None:
-    """Check that a path is an ordinary, readable file.
+def require_file(root: Path, file: str, episode: int | None = None) -> None:
+    """Check that a path is an ordinary, readable file of the dataset.
+
+    Args:
+        root: Folder of the dataset.
+        file: Path relative to `root`.
+        episode: Episode that needs it.
 
     Raises:
-        DatasetError: There is no such file, it is a device or a pipe, may not be read, or is a
-            pointer of Git LFS.
+        DatasetError: There is no such file, it is a device or a pipe, may not be read, is a
+            pointer of Git LFS, or lies outside the dataset.
     """
-    place: dict[str, Any] = {"file": name, "episode": episode}
+    place: dict[str, Any] = {"file": file, "episode": episode}
+    path = root / file
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
@@ -48,6 +54,8 @@ def require_file(path: Path, name: str | Path, episode: int | None = None) -> No
     if head == _POINTER:
         text = "is a pointer of Git LFS, not the file itself: run `git lfs pull` in the dataset"
         raise DatasetError(text, **place)
+    if not is_inside(root, file):
+        raise DatasetError(_OUTSIDE, **place)
 
 
 def is_inside(root: Path, file: str | Path) -> bool:
@@ -85,28 +93,23 @@ def path_in(root: Path, template: object, key: str, **places: int | str) -> str:
     return file
 
 
-def read_text(path: Path) -> str:
-    """Text of a metadata file.
-
-    Raises:
-        DatasetError: The file is missing, too large, not UTF-8, or a pointer of Git LFS.
-    """
-    require_file(path, path)
+def _read_text(root: Path, file: str) -> str:
+    require_file(root, file)
     try:
-        if path.stat().st_size > _LARGEST_TEXT:
-            raise DatasetError("is too large to be metadata", file=path)
-        return path.read_bytes().decode("utf-8-sig")
+        if (root / file).stat().st_size > _LARGEST_TEXT:
+            raise DatasetError("is too large to be metadata", file=file)
+        return (root / file).read_bytes().decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"cannot be read as text: {error}", file=path) from error
+        raise DatasetError(f"cannot be read as text: {error}", file=file) from error
 
 
-def read_json(path: Path) -> dict:
-    """JSON object in a file.
+def read_json(root: Path, file: str) -> dict:
+    """JSON object in a metadata file.
 
     Raises:
-        DatasetError: The file holds none.
+        DatasetError: The file is missing, too large, or holds no JSON object.
     """
-    return _parse(read_text(path), path)
+    return _parse(_read_text(root, file), file)
 
 
 def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[dict]:
@@ -120,12 +123,8 @@ def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[di
     Raises:
         DatasetError: A line is malformed or lacks a field.
     """
-    path = root / file
-    require_file(path, file)
-    if not is_inside(root, file):
-        raise DatasetError(_OUTSIDE, file=file)
     rows = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(_read_text(root, file).splitlines(), start=1):
         if not line.strip():
             continue
         row = _parse(line, file, f"line {number} ")
@@ -136,7 +135,7 @@ def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[di
     return rows
 
 
-def _parse(text: str, file: str | Path, place: str = "") -> dict:
+def _parse(text: str, file: str, place: str = "") -> dict:
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: numbers of too many digits too
@@ -165,9 +164,7 @@ def open_parquet(root: Path, file: str, episode: int | None = None) -> pq.Parque
     Raises:
         DatasetError: The file is missing, truncated, or outside the dataset.
     """
-    require_file(root / file, file, episode)
-    if not is_inside(root, file):
-        raise DatasetError(_OUTSIDE, file=file, episode=episode)
+    require_file(root, file, episode)
     try:
         return pq.ParquetFile(root / file, page_checksum_verification=True)
     except (pa.ArrowException, OSError, ValueError) as error:

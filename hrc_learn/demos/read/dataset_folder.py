@@ -132,11 +132,10 @@ def read_info(root: Path) -> dict:
     Raises:
         DatasetError: The file is missing, damaged, or unusable.
     """
-    path = root / INFO_PATH
     settle(root)
-    if not path.exists():
-        raise DatasetError(_reason_of_absence(root), file=path)
-    info = read_json(path)
+    if not (root / INFO_PATH).exists():
+        raise DatasetError(_reason_of_absence(root), file=root / INFO_PATH)
+    info = read_json(root, INFO_PATH)
     missing = [key for key in ("codebase_version", "fps", "features") if key not in info]
     if missing:
         raise DatasetError(f"lacks {', '.join(missing)}", file=INFO_PATH)
@@ -235,13 +234,18 @@ def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     size = integer(info.get("chunks_size", 1000), "chunks_size", INFO_PATH, lowest=1)
     for row in rows:
         index, length = (integer(row[n], n, name) for n in ("episode_index", "length"))
-        # Version 2 keeps one file per episode, and `chunks_size` files per folder. Some
-        # converters name the folder as version 3 does.
-        chunk = index // size
-        places = {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": index}
-        file = path_in(root, info.get("data_path"), "data_path", **places)
+        file = path_in(root, info.get("data_path"), "data_path", **places_v2(index, size))
         tasks = _task_texts(row.get("tasks"))
         yield EpisodeEntry(index=index, length=length, tasks=tasks, file=file, start=0)
+
+
+def places_v2(episode: int, chunks_size: int) -> dict[str, int]:
+    """Fields of a path in version 2, which keeps one file per episode.
+
+    Some converters name the folder of `chunks_size` files as version 3 does.
+    """
+    chunk = episode // chunks_size
+    return {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": episode}
 
 
 def _task_texts(tasks: object) -> tuple[str, ...]:

@@ -118,23 +118,14 @@ EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 CHUNK_SIZE, FILE_SIZE_MB, VIDEO_FILE_SIZE_MB = 1000, 100, 200
 
 # pandas uses the task texts as the index of the table only with this metadata.
-_PANDAS_INDEX = {
-    "index_columns": ["task"],
-    "column_indexes": [],
-    "columns": [
-        {
-            "name": name,
-            "field_name": name,
-            "pandas_type": kind,
-            "numpy_type": numpy_kind,
-            "metadata": None,
-        }
-        for name, kind, numpy_kind in (
-            ("task_index", "int64", "int64"),
-            ("task", "unicode", "object"),
-        )
-    ],
+_TASK_INDEX = {
+    "name": "task",
+    "field_name": "task",
+    "pandas_type": "unicode",
+    "numpy_type": "object",
+    "metadata": None,
 }
+_PANDAS_INDEX = {"index_columns": ["task"], "column_indexes": [], "columns": [_TASK_INDEX]}
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 Statistics = dict[str, dict[str, list]]
