@@ -2,14 +2,13 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from hrc_learn.demos.demonstration import Demonstration
@@ -17,6 +16,7 @@ from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH, open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
 from hrc_learn.demos.videos import (
+    CameraImages,
     Image,
     Segments,
     VideoSegment,
@@ -215,18 +215,6 @@ def load_images(
     return ImageReader(path).read(episode, cameras, frames, size)
 
 
-@dataclass(frozen=True)
-class CameraImages:
-    """Images of a camera during an episode."""
-
-    codec: str
-    """Codec: jpeg, av1, h264, hevc or vp9."""
-    time: Float[np.ndarray, " images"]
-    """Times since the first image [s]."""
-    samples: tuple[bytes, ...]
-    """Files, or samples of a video in the order of decoding."""
-
-
 def camera_images(
     reader: ImageReader, demo: Demonstration
 ) -> Iterator[tuple[str, CameraImages | DatasetError]]:
@@ -240,10 +228,7 @@ def camera_images(
         segment = reader.segment(demo.episode, camera)
         try:
             encoded = None if segment is None else encoded_samples(segment)
-            if encoded is None:
-                yield name, thumbnails(reader, demo, camera)
-            else:
-                yield name, CameraImages(*encoded)
+            yield name, encoded or thumbnails(reader, demo, camera)
         except DatasetError as error:
             yield name, error
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 
-from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
+from hrc_learn.demos.demonstration import JOINT_FIELDS, Demonstration, DemonstrationSet
 from hrc_learn.geometry import quaternion
 
 
@@ -57,15 +57,9 @@ def local_polynomial(
     return coefficients[:, 0], coefficients[:, 1] / scale
 
 
-_SMOOTHED = (
-    "joint_position",
-    "joint_velocity",
-    "joint_effort",
-    "human_effort",
-    "position",
-    "orientation",
-)
-"""Fields that are smoothed."""
+_MEASURED = (name for name in JOINT_FIELDS if not name.startswith("command_"))
+_SMOOTHED = (*_MEASURED, "position", "orientation")
+"""Fields that are smoothed: commands are not."""
 
 _EVEN = 0.01
 """Largest difference of even steps, as a fraction of a step."""

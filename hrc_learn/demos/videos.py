@@ -115,19 +115,28 @@ def _segment(
     return VideoSegment(file=folder.root / file, start=float(times[0]), stop=float(times[1]))
 
 
+@dataclass(frozen=True)
+class CameraImages:
+    """Images of a camera during an episode."""
+
+    codec: str
+    """Codec: jpeg, av1, h264, hevc or vp9."""
+    time: Float64[np.ndarray, " images"]
+    """Times since the first image [s]."""
+    samples: tuple[bytes, ...]
+    """Files, or samples of a video in the order of decoding."""
+
+
 _CODECS = {"av1": "av1", "h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb", "vp9": "vp9"}
 """Codec -> filter that makes each sample complete by itself, or the codec itself for none."""
 
 
-def encoded_samples(
-    segment: VideoSegment,
-) -> tuple[str, Float64[np.ndarray, " _images"], tuple[bytes, ...]] | None:
+def encoded_samples(segment: VideoSegment) -> CameraImages | None:
     """The images of a segment as they are encoded, for players that decode on demand.
 
     Returns:
-        The codec, the time of each sample since the first image [s] in the order of decoding,
-        and the samples; None if the codec, or an order of images that differs from it, needs
-        decoding.
+        The samples; None if the codec, or an order of images that differs from that of
+        decoding, needs decoding.
 
     Raises:
         DatasetError: The video cannot be read.
@@ -160,7 +169,9 @@ def encoded_samples(
                     samples.append(bytes(part))
     except (av.FFmpegError, OSError, IndexError) as error:
         raise DatasetError(f"cannot be read as a video: {error}", file=segment.file) from error
-    return (codec, np.array(times), tuple(samples)) if len(times) == len(samples) else None
+    if len(times) != len(samples):
+        return None
+    return CameraImages(codec, np.array(times), tuple(samples))
 
 
 def decode(

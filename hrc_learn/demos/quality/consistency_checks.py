@@ -210,18 +210,16 @@ def _permuted(
     _, best = linear_sum_assignment(np.minimum(cost, 50))
     # Cycles of the permutation in which every component is far from its usual place: if only
     # some are, they resemble the others by chance.
-    exchanged: list[int] = []
-    for first in range(len(best)):
-        ring = [first]
-        while best[ring[-1]] != first:
-            ring.append(int(best[ring[-1]]))
-        if len(ring) > 1 and (off[ring] > _FAR_OFF).all():
-            exchanged.append(first)
-    if not exchanged:
+    cyclic, after = best != np.arange(len(best)), best
+    for _ in best:
+        cyclic &= off[after] > _FAR_OFF
+        after = best[after]
+    exchanged = np.flatnonzero(cyclic)
+    if not len(exchanged):
         return None
-    after = cost[exchanged, best[exchanged]]
+    left = cost[exchanged, best[exchanged]]
     # In their new places all components must look usual: within two spreads.
-    if after.max() >= 2 or after.mean() >= 0.3 * off[exchanged].mean():
+    if left.max() >= 2 or left.mean() >= 0.3 * off[exchanged].mean():
         return None
     pairs = ", ".join(f"{names[i]} like {names[best[i]]}" for i in exchanged[:4])
     return "error", f"columns look exchanged, in this episode alone: {pairs}"

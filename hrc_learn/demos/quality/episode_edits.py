@@ -293,17 +293,15 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     Joints, joint velocities and poses follow cubic splines, other columns straight lines;
     integers, switches and hands take the nearest frame. Joints, commands and Euler angles that
     jump by whole turns are unwrapped. Rotation vectors are interpolated as they are: unwrap
-    them first.
+    them first. Stamps must increase.
 
     Raises:
-        DatasetError: The stamps do not increase, the episode is shorter than a period, or it
-            holds transforms, which cannot be interpolated by their entries.
+        DatasetError: The episode is shorter than a period, or it holds transforms, which cannot
+            be interpolated by their entries.
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     known = edit.time - edit.time[0]
-    if (np.diff(known) <= 0).any():
-        raise edit.fault("stamps must increase to be resampled")
     try:
         grid = regular_grid(float(known[-1]), fps)
     except ValueError as error:
@@ -315,7 +313,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
             key="pose_matrix",
         )
     time = np.minimum(grid, known[-1])
-    smooth = _unwrapped_all(edit)
+    smooth = fix_signs(_unwrapped_all(edit))
     frames = {
         key: make_interp_spline(known, values.astype(float), k=1)(time)
         for key, values in smooth.frames.items()
@@ -325,8 +323,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
         if role in _SMOOTH:
             moved = moved.with_quantity(role, CubicSpline(known, values)(time))
         elif role.startswith("quaternion"):
-            signed = quaternion.continuous(torch.from_numpy(values)).numpy()
-            q = CubicSpline(known, signed)(time)
+            q = CubicSpline(known, values)(time)
             q /= np.linalg.norm(q, axis=1, keepdims=True)
             moved = moved.with_quantity(role, q)
     nearest = nearest_frames(known, time)

@@ -226,8 +226,6 @@ class _Repair:
         for name in ("drop_late", "trim", "drop_repeats", "unwrap", "fix_signs"):
             if getattr(options, name):
                 edit = getattr(edits, name)(edit)
-        if options.fps is not None:
-            edit = edits.resample_to_grid(edit, options.fps)
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
         if len(stalled):
             raise edit.fault(
@@ -235,7 +233,7 @@ class _Repair:
                 "episode out (drop_bad_episodes)",
                 frame=int(stalled[0]) + 1,
             )
-        return edit
+        return edit if options.fps is None else edits.resample_to_grid(edit, options.fps)
 
     def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> edits.EpisodeEdit:
         """The frames of an episode that are to be kept."""
