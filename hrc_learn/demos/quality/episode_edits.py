@@ -15,9 +15,11 @@ from hrc_learn.demos.preprocessing import nearest_frames, regular_grid, trim_res
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
-from hrc_learn.demos.read.frames import RawFrames, select_quantities
+from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
 from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.demos.read.profiles import is_discrete, profile_columns
+from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities, UnitDecision
 from hrc_learn.geometry import quaternion
 
@@ -110,10 +112,32 @@ class EpisodeEdit:
         return self.entry.error(message, frame=original, key=key)
 
 
+def unedited(
+    dataset: OpenedDataset,
+    units: Mapping[str, UnitDecision],
+    entry: EpisodeEntry,
+    frames: RawFrames,
+) -> EpisodeEdit:
+    """All frames of an episode, as they are."""
+    time = recorded_stamps(dataset.folder, frames)
+    if "time" in dataset.columns.selections:
+        ((key, index),) = dataset.columns.selections["time"].columns
+        time = frames[key][:, index].astype(float) * units["time"].factor
+    unused = {*INDEX_KEYS} - {"task_index"}
+    return EpisodeEdit(
+        entry=entry,
+        columns=dataset.columns,
+        units=units,
+        frames={key: values for key, values in frames.items() if key not in unused},
+        time=time,
+        kept=np.arange(entry.length),
+    )
+
+
 def renew_stamps(edit: EpisodeEdit, fps: float) -> EpisodeEdit:
     """Replace LeRobot's own stamps if they do not increase: they are frame / fps."""
     stalled = int((~(np.diff(edit.time) > 0)).sum())
-    if not stalled:
+    if not stalled or "time" in edit.selections:
         return edit
     change = f"renewed the stamps: {stalled} steps that did not increase -> 0"
     time = np.arange(len(edit)) / fps

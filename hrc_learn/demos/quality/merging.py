@@ -1,6 +1,5 @@
 """One dataset of several: columns by name, units and tasks as in the first, videos copied."""
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,8 +8,7 @@ import numpy as np
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality import column_rewriter as copying
-from hrc_learn.demos.quality.episode_edits import EpisodeEdit
-from hrc_learn.demos.quality.repair import RepairOptions, repair_dataset
+from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.quantities import INDEX_KEYS
@@ -69,25 +67,17 @@ def merge_datasets(
     report = MergeReport(path=Path(out))
     opened = [open_dataset(path) for path in paths]
     rate = opened[0].folder.fps if fps is None else float(fps)
-    with tempfile.TemporaryDirectory() as folder:
-        for number, dataset in enumerate(opened):
-            root, own = dataset.folder.root, dataset.folder.fps
-            if np.isclose(own, rate):
-                continue
-            if fps is None:
-                raise DatasetError(
-                    f"runs at {own:g} fps, but {opened[0].folder.root} at {rate:g}: "
-                    f"--fps {rate:g} --no-videos resamples it",
-                    file=root,
-                )
-            options = RepairOptions(
-                trim=False, unwrap=False, fix_signs=False, fps=rate, videos=videos
+    for folder in (dataset.folder for dataset in opened):
+        if np.isclose(folder.fps, rate):
+            continue
+        if fps is None:
+            raise DatasetError(
+                f"runs at {folder.fps:g} fps, but {opened[0].folder.root} at {rate:g}: "
+                f"--fps {rate:g} --no-videos resamples it",
+                file=folder.root,
             )
-            resampled = Path(folder) / f"{number}" / root.resolve().name
-            repair_dataset(root, resampled, options)
-            report.notes.append(f"{root}: resampled from {own:g} to {rate:g} fps")
-            opened[number] = open_dataset(resampled)
-        _Merge(opened, videos, report).write()
+        report.notes.append(f"{folder.root}: resampled from {folder.fps:g} to {rate:g} fps")
+    _Merge(opened, rate, videos, report).write()
     return report
 
 
@@ -141,8 +131,11 @@ class _Source:
 class _Merge:
     """One merge: the datasets, the features of all of them, and the report."""
 
-    def __init__(self, opened: Sequence[OpenedDataset], videos: bool, report: MergeReport):
-        self.sources, self.report, self.videos = [*map(_Source, opened)], report, videos
+    def __init__(
+        self, opened: Sequence[OpenedDataset], fps: float, videos: bool, report: MergeReport
+    ):
+        self.sources, self.report = [*map(_Source, opened)], report
+        self.fps, self.videos = fps, videos
         self.first = self.sources[0]
         self.features = self._common_features()
         robot = self.first.folder.robot_type
@@ -248,13 +241,10 @@ class _Merge:
 
     def write(self) -> None:
         """Write the merged dataset."""
-        report = self.report
-        tasks = [
-            *dict.fromkeys(
-                t for source in self.sources for t in copying.listed_tasks(source.folder)
-            )
-        ]
-        header = self._header(copying.new_header(self.first.dataset, {}, self.features))
+        report, first = self.report, self.first.dataset
+        listed = [t for source in self.sources for t in copying.listed_tasks(source.folder)]
+        tasks = [*dict.fromkeys(listed)]
+        header = self._header(copying.new_header(first, {}, self.features, fps=self.fps))
 
         def rewritten() -> Iterator[copying.Rewritten]:
             for source in self.sources:
@@ -283,16 +273,14 @@ class _Merge:
         sidecar = replace(old, columns=columns, contract=contract)
         return replace(own, features=features, sidecar=sidecar)
 
-    def _episodes(self, source: _Source, features: Mapping[str, dict]) -> Iterator[EpisodeEdit]:
-        """Episodes of a dataset as those of the first one, unedited."""
-        entries, fps = source.folder.episodes, source.folder.fps
-        keys = [*source.places, *({"task_index"} & source.features.keys())]
-        for entry, frames in read_frames(source.folder, entries, keys):
-            yield EpisodeEdit(
-                entry=entry,
-                columns=source.dataset.columns,
-                units=source.decisions,
-                frames=source.converted(frames, features),
-                time=np.arange(entry.length) / fps,
-                kept=np.arange(entry.length),
-            )
+    def _episodes(
+        self, source: _Source, features: Mapping[str, dict]
+    ) -> Iterator[edits.EpisodeEdit]:
+        """Episodes of a dataset as those of the first one, at its rate."""
+        folder = source.folder
+        for entry, frames in read_frames(folder, folder.episodes, folder.numbers):
+            edit = edits.unedited(source.dataset, source.decisions, entry, frames)
+            if not np.isclose(folder.fps, self.fps):
+                increasing = edits.drop_late(edits.renew_stamps(edit, folder.fps))
+                edit = edits.resample_to_grid(increasing, self.fps)
+            yield replace(edit, frames=source.converted(edit.frames, features))

@@ -13,7 +13,6 @@ from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_folder
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
-from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities
 from hrc_learn.demos.videos import read_segments, video_keys
@@ -186,9 +185,7 @@ class _Repair:
 
     def _read(self) -> Iterator[RawFrames | DatasetError]:
         """Numeric columns of every episode."""
-        features = self.folder.features.items()
-        keys = [key for key, f in features if f.numeric and key not in INDEX_KEYS]
-        return read_each(self.folder, self.folder.episodes, keys)
+        return read_each(self.folder, self.folder.episodes, self.folder.numbers)
 
     def episodes(self, progress: Progress | None) -> Iterator[copying.Rewritten]:
         """Repaired episodes; the report counts them, and those that are left out."""
@@ -219,9 +216,12 @@ class _Repair:
             raise fault
         if isinstance(frames, DatasetError):
             raise frames
-        edit = self._unedited(entry, frames)
-        if "time" not in edit.selections:
-            edit = edits.renew_stamps(edit, self.folder.fps)
+        edit = edits.unedited(self.dataset, self.decisions, entry, frames)
+        if self.kept is not None:
+            part, wanted = self.kept[entry.index], np.zeros(entry.length, dtype=bool)
+            wanted[part] = True
+            edit = edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
+        edit = edits.renew_stamps(edit, self.folder.fps)
         edit = edits.drop_bad_frames(edit, options.drop_bad_frames)
         for name in ("drop_late", "trim", "drop_repeats", "unwrap", "fix_signs"):
             if getattr(options, name):
@@ -234,27 +234,6 @@ class _Repair:
                 frame=int(stalled[0]) + 1,
             )
         return edit if options.fps is None else edits.resample_to_grid(edit, options.fps)
-
-    def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> edits.EpisodeEdit:
-        """The frames of an episode that are to be kept."""
-        columns = self.dataset.columns
-        time = recorded_stamps(self.folder, frames)
-        if "time" in columns.selections:
-            ((key, index),) = columns.selections["time"].columns
-            time = frames[key][:, index].astype(float) * self.decisions["time"].factor
-        unused = {*INDEX_KEYS} - {"task_index"}
-        edit = edits.EpisodeEdit(
-            entry=entry,
-            columns=columns,
-            units=self.decisions,
-            frames={key: values for key, values in frames.items() if key not in unused},
-            time=time,
-            kept=np.arange(entry.length),
-        )
-        part = slice(None) if self.kept is None else self.kept[entry.index]
-        wanted = np.zeros(entry.length, dtype=bool)
-        wanted[part] = True
-        return edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
 
 
 Verdict = Literal["accept", "cut", "reject"]

@@ -19,6 +19,7 @@ from hrc_learn.demos.read.dataset_files import (
     read_rows,
 )
 from hrc_learn.demos.read.metadata import QUANTILES, Feature, Statistics, read_features
+from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import resolved, settle
 
 _FASTEST = 1e6
@@ -83,6 +84,12 @@ class DatasetFolder:
     def is_v3(self) -> bool:
         """True for version 3.0, False for 2.0 and 2.1."""
         return generation(self.version) == 3
+
+    @property
+    def numbers(self) -> list[str]:
+        """Features that hold numbers, without LeRobot's own index columns."""
+        features = self.features.items()
+        return [key for key, f in features if f.numeric and key not in INDEX_KEYS]
 
     @cached_property
     def files(self) -> dict[str, list[EpisodeEntry]]:
