@@ -12,8 +12,8 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -66,9 +66,9 @@ class ArmServer:
     Attributes:
         world: The world.
         address: Network address of the arm, for its driver.
+        link: Server of the protocol, from franky-sim.
         cycles: Number of cycles so far.
         missed: Number of cycles of a motion that the driver did not answer in time.
-        lost: Number of packets of motions dropped on purpose, states and answers.
         longest_gap: Largest number of consecutive cycles of a motion without an answer. A
             control box stops the arm after 20; this server holds the velocity from then on.
     """
@@ -76,41 +76,31 @@ class ArmServer:
     def __init__(
         self,
         world: World,
-        addresses: Iterable[str],
-        *,
-        loss: float = 0.0,
         on_cycle: Callable[[DrivenCycle], None] | None = None,
     ):
         """Listen; `serve_world` calls this and closes the server.
 
         Args:
             world: The world. Its physics runs in steps of a cycle from now on.
-            addresses: Addresses of this machine; the first free one is taken.
-            loss: Fraction of the packets that are dropped, of states and of answers each.
             on_cycle: Called with each cycle of a motion, on the server's thread.
 
         Raises:
             ImportError: The package franky-sim is not installed.
-            OSError: None of the addresses is free.
-            ValueError: The loss is not in [0, 1).
         """
-        if not 0 <= loss < 1:
-            raise ValueError(f"loss must be in [0, 1), got {loss}")
-        self.world = world
-        self.cycles = self.missed = self.lost = self.longest_gap = self._gap = 0
-        self._loss, self._chance, self._on_cycle = loss, random.Random(0), on_cycle
+        self.world, self._on_cycle = world, on_cycle
+        self.cycles = self.missed = self.longest_gap = self._gap = 0
         try:
-            from hrc_learn.hardware.served_robot import LossyServer, ServedRobot
+            from hrc_learn.hardware.served_robot import PunctualServer, ServedRobot
         except ImportError as error:
             raise ImportError(
                 "the protocol of the arm is spoken by the package franky-sim: pip install "
                 "'hrc-learn[hardware]'."
             ) from error
         self._robot = ServedRobot(world)
-        self._server: Any = LossyServer(self._robot, list(addresses))
-        self._server.init()
-        self.address: str = self._server.hostname
-        self._server.process_commands()  # none yet, but a step needs a command before it
+        self.link: Any = PunctualServer(self._robot, loopback_addresses())
+        self.link.init()
+        self.address: str = self.link.hostname
+        self.link.process_commands()  # none yet, but a step needs a command before it
         self._due = world.time
         # Until when the thread may go on; None: as long as calls of the driver take.
         self._until: float | None = world.time
@@ -170,9 +160,9 @@ class ArmServer:
         self._hang_up()
 
     def _hang_up(self) -> None:
-        self._server.cleanup()
-        self._server.reset_state()
-        self._server.gripper_server.reset_state()
+        self.link.cleanup()
+        self.link.reset_state()
+        self.link.gripper_server.reset_state()
 
     def _has_paused(self) -> bool:
         return self._error is not None or (self._until is not None and not self._may_go_on())
@@ -208,19 +198,15 @@ class ArmServer:
         """Send the state to the driver and step the physics; the answer counts in the next
         cycle.
         """
-        server, robot = self._server, self._robot
+        robot = self._robot
         robot.step()
         robot.begin_cycle()
-        connected = server.udp_connected
-        server.lose_state, server.lose_answer = (
-            bool(server.current_motion_id) and self._chance.random() < self._loss
-            for _ in range(2)
-        )
-        server.send_state()
+        connected = self.link.udp_connected
+        self.link.send_state()
         self.cycles += 1
         self._sent = self._sent + 1 if connected else 0
         self._await_answer()
-        if motion := server.current_motion_id:
+        if motion := self.link.current_motion_id:
             self._gap = 0 if robot.answered else self._gap + 1
             self.longest_gap = max(self.longest_gap, self._gap)
             if not robot.answered and self._gap <= _BRIDGED:
@@ -230,13 +216,10 @@ class ArmServer:
                 self._on_cycle(DrivenCycle(motion, robot.velocity, position, robot.answered))
 
     def _await_answer(self) -> None:
-        server, give_up = self._server, time.monotonic() + _LATE
+        give_up = time.monotonic() + _LATE
         while True:
-            server.process_commands()
-            if self._robot.answered or not server.current_motion_id:
-                return
-            if server.lose_state or server.has_lost_answer:
-                self.lost += 1
+            self.link.process_commands()
+            if self._robot.answered or not self.link.current_motion_id:
                 return
             if time.monotonic() > give_up:
                 self.missed += 1
@@ -295,34 +278,22 @@ def loopback_addresses(number: int = 50) -> list[str]:
 
 @contextmanager
 def serve_world(
-    world: World,
-    addresses: Iterable[str] | None = None,
-    *,
-    loss: float = 0.0,
-    on_cycle: Callable[[DrivenCycle], None] | None = None,
+    world: World, on_cycle: Callable[[DrivenCycle], None] | None = None
 ) -> Iterator[ArmServer]:
     """A server of a world's arm, until the block ends.
 
     Args:
         world: The world, at rest, and not to be reset meanwhile. Its physics runs in steps of
             1 ms meanwhile.
-        addresses: Addresses of this machine; the first free one is taken. None: any.
-        loss: Fraction of the packets that are dropped, of states and of answers each.
         on_cycle: Called with each cycle of a motion, on the server's thread.
 
     Raises:
         ImportError: The package franky-sim is not installed.
-        OSError: None of the addresses is free.
-        ValueError: The loss is not in [0, 1).
     """
     step = world.model.opt.timestep
     world.model.opt.timestep = CYCLE
     try:
-        addresses = loopback_addresses() if addresses is None else addresses
-        server = ArmServer(world, addresses, loss=loss, on_cycle=on_cycle)
-        try:
+        with closing(ArmServer(world, on_cycle)) as server:
             yield server
-        finally:
-            server.close()
     finally:
         world.model.opt.timestep = step

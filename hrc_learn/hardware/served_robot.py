@@ -15,13 +15,8 @@ from hrc_learn.hardware.franka_settings import CYCLE
 from hrc_learn.sim.arm_model import FINGER_STROKE
 from hrc_learn.sim.world import World
 
-_CATCH_UP = 20.0
-"""Rate at which joints commanded by position approach it [1/s]: those of franky's motions move
-on by themselves, so this only takes away what rounding leaves."""
-
-
 class ServedRobot(BaseRobot):
-    """The world's arm and gripper, commanded by velocity or position in each cycle.
+    """The world's arm and gripper, commanded by joint velocities in each cycle.
 
     Its servos are the world's own, so commands of torque come to nothing.
 
@@ -35,7 +30,6 @@ class ServedRobot(BaseRobot):
         super().__init__()
         self._world = world
         self.answered = False
-        self._target: np.ndarray | None = None
         # Velocities of this cycle and of the two before it.
         self.velocity = self._last = self._before = np.zeros(7)
         self._width_goal: float | None = None
@@ -58,13 +52,9 @@ class ServedRobot(BaseRobot):
         self._before, self._last = self._last, self.velocity
 
     def go_on(self) -> None:
-        """Keep the acceleration of the last two cycles, for want of an answer.
-
-        Where positions are commanded, the arm waits for the next one instead.
-        """
-        if self._target is None:
-            self.velocity = 2 * self._last - self._before
-            self.joint_velocity_control(self.velocity, has_new_command=False)
+        """Keep the acceleration of the last two cycles, for want of an answer."""
+        self.velocity = 2 * self._last - self._before
+        self.joint_velocity_control(self.velocity, has_new_command=False)
 
     def joint_velocity_control(self, target_dq: Any, has_new_command: bool = True) -> None:
         self.answered |= has_new_command
@@ -76,29 +66,16 @@ class ServedRobot(BaseRobot):
             vars(self)["_BaseRobot__t"], (self.velocity - self._last) / CYCLE
         )
 
-    def joint_position_control(self, target_q: Any, has_new_command: bool = True) -> None:
-        self.answered |= has_new_command
-        super().joint_position_control(target_q, has_new_command)
-
     def _joint_velocity_control(self, target_dq: np.ndarray) -> None:
-        self._target = None
-        self._drive(np.asarray(target_dq, dtype=float))
+        self.velocity = np.asarray(target_dq, dtype=float)
+        self._world.arm.command(self.velocity)
+        self.torque_control([0.0] * 7)  # reported commanded torques
 
     def _joint_position_control(self, target_q: np.ndarray) -> None:
-        if self.server is None or not self.server.current_motion_id:
-            # No motion: its own servos hold the arm where it is.
-            self._target = None
-            self._drive(np.zeros(7))
-            return
-        ahead = np.zeros(7) if self._target is None else target_q - self._target
-        self._target = target_q.copy()
-        behind = target_q - self.reading.joint_position
-        self._drive(ahead / CYCLE + _CATCH_UP * behind)
-
-    def _drive(self, velocity: np.ndarray) -> None:
-        self.velocity = velocity
-        self._world.arm.command(velocity)
-        self.torque_control([0.0] * 7)  # reported commanded torques
+        if self.server is not None and self.server.current_motion_id:
+            raise NotImplementedError("the simulated arm takes motions by joint velocities only")
+        # Without a motion its own servos hold the arm where it is.
+        self._joint_velocity_control(np.zeros(7))
 
     def _torque_control(self, torques: np.ndarray) -> None:
         pass
@@ -131,25 +108,13 @@ class ServedRobot(BaseRobot):
         self._post_step()
 
 
-class LossyServer(FrankaRobotServer):
-    """Drops states, answers, and answers that come late."""
+class PunctualServer(FrankaRobotServer):
+    """Server that takes no answer to an earlier state.
 
-    lose_state = lose_answer = has_lost_answer = False
-
-    def send_state(self) -> None:
-        self.has_lost_answer = False
-        if self.lose_state:
-            # The package cannot leave one out, and has to count it.
-            self._FrankaServer__message_id += 1
-        else:
-            super().send_state()
+    Taken for this cycle's, each answer would be a cycle late from then on.
+    """
 
     def _handle_udp_command(self, command_data: bytes) -> None:
-        # An answer names its state. One to an earlier state comes too late: taken for this
-        # cycle's, each answer would be a cycle late from then on.
-        answered = int.from_bytes(command_data[:8], "little")
-        if answered != self._FrankaServer__message_id - 1:
-            return
-        self.has_lost_answer = self.lose_answer
-        if not self.lose_answer:
+        # An answer names its state; the package has counted on since it was sent.
+        if int.from_bytes(command_data[:8], "little") == self._FrankaServer__message_id - 1:
             super()._handle_udp_command(command_data)
