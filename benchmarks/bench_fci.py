@@ -127,8 +127,8 @@ def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, 
             except DriverError:  # too many cycles were missed
                 arm.recover()
             time.sleep(0.02)
-        timing, reflexes = arm.timing, arm.faults
-    return timing.cost, timing.answered_fraction, reflexes
+        costs, report = arm.costs, arm.report
+    return costs, report.cycles / (report.cycles + report.lost), report.faults
 
 
 def bare_loop(host: str, seconds: float) -> tuple[np.ndarray, float, int]:

@@ -1,13 +1,11 @@
 """Real arms, grippers and cameras; a driver is imported when its device is opened."""
 
-from hrc_learn.hardware.camera_delay import DelayMotion as DelayMotion
 from hrc_learn.hardware.camera_delay import measure_delay as measure_delay
 from hrc_learn.hardware.driver_process import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.driver_process import ArmProcess as ArmProcess
 from hrc_learn.hardware.driver_process import DriverError as DriverError
 from hrc_learn.hardware.driver_process import ending_at_rest as ending_at_rest
 from hrc_learn.hardware.franka_arm import FrankaArm as FrankaArm
-from hrc_learn.hardware.franka_arm import LoopTiming as LoopTiming
 from hrc_learn.hardware.franka_settings import CollisionConfig as CollisionConfig
 from hrc_learn.hardware.franka_settings import FrankaConfig as FrankaConfig
 from hrc_learn.hardware.franka_settings import FrankyConfig as FrankyConfig

@@ -32,31 +32,22 @@ _POWERS = 3
 _STEP = 2e-3
 # Fewest images, and smallest explained fraction of the pixels' motion, for a valid delay.
 _FEWEST, _EXPLAINED = 30, 0.9
-# Decay rate of the way back to where the joint was, and what is left of it [1/s, rad].
-_RETURN, _BACK = 2.0, 1e-3
+# Decay rate of the way back to where the joint was, what is left of it, and the longest that it
+# may take [1/s, rad, s].
+_RETURN, _BACK, _LONGEST_WAY_BACK = 2.0, 1e-3, 3.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class DelayMotion:
-    """Joint motion during the measurement of a delay."""
+def turning_velocity(passed: float, duration: float) -> float:
+    """Joint velocity some time after the start [rad/s]: rising frequency, smooth at both ends.
 
-    joint: int = 1
-    """Joint that turns, counted from 1; its motion must move the marker across the image."""
-    duration: float = 8.0
-    """[s]"""
-
-    def __post_init__(self) -> None:
-        if not self.duration > 0:
-            raise ValueError(f"duration must be positive, but is {self.duration}.")
-        if self.joint < 1:
-            raise ValueError(f"joint is counted from 1, but is {self.joint}.")
-
-    def velocity(self, passed: float) -> float:
-        """Joint velocity at a time [rad/s]: rising frequency, smooth at both ends."""
-        progress = passed / self.duration
-        turns = passed * (_SLOWEST + 0.5 * (_FASTEST - _SLOWEST) * progress)
-        gentle = min(1.0, 8 * progress, 8 * (1 - progress))
-        return _SPEED * gentle * math.sin(2 * math.pi * turns)
+    Args:
+        passed: Time since the start [s].
+        duration: Duration of the whole motion [s].
+    """
+    progress = passed / duration
+    turns = passed * (_SLOWEST + 0.5 * (_FASTEST - _SLOWEST) * progress)
+    gentle = min(1.0, 8 * progress, 8 * (1 - progress))
+    return _SPEED * gentle * math.sin(2 * math.pi * turns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,9 +70,10 @@ def measure_delay(
     marker: int,
     *,
     advance: Callable[[float], None],
-    motion: DelayMotion | None = None,
+    joint: int = 1,
+    duration: float = 8.0,
 ) -> MeasuredDelay:
-    """Measure a camera's delay by moving the arm before it; it ends where it began.
+    """Measure a camera's delay by moving the arm in front of it; it ends where it began.
 
     What is measured belongs into the camera's `delay`, and with it into
     `LatencyConfig(delay=...)` of the work cell.
@@ -91,29 +83,29 @@ def measure_delay(
         camera: Looks at it, from anywhere.
         marker: ArUco number on the arm.
         advance: Lets a given time pass [s].
-        motion: Of the arm; its surroundings are not looked at.
+        joint: Joint that turns, counted from 1; its motion must move the marker across the
+            image. Obstacles in the way are not considered.
+        duration: Duration of the motion [s].
 
     Raises:
-        ValueError: The arm has no such joint.
+        ValueError: The arm has no such joint, or the duration is not positive.
         CameraError: The marker is hardly seen, does not move with the joint, or the delay is
             longer than looked for.
     """
-    motion = motion or DelayMotion()
-    joint, joints = motion.joint - 1, len(arm.read().joint_position)
-    if joint >= joints:
-        raise ValueError(f"joint must be one of {joints}, but is {motion.joint}.")
-    detector, begun = MarkerDetector([marker]), arm.read()
-    home, times, positions = float(begun.joint_position[joint]), [], []
-    taken, pixels, last = [], [], None
+    home = arm.read().joint_position
+    if not 1 <= joint <= len(home):
+        raise ValueError(f"joint must be one of 1 to {len(home)}, but is {joint}.")
+    if not duration > 0:
+        raise ValueError(f"duration must be positive, but is {duration}.")
+    detector, turned = MarkerDetector([marker]), np.eye(len(home))[joint - 1]
+    times, positions, taken, pixels, last = [], [], [], [], None
     try:
-        for k in range(round(motion.duration / _DT)):
-            velocity = np.zeros(joints)
-            velocity[joint] = motion.velocity(k * _DT)
-            arm.command(velocity)
+        for k in range(round(duration / _DT)):
+            arm.command(turning_velocity(k * _DT, duration) * turned)
             advance(_DT)
             state = arm.read()
             times.append(state.time)
-            positions.append(float(state.joint_position[joint]))
+            positions.append(float(turned @ state.joint_position))
             image = camera.read()
             # An image that is read again is no new one.
             if last is not None and np.array_equal(image, last):
@@ -123,9 +115,14 @@ def measure_delay(
                 age = camera.age if isinstance(camera, TimedCamera) else 0.0
                 taken.append(state.time - age)
                 pixels.append(centre(seen))
-        _go_back(arm, joint, home, advance)
+        for _ in range(round(_LONGEST_WAY_BACK / _DT)):
+            velocity = _RETURN * turned * (home - arm.read().joint_position)
+            if np.abs(velocity).max() < _RETURN * _BACK:
+                break
+            arm.command(velocity)
+            advance(_DT)
     finally:
-        arm.command(np.zeros(joints))
+        arm.command(0 * home)
     if len(taken) < _FEWEST:
         raise CameraError(
             f"the camera saw marker {marker} in {len(taken)} different images, and at least "
@@ -134,18 +131,6 @@ def measure_delay(
     return fit_delay(
         np.array(times), np.array(positions), np.array(taken), np.array(pixels), _LONGEST
     )
-
-
-def _go_back(arm: Arm, joint: int, home: float, advance: Callable[[float], None]) -> None:
-    """Bring a joint back to where it was [rad]."""
-    for _ in range(round(3.0 / _DT)):
-        state = arm.read()
-        velocity = np.zeros_like(state.joint_position)
-        velocity[joint] = _RETURN * (home - state.joint_position[joint])
-        if abs(velocity[joint]) < _RETURN * _BACK:
-            return
-        arm.command(velocity)
-        advance(_DT)
 
 
 def fit_delay(

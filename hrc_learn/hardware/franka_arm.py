@@ -16,7 +16,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import final
 
@@ -59,23 +59,6 @@ _STILL = 0.02
 """Below this it is rest [rad/s]: an encoder's noise of 0.1 mrad is a quarter of it."""
 _PAUSE = 5e-4
 """Between two looks at whether something has happened [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopTiming:
-    """Timing of the loop so far."""
-
-    answered: int
-    """Cycles of motion that were answered."""
-    lost: int
-    """Cycles of motion of which no state was read in time."""
-    cost: Float[np.ndarray, " bins"]
-    """Number of answers by the time they took, from reading the state to sending the answer."""
-
-    @property
-    def answered_fraction(self) -> float:
-        """Fraction of all cycles answered in time; 1 before the first."""
-        return self.answered / max(1, self.answered + self.lost) if self.answered else 1.0
 
 
 @final
@@ -151,23 +134,23 @@ class FrankaArm:
     @property
     def fault(self) -> str:
         """Reason for which the arm has stopped; empty if it has not."""
-        stopped = self._report().phase in (Phase.FAULTED, Phase.ENDED)
+        stopped = self.report.phase in (Phase.FAULTED, Phase.ENDED)
         return self._shared.message if stopped else ""
 
     @property
-    def faults(self) -> int:
-        """Number of faults so far."""
-        return self._report().faults
+    def costs(self) -> Float[np.ndarray, " bins"]:
+        """Number of answers by the time they took, from reading the state to sending the answer,
+        in bins of 1 us.
+        """
+        return self._shared.costs.copy()
 
     @property
-    def timing(self) -> LoopTiming:
-        """Timing of the loop so far."""
-        report = self._report()
-        return LoopTiming(
-            answered=report.cycles,
-            lost=report.lost,
-            cost=self._shared.costs.copy(),
-        )
+    def report(self) -> Report:
+        """Newest report of the loop, with its counts of cycles and faults."""
+        line = self._shared.report.read()
+        if line is None:  # it died in the middle of a line
+            return Report(phase=Phase.ENDED)
+        return Report.of(line)
 
     def read(self) -> ArmState:
         """Return the newest state, by the clock of the robot.
@@ -175,7 +158,7 @@ class FrankaArm:
         Raises:
             DriverError: The loop has ended, or has read none for 0.2 s (2 s in lockstep).
         """
-        report = self._report()
+        report = self.report
         age = time.monotonic() - report.stamp
         longest = _STALE_IN_LOCKSTEP if self._config.lockstep else _STALE
         if age > longest and report.phase != Phase.RECOVERING:
@@ -211,7 +194,7 @@ class FrankaArm:
         self._await(
             lambda report: report.resting and report.phase != Phase.MOVING, _REST, "stop"
         )
-        before = self._report()
+        before = self.report
 
         def still(report: Report) -> bool:
             nonlocal before
@@ -246,7 +229,7 @@ class FrankaArm:
         Raises:
             DriverError: That is not possible; it says why.
         """
-        if self._report().phase != Phase.FAULTED:
+        if self.report.phase != Phase.FAULTED:
             self._check()
             return
         asked = self._orders.recoveries + 1
@@ -271,15 +254,9 @@ class FrankaArm:
             self._orders = replace(self._orders, **changes)  # pyright: ignore[reportArgumentType]
             self._shared.orders.write(self._orders.line())
 
-    def _report(self) -> Report:
-        line = self._shared.report.read()
-        if line is None:  # it died in the middle of a line
-            return Report(phase=Phase.ENDED)
-        return Report.of(line)
-
     def _check(self) -> None:
         """Raise what keeps the arm from moving."""
-        report = self._report()
+        report = self.report
         if report.phase == Phase.FAULTED:
             raise DriverError(self._shared.message)
         if report.phase == Phase.ENDED or not self._process.is_alive():
@@ -300,7 +277,7 @@ class FrankaArm:
 
     def _await(self, reached: Callable[[Report], bool], patience: float, what: str) -> None:
         end = time.monotonic() + patience
-        while not reached(report := self._report()):
+        while not reached(report := self.report):
             if report.phase == Phase.ENDED or not self._process.is_alive():
                 raise DriverError(f"cannot {what}: {self._stalled(report, math.inf)}")
             if time.monotonic() > end:

@@ -15,6 +15,7 @@ from hrc_learn.hardware.franka_settings import CYCLE
 from hrc_learn.sim.arm_model import FINGER_STROKE
 from hrc_learn.sim.world import World
 
+
 class ServedRobot(BaseRobot):
     """The world's arm and gripper, commanded by joint velocities in each cycle.
 
@@ -73,7 +74,9 @@ class ServedRobot(BaseRobot):
 
     def _joint_position_control(self, target_q: np.ndarray) -> None:
         if self.server is not None and self.server.current_motion_id:
-            raise NotImplementedError("the simulated arm takes motions by joint velocities only")
+            raise NotImplementedError(
+                "the simulated arm takes motions by joint velocities only"
+            )
         # Without a motion its own servos hold the arm where it is.
         self._joint_velocity_control(np.zeros(7))
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hrc_learn.hardware import FrankaConfig, LoopTiming
+from hrc_learn.hardware import FrankaConfig
 from hrc_learn.hardware.franka_loop import Punctuality, answer_was_lost
 from hrc_learn.hardware.franka_memory import Mailbox, Orders, Phase, Report, Shared
 
@@ -176,9 +176,3 @@ class TestPunctuality:
 def test_settings_that_make_no_sense_are_refused(make, named):
     with pytest.raises(ValueError, match=named):
         make()
-
-
-def test_timing_counts_the_cycles_that_were_answered():
-    timing = LoopTiming(answered=98, lost=2, cost=np.zeros(2000))
-    assert timing.answered_fraction == 0.98
-    assert LoopTiming(answered=0, lost=0, cost=np.zeros(2000)).answered_fraction == 1.0
