@@ -13,12 +13,13 @@ import signal
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from types import FrameType, TracebackType
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Any, Protocol, Self, final, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -41,6 +42,20 @@ class DriverError(RuntimeError):
 
 class ArmFaultError(RuntimeError):
     """The arm has stopped and takes no commands until `recover` is called."""
+
+
+class Connected(ABC):
+    """A device that is connected from its construction until its `with` block ends."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def checked_velocity(

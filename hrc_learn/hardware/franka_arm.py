@@ -32,7 +32,7 @@ from hrc_learn.deploy import (
     export_step,
 )
 from hrc_learn.distributed import ByValue
-from hrc_learn.hardware.driver_process import DriverError, checked_velocity
+from hrc_learn.hardware.driver_process import Connected, DriverError, checked_velocity
 from hrc_learn.hardware.franka_loop import import_pylibfranka, serve
 from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
 from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig
@@ -62,7 +62,7 @@ _PAUSE = 5e-4
 
 
 @final
-class FrankaArm:
+class FrankaArm(Connected):
     """The arm and its gripper, as an `Arm`, a `Gripper` and a `StoppableArm`.
 
         with FrankaArm("172.16.0.2", fr3) as arm:
@@ -139,7 +139,7 @@ class FrankaArm:
 
     @property
     def costs(self) -> Float[np.ndarray, " bins"]:
-        """Number of answers by the time they took, from reading the state to sending the answer,
+        """Number of answers by their duration, from reading the state to sending the answer,
         in bins of 1 us.
         """
         return self._shared.costs.copy()
@@ -242,12 +242,6 @@ class FrankaArm:
         self._order(end=True)
         self._process.join(_REST)
         self._end()
-
-    def __enter__(self) -> FrankaArm:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _order(self, **changes: object) -> None:
         with self._writing:

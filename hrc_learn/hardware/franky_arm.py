@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.driver_process import ArmFaultError, checked_velocity
+from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
 from hrc_learn.hardware.franka_settings import FrankyConfig, RealtimeError
 from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
@@ -30,7 +30,7 @@ _COMING_TO_REST = 2.0
 acceleration."""
 
 
-class FrankyArm:
+class FrankyArm(Connected):
     """A Franka arm and its gripper.
 
     A velocity holds for at most the config's `timeout`; then the driver brings the arm to rest.
@@ -173,12 +173,6 @@ class FrankyArm:
             # The control box takes one connection at a time: this one ends here.
             self._robot, self._closed = None, True
             self._fault = f"the arm at {self._ip} is closed: open it again."
-
-    def __enter__(self) -> FrankyArm:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _connect(self) -> None:
         franky, config = self._franky, self.config

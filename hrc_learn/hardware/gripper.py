@@ -10,6 +10,7 @@ from multiprocessing.connection import Connection
 from typing import Protocol, final, runtime_checkable
 
 from hrc_learn.hardware.driver_process import (
+    Connected,
     DriverError,
     DriverProcess,
     answer_calls,
@@ -58,7 +59,7 @@ class GripperDriver(Protocol):
 
 
 @final
-class GripperThread:
+class GripperThread(Connected):
     """A `Gripper` that neither blocks nor raises within an arm's control loop.
 
         with GripperThread(open_driver) as gripper:
@@ -160,12 +161,6 @@ class GripperThread:
         self._disconnect()
         for thread in self._threads:
             thread.join(_ENDING)
-
-    def __enter__(self) -> GripperThread:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _read(self) -> None:
         while not self._closed:

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.driver_process import ArmFaultError, checked_velocity
+from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
 from hrc_learn.hardware.lerobot_device import JointUnits, forget_late_replies, open_device
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
@@ -59,7 +59,7 @@ class LeRobotConfig:
     """Joints that turn against those of the description."""
 
 
-class LeRobotArm:
+class LeRobotArm(Connected):
     """A robot of LeRobot with joint positions, driven by velocities.
 
     A thread reads the positions and sends the next ones, into which the velocities are
@@ -195,12 +195,6 @@ class LeRobotArm:
         self._thread.join(5.0)
         with suppress(Exception):  # a bus that has gone, or a servo with an alarm
             self._robot.disconnect()
-
-    def __enter__(self) -> LeRobotArm:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _keep_going(self) -> None:
         """Read and send until the arm is closed."""

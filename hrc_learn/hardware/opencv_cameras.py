@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from hrc_learn.hardware.driver_process import Connected
 from hrc_learn.protocols import TimedCamera
 
 type RGB = UInt8[np.ndarray, "height width 3"]
@@ -31,7 +32,7 @@ class CameraError(RuntimeError):
     """A camera cannot be opened, or sends no images or none that can be used."""
 
 
-class CaptureCamera(TimedCamera):
+class CaptureCamera(Connected, TimedCamera):
     """A camera, stream or video file; a thread reads it and keeps only the newest image.
 
     The backend buffers several images, so a reader slower than the camera would receive ever
@@ -118,12 +119,6 @@ class CaptureCamera(TimedCamera):
             self._capture.release()
         with self._arrived:
             self._newest = None
-
-    def __enter__(self) -> CaptureCamera:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _first_image(self) -> np.ndarray:
         longest = self._timeout + _FIRST_IMAGE

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.driver_process import ArmFaultError, checked_velocity
+from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
 from hrc_learn.hardware.lerobot_arm import led_goal
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of, start_guard
 from hrc_learn.kinematics import SerialChain
@@ -70,7 +70,7 @@ class Ros2Config:
             )
 
 
-class Ros2Arm:
+class Ros2Arm(Connected):
     """An arm of ros2_control, or any with its topics, driven by velocities.
 
     A velocity holds for at most the config's `timeout`. Joint states that are old, reordered
@@ -317,9 +317,3 @@ class Ros2Arm:
             self._guard.kill()
             self._guard.wait()
         self.session.close()
-
-    def __enter__(self) -> Ros2Arm:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

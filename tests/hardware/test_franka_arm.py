@@ -172,7 +172,12 @@ def test_gripper_whose_process_died_is_connected_again(arm, capfd):
 
 
 def test_cycles_are_counted(arm):
-    wait_until(lambda: arm.report.cycles > 300)
+    def has_moved():
+        arm.command(np.full(7, 0.02))
+        return arm.report.cycles > 300
+
+    wait_until(has_moved)
+    arm.stop()
     counted = arm.costs.sum()
     assert counted > 300
     # Each answer is counted once, by its microseconds; the loop goes on between the two reads.
