@@ -38,7 +38,7 @@ from hrc_learn import cli
 from hrc_learn.cli._run import write_values
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState
-from hrc_learn.sim import MovingBodies, World
+from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.page import Page, PageConfig
 
@@ -128,11 +128,9 @@ def still_page(meshes: bool):
     workplace = Workplace()
     world, q = World(workplace.scene), workplace.home_joints().numpy()
     world.hold(workplace.scene.objects[0].name, q)
-    bodies = MovingBodies(world)
-    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
     config = PageConfig(meshes=meshes, silence=5.0, timeout=5.0)
     state = ArmState(time=0.0, joint_position=q, joint_velocity=np.zeros(7), gripper_width=0.05)
-    with Page(panda, drawn, workplace.scene.boxes(), config, task="measure") as page:
+    with Page(world, config, task="measure") as page:
         page.human.read(state)
         yield page, state
 

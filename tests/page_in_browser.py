@@ -15,7 +15,7 @@ import torch
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import MovingBodies, World
+from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation import InteractionForceConfig
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
@@ -47,13 +47,11 @@ class Session:
     def __init__(self, out: Path, mapping="transpose", **page_options):
         workplace, config = Workplace(), PageSessionConfig()
         world = World(workplace.scene)
-        bodies = MovingBodies(world)
-        drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
         self.writer = DatasetWriter(out, config.fps, "panda", panda.joint_names, FEATURES)
         options = {"silence": PATIENCE, "timeout": PATIENCE, "meshes": False} | page_options
         forces = InteractionForceConfig(mapping=mapping)
         page = PageConfig(forces=forces, **options)
-        self.page = Page(panda, drawn, workplace.scene.boxes(), page, task="show it")
+        self.page = Page(world, page, task="show it")
         self.recorder = DemonstrationRecorder(self.writer, lambda: self.page.task)
         self.session = PageSession(workplace, self.page, self.recorder, world)
         self.step = self.session.step()

@@ -39,7 +39,7 @@ from hrc_learn.hardware.ros2_topics import found_description, ros2_origin
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
-from hrc_learn.sim import MovingBodies, SceneConfig, World
+from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import Gamepad, HapticDevice, TerminalKeyboard
@@ -131,16 +131,14 @@ def page(args: ServePage) -> None:
         },
     )
     recorder = DemonstrationRecorder(writer, lambda: page.task, chain=robot.chain)
-    stands = [*workplace.scene.boxes(), *place_targets(workplace)]
+    targets = place_targets(workplace)
     try:
         # The recorder is closed last, so that an open demonstration is kept in any case.
         with recorder, connect() as opened:
-            bodies = MovingBodies(world)
-            drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
             config = replace(settings.session, guiding=replace(guiding, safety=safety))
             with (
                 _opened_device(args.device, robot.chain) as devices,
-                Page(robot.chain, drawn, stands, settings.page, task=settings.task) as page,
+                Page(world, settings.page, boxes=targets, task=settings.task) as page,
             ):
                 session = PageSession(
                     workplace,

@@ -24,7 +24,7 @@ from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.teleoperation.page_session import task_page
+from hrc_learn.teleoperation.page_session import TaskPage
 
 type Serve = Callable[[World], AbstractContextManager[ArmServer]]
 """Function that serves the arm of a world over its network protocol, such as `serve_world`."""
@@ -190,12 +190,10 @@ def simulated_cell(
             motion.advance(duration)
             on_step()
 
-        def tell(address: str) -> None:
-            observer.tell(f"Page at {address}")
-
         people, advance_all, task = human, advance, None
         if page is not None:
-            task = stack.enter_context(task_page(world, config.dt, page, tell, title))
+            task = stack.enter_context(TaskPage(world, config.dt, page, title))
+            observer.tell(f"Page at {task.url}")
             people, advance_all = task.joined(human, advance)
         cell = WorkCell(
             chain=world.arm.robot.chain,

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from types import FrameType, TracebackType
-from typing import Any, Protocol, Self, final, runtime_checkable
+from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -51,7 +51,7 @@ class Connected(ABC):
     def close(self) -> None:
         """Disconnect."""
 
-    def __enter__(self) -> Self:
+    def __enter__[Device](self: Device) -> Device:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -97,16 +97,12 @@ class RobotPage:
             note: Text shown on the page.
             guides: True if the person also guides the end effector, and not the body only.
         """
-        from hrc_learn.sim import MovingBodies, World
+        from hrc_learn.sim import World
         from hrc_learn.sim.workplace import Workplace
         from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 
-        self._served = ExitStack()
-        self._ghost = self._shown = World(Workplace.of(arm).scene)
-        self._bodies = MovingBodies(self._ghost)
-        drawn = self._bodies.drawn(*(poses[None] for poses in self._bodies.poses()))
-        config = PageConfig(host=host, port=port)
-        page = Page(arm.chain, drawn, self._ghost.config.boxes(), config, guides=guides)
+        self._served, self._ghost = ExitStack(), World(Workplace.of(arm).scene)
+        page = Page(self._ghost, PageConfig(host=host, port=port), guides=guides)
         self.page = self._served.enter_context(page)
         self.page.show(PageStatus(title="LeRobot", note=note))
 
@@ -117,15 +113,11 @@ class RobotPage:
             driver: Driver of the arm, read if there is no world.
             world: Simulated world with everything around the arm; None for a real arm.
         """
-        from hrc_learn.sim import MovingBodies
-
         if world is None:
             state = driver.read()
             world = self._ghost
             world.reset(state.joint_position, gripper_width=state.gripper_width)
-        if world is not self._shown:
-            self._shown, self._bodies = world, MovingBodies(world)
-        self.page.place(*self._bodies.poses())
+        self.page.place(world)
 
     def close(self) -> None:
         """Serve it no more."""

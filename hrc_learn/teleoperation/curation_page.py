@@ -11,7 +11,6 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
@@ -27,6 +26,7 @@ from hrc_learn.demos.quality.repair import (
 )
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.metadata import Feature
+from hrc_learn.store import json_text
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.gate import Visitor, incoming
@@ -198,7 +198,7 @@ class CurationPage:
                 told = self.state()
             except (ValueError, OSError) as error:
                 told = {"refused": str(error)}
-            await connection.send(_encode(told).decode())
+            await connection.send(json_text(told, indent=False))
 
     def act(self, message: CurationMessage) -> None:
         """Take a decision, or begin to write the cleaned dataset.
@@ -237,12 +237,8 @@ class CurationPage:
         )
 
 
-_encode = msgspec.json.Encoder(enc_hook=lambda array: array.tolist()).encode
-"""JSON of plain values, arrays and dataclasses; values that are not finite become null."""
-
-
 def _json(content: Any) -> Content:
-    return Content(body=_encode(content), kind="application/json")
+    return Content(body=json_text(content, indent=False).encode(), kind="application/json")
 
 
 def _other_charts(demo: Demonstration, features: Mapping[str, Feature]) -> Iterator[Chart]:

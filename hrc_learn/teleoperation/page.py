@@ -17,11 +17,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Float
 
-from hrc_learn.geometry import Body, Box, Pose
-from hrc_learn.kinematics import SerialChain
+from hrc_learn.geometry import Box, Pose
 from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.sim import MovingBodies, World
+from hrc_learn.store import json_text
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, messages
 from hrc_learn.teleoperation.gate.admission import RefusedError
@@ -92,17 +92,16 @@ _MOST_FAILURES = 25
 for no motion, as nothing is posted."""
 
 _logger = logging.getLogger("hrc_learn.page")
-_encode = msgspec.json.Encoder(enc_hook=lambda array: array.tolist()).encode
 
 
 class Page:
     """Serves the page and keeps it up to date, in threads of its own.
 
-        with Page(panda, bodies, boxes) as page:
+        with Page(world) as page:
             while running:
                 human_input = page.human.read(arm.read())
                 ...
-                page.place(positions, orientations)
+                page.place()
                 page.show(status)
 
     The control loop pays for `human.read`, `place` and `show` only, which exchange references.
@@ -120,11 +119,10 @@ class Page:
 
     def __init__(
         self,
-        chain: SerialChain,
-        bodies: Sequence[Body],
-        boxes: Sequence[Box] = (),
+        world: World,
         config: PageConfig | None = None,
         *,
+        boxes: Sequence[Box] = (),
         task: str = "",
         guides: bool = True,
         draws: bool | None = None,
@@ -132,11 +130,10 @@ class Page:
         """Serve the page; it follows the arm within the `with` block.
 
         Args:
-            chain: Kinematics of the arm.
-            bodies: Moving bodies with shapes and initial poses. "link1", "link2", ... can be
-                held; "hand", "finger_left" and "finger_right" move the end effector.
-            boxes: Fixed boxes.
+            world: World to show. "link1", "link2", ... of its bodies can be held; "hand",
+                "finger_left" and "finger_right" move the end effector.
             config: Settings of the page.
+            boxes: Fixed boxes beyond those of the world.
             task: Description of the task to demonstrate.
             guides: True if the person guides the end effector and records; False next to an arm
                 that works autonomously.
@@ -146,9 +143,12 @@ class Page:
         import viser
 
         self._config = config = config or PageConfig()
+        self._world, self._bodies = world, MovingBodies(world)
+        self._poses = self._bodies.poses()
+        bodies = self._bodies.drawn(*(poses[None] for poses in self._poses))
         if not config.meshes:
             bodies = [replace(body, meshes=()) for body in bodies]
-        self._chain = chain
+        boxes, self._chain = [*world.config.boxes(), *boxes], world.arm.robot.chain
         self.control = control = Control(config.silence, config.timeout, self._let_go)
         self.human = PageHuman(present=lambda: control.present)
         draws = guides if draws is None else draws
@@ -185,10 +185,6 @@ class Page:
         self.address = self._gate.address
         self.url, self.watch_url = self.address.link(), self.address.link(watch=True)
         self.headset_url = self.address.link("/xr") if headset else ""
-        self._poses = (
-            np.stack([body.position[0] for body in bodies]),
-            np.stack([body.orientation[0] for body in bodies]),
-        )
         self._status = PageStatus()
         self._closing = Event()
         self._error: BaseException | None = None
@@ -236,13 +232,16 @@ class Page:
         """
         return self._error is None
 
-    def place(
-        self,
-        positions: Float[np.ndarray, "bodies 3"],
-        orientations: Float[np.ndarray, "bodies 4"],
-    ) -> None:
-        """Tell after each step where the bodies are: positions [m], unit quaternions (wxyz)."""
-        self._poses = (positions, orientations)
+    def place(self, world: World | None = None) -> None:
+        """Show where the bodies are now; called after each step.
+
+        Args:
+            world: World with the same bodies that has taken the place of the last one; None: it
+                is the same.
+        """
+        if world is not None and world is not self._world:
+            self._world, self._bodies = world, MovingBodies(world)
+        self._poses = self._bodies.poses()
 
     def show(self, status: PageStatus) -> None:
         """Tell how the session stands."""
@@ -299,7 +298,7 @@ class Page:
             "active": editor is not None and editor.region is not None,
             "plan": () if status.plan is None else status.plan.round(4),
         }
-        self._sockets.scene = msgspec.Raw(_encode(scene))
+        self._sockets.scene = msgspec.Raw(json_text(scene, indent=False))
         return command
 
     def _draw(self, command: GizmoCommand, *, panel: bool) -> None:

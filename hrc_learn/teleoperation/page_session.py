@@ -2,8 +2,7 @@
 pulling the arm's body.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +13,7 @@ from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Human, OpenedArm, Request
-from hrc_learn.sim import MovingBodies, World
+from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.pick_and_place import INTERACT
@@ -31,7 +30,7 @@ from hrc_learn.teleoperation.hand_guiding import (
     InputFilterConfig,
     check_positive,
 )
-from hrc_learn.teleoperation.page import Page, PageConfig, PageHuman, PageStatus
+from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba
 
 # Of the fields drawn on the boards [m]: thin, but thick enough not to flicker with the board.
@@ -162,7 +161,6 @@ class PageSession:
         self.world, self.finished = world, False
         self._workplace, self._page, self._recorder = workplace, page, recorder
         self._config = config or PageSessionConfig()
-        self._bodies = MovingBodies(world)
         self._home = workplace.home_joints().numpy()
         self._jumps, self._remark = opened is None, ""
         self._opened = opened or world.opened_arm
@@ -191,7 +189,7 @@ class PageSession:
             self._width = width
             self._opened.gripper.move(width)
         self._opened.advance(self._config.guiding.dt)
-        self._page.place(*self._bodies.poses())
+        self._page.place()
         self._stop_when_left()
         for request in step.human_input.requests:
             self._remark = ""
@@ -290,28 +288,22 @@ def recorded_frame(step: GuidedStep, hands: Mapping[str, TrackedHand]) -> Frame:
     return frame
 
 
-class TaskPage:
-    """Page next to a task that runs autonomously: people watch it and pull the arm.
+class TaskPage(Page):
+    """Page next to a task that runs autonomously: people watch it and pull the arm."""
 
-    Attributes:
-        human: Combined input of the people at the page.
-    """
-
-    human: PageHuman
-
-    def __init__(self, world: World, page: Page, dt: float, title: str):
-        """Connect page and world.
+    def __init__(
+        self, world: World, dt: float, config: PageConfig, title: str = "Pick and place"
+    ):
+        """Serve the page.
 
         Args:
-            world: World to show.
-            page: Open.
+            world: World to show, which the task moves.
             dt: Control step of the task [s].
+            config: Settings of the page.
             title: Title of the task.
         """
-        self._title = title
-        self.human = page.human
-        self._world, self._page, self._bodies = world, page, MovingBodies(world)
-        self._rate, self._ticks = Rate(dt), 0
+        super().__init__(world, config, guides=False, draws=True)
+        self._title, self._rate, self._ticks = title, Rate(dt), 0
         self._cell: WorkCell | None = None
 
     def follow(self, cell: WorkCell) -> None:
@@ -336,9 +328,9 @@ class TaskPage:
 
     def tick(self) -> None:
         """After each control step: show where everything is, and let real time pass."""
-        self._page.place(*self._bodies.poses())
+        self.place()
         if self._ticks % _SHOW_EVERY == 0 and self._cell is not None:
-            self._page.show(self.status(self._cell))
+            self.show(self.status(self._cell))
         self._ticks += 1
         self._rate.wait()
 
@@ -376,29 +368,3 @@ def _followed(cell: WorkCell) -> DrawnRegion | None:
         return None
     (x, y, z), (a, b, c) = cell.region.centre.tolist(), cell.region.half_size.tolist()
     return DrawnRegion(centre=(x, y, z), half_size=(a, b, c))
-
-
-@contextmanager
-def task_page(
-    world: World,
-    dt: float,
-    config: PageConfig,
-    on_open: Callable[[str], None],
-    title: str = "Pick and place",
-) -> Iterator[TaskPage]:
-    """Serve a page on a world that a task moves.
-
-    Args:
-        world: World to show.
-        dt: Control period of the task [s].
-        config: Settings of the page.
-        on_open: Callback that receives the address of the page.
-        title: Title of the task.
-    """
-    bodies = MovingBodies(world)
-    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-    boxes = world.config.boxes()
-    chain = world.arm.robot.chain
-    with Page(chain, drawn, boxes, config, guides=False, draws=True) as page:
-        on_open(page.url)
-        yield TaskPage(world, page, dt, title)

@@ -103,8 +103,8 @@ class Grasping:
             return ScriptedExpert(
                 self.workplace.robot.chain,
                 GuidedPath(np.vstack(points), duration, start),
-                tremor=Tremor(_TREMOR, rng),
-                orientation=lambda _position, _time: gripper_down(),
+                lambda _position, _time: gripper_down(),
+                Tremor(_TREMOR, rng),
             )
 
         closing = _APPROACH + _GRIP

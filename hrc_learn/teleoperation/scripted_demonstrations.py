@@ -21,6 +21,7 @@ from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import (
+    CombinedInput,
     Frame,
     GuidedStep,
     HandGuidedArm,
@@ -30,6 +31,7 @@ from hrc_learn.teleoperation.scripted_expert import (
     GuidedPath,
     ScriptedExpert,
     ScriptedForce,
+    ScriptedPerturbation,
     Tremor,
 )
 from hrc_learn.vision import angle, centre
@@ -143,8 +145,8 @@ def servo_expert(
     return ScriptedExpert(
         workplace.robot.chain,
         path,
-        tremor=Tremor(size * config.tremor, rng),
-        orientation=orientation,
+        orientation,
+        Tremor(size * config.tremor, rng),
     )
 
 
@@ -312,7 +314,7 @@ def placing_expert(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
-) -> ScriptedExpert:
+) -> Human:
     """Reset a world for placing, and return the expert that puts the object on a shelf.
 
     Args:
@@ -327,15 +329,17 @@ def placing_expert(
     world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
     waypoints = workplace.path_to_shelf(shelf, config.lift)
     waypoints[0] += offset
-    # Whose elbow is where it has to be, once the hand is, cannot be pulled aside.
-    pulled = config.pull_elbow and workplace.robot.null_space == "arm angle"
-    return ScriptedExpert(
-        workplace.robot.chain,
+    chain = workplace.robot.chain
+    expert = ScriptedExpert(
+        chain,
         GuidedPath(waypoints.numpy(), config.duration),
-        forces=ELBOW_FORCES if pulled else (),
-        tremor=Tremor(size * config.tremor, rng),
-        orientation=lambda position, _: coarse_orientation(position, workplace.level_at),
+        lambda position, _: coarse_orientation(position, workplace.level_at),
+        Tremor(size * config.tremor, rng),
     )
+    # An arm without a free arm angle has its elbow where the end effector requires it.
+    if not config.pull_elbow or workplace.robot.null_space != "arm angle":
+        return expert
+    return CombinedInput(expert, ScriptedPerturbation(chain, ELBOW_FORCES))
 
 
 def demonstrate_placing(

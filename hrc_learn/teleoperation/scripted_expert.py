@@ -1,5 +1,5 @@
-"""Scripted people: one pulls the arm at given times, the expert also guides the end effector
-along way points.
+"""Scripted people: one pulls the arm at given times, the expert guides the end effector along
+way points.
 """
 
 import math
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, minimum_jerk
-from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation.hand_guiding import (
     TINY,
@@ -211,46 +211,38 @@ Orientation = Callable[[Float[torch.Tensor, "3"], float], Float[torch.Tensor, "4
 """Orientation (wxyz) the end effector should have at a position [m] and time [s]."""
 
 
-def _by_the_rule(position: Float[torch.Tensor, "3"], _time: float) -> Float[torch.Tensor, "4"]:
-    return coarse_orientation(position)
-
-
 class ScriptedExpert(Human):
-    """Teaches a motion in task space and null-space posture at once, with an unsteady hand.
+    """Guides the end effector with an unsteady hand.
 
-    Position follows a guided path, corrected by eye; orientation follows a rule; meanwhile the
-    other hand pulls joints in the null space.
+    Position follows a guided path, corrected by eye; orientation follows a rule.
     """
 
     def __init__(
         self,
         chain: SerialChain,
         path: GuidedPath,
-        forces: Sequence[ScriptedForce] = (),
-        tremor: Tremor | None = None,
-        orientation: Orientation = _by_the_rule,
+        orientation: Orientation,
+        tremor: Tremor,
     ):
         """Prepare the script.
 
         Args:
             chain: The arm.
             path: Path of the end effector.
-            forces: Times, places and forces of pulls at the body.
+            orientation: Rule for the orientation, such as the paper's coarse one.
             tremor: Unsteadiness of the end effector.
-            orientation: Rule for the orientation; the paper's coarse one by default.
         """
         self.path, self.orientation = path, orientation
         self._chain, self._tremor = chain, tremor
-        self._puller = ScriptedPerturbation(chain, forces)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the end effector and pull at the body at the state's time."""
+        """Motion of the end effector at the state's time."""
         pose = self._chain.forward(torch.from_numpy(state.joint_position))
         wanted = torch.from_numpy(self.path.position(state.time))
         # The rule turns the end effector where it is, not where it should be.
         goal = Pose(wanted, self.orientation(pose.position, state.time))
         twist = _GAIN * pose.twist_to(goal).numpy()
         twist[:3] += self.path.velocity(state.time)
-        if self._tremor is not None and state.time < self.path.end:
+        if state.time < self.path.end:
             twist[:3] += self._tremor.velocity(state.time)
-        return HumanInput(nullspace_input=self._puller.read(state).nullspace_input, twist=twist)
+        return HumanInput(twist=twist)

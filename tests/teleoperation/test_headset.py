@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Feedback
-from hrc_learn.sim import MovingBodies, World
+from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.page import Page, PageConfig
 
@@ -32,10 +32,8 @@ def still_page():
     workplace = Workplace()
     world, q = World(workplace.scene), workplace.home_joints().numpy()
     world.hold(workplace.scene.objects[0].name, q)
-    bodies = MovingBodies(world)
-    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
     config = PageConfig(silence=PATIENCE, timeout=PATIENCE, meshes=False)
-    with Page(panda, drawn, workplace.scene.boxes(), config, task="lead it") as page:
+    with Page(world, config, task="lead it") as page:
         state = ArmState(
             time=0.0, joint_position=q, joint_velocity=np.zeros(7), gripper_width=0.05
         )

@@ -8,6 +8,7 @@ import pytest
 from page_in_browser import PATIENCE, Browser, chromium, wait_until
 from taught_models import teach
 
+from hrc_learn.experiments import simulated_cell
 from hrc_learn.experiments.collaboration_trial import (
     CollaborationScenario,
     simulate_collaboration,
@@ -16,8 +17,8 @@ from hrc_learn.experiments.run_measures import ELBOW, Deviation, span
 from hrc_learn.experiments.simulated_cell import Observer
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
-from hrc_learn.teleoperation import page_session as task_page
 from hrc_learn.teleoperation.page import Page, PageConfig
+from hrc_learn.teleoperation.page_session import TaskPage
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -73,9 +74,7 @@ class Job:
 
 def test_the_elbow_yields_to_the_mouse_while_the_end_effector_servoes(tmp_path, monkeypatch):
     job = Job(*teach(tmp_path))
-    monkeypatch.setattr(
-        task_page, "Page", lambda *given, **named: job.open(Page(*given, **named))
-    )
+    monkeypatch.setattr(simulated_cell, "TaskPage", lambda *given: job.open(TaskPage(*given)))
     # The browser, which takes most of the machine, is closed before the job goes on.
     with job, chromium(tmp_path / "chromium") as tab:
         wait_until(lambda: job.cell, "a page", timeout=180)

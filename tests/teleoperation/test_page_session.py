@@ -12,7 +12,7 @@ from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import DrawnRegion, Feedback, Human, HumanInput, Reason
 from hrc_learn.regions import PositionRegion
-from hrc_learn.sim import MovingBodies, World
+from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation, page_session
@@ -23,7 +23,7 @@ from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
     PageSessionConfig,
-    task_page,
+    TaskPage,
 )
 from hrc_learn.viz.palette import PERSON, VERMILION, rgba
 
@@ -46,9 +46,8 @@ def world():
 @pytest.fixture
 def beside(world):
     pytest.importorskip("viser", reason="the extra `ui` is not installed")
-    opened = []
-    with task_page(world, 0.01, PageConfig(), opened.append) as beside:
-        assert opened[0].startswith("http://127.0.0.1:")
+    with TaskPage(world, 0.01, PageConfig()) as beside:
+        assert beside.url.startswith("http://127.0.0.1:")
         yield beside
 
 
@@ -70,10 +69,8 @@ def session_from(start, tmp_path):
     workplace, config = Workplace(), PageSessionConfig()
     world = World(workplace.scene)
     world.hold(workplace.scene.objects[0].name, start.numpy())
-    bodies = MovingBodies(world)
-    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
     writer = DatasetWriter(tmp_path / "demos", config.fps, "panda", panda.joint_names, FEATURES)
-    page = Page(panda, drawn, workplace.scene.boxes(), PageConfig(), task="show it")
+    page = Page(world, PageConfig(), task="show it")
     with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
         yield PageSession(
             workplace, page, recorder, world, opened=world.opened_arm, inputs=(Asking(),)
@@ -111,9 +108,9 @@ def test_the_script_and_the_page_pull_together_while_somebody_holds_on(world, be
         return human.read(world.arm.read()).effort(7)
 
     np.testing.assert_array_equal(effort(), np.ones(7))
-    beside._page.control.join("somebody")
+    beside.control.join("somebody")
     for _ in range(1000):  # the page renews what is asked, and may come in between
-        beside._page.control.hear("somebody")
+        beside.control.hear("somebody")
         beside.human.post(HumanInput(nullspace_input=np.arange(7.0)))
         if (pulled := effort()).any() and pulled[6] > 1:
             break
@@ -171,7 +168,7 @@ def test_the_page_shows_the_region_that_a_controller_follows(world, beside, monk
 
 
 def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, beside):
-    page = beside._page
+    page = beside
     human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
     cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
     # Both the arm's and its twin's, which viser's thread colours one after the other.

@@ -66,7 +66,10 @@ def test_the_experts_hand_reaches_the_end_of_the_path():
     position = panda.forward(start).position.numpy()
     goal = position + np.array([0.05, -0.2, -0.1])
     path = GuidedPath(np.stack([position, goal]), duration=4.0)
-    expert = ScriptedExpert(panda, path)
+    still = Tremor(0.0, np.random.default_rng(0))
+    expert = ScriptedExpert(
+        panda, path, lambda position, _: coarse_orientation(position), still
+    )
     q, dt = start, 0.01
     for k in range(600):
         state = ArmState(
