@@ -14,6 +14,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import itertools
 import json
 import subprocess
 import tempfile
@@ -156,7 +157,9 @@ def job(
         )
     server, link = served[-1]
     # A cycle whose packet was dropped is missed, too.
-    counts = {"missed": server.missed, "lost": link.lost, "longest_gap": server.longest_gap}
+    gaps = itertools.groupby(cycles, lambda cycle: cycle.answered)
+    longest = max((len([*gap]) for answered, gap in gaps if not answered), default=0)
+    counts = {"missed": server.missed, "lost": link.lost, "longest_gap": longest}
     return row | counts | judged(cycles) | {"wall": time.monotonic() - begun}
 
 

@@ -303,18 +303,7 @@ def _controller(
         Goals.at(centre, down, target),
         config=ControllerConfig(safety=safety),
     )
-    q = chain.ready
-    observation = Observation(
-        joint_position=q,
-        feature=target,
-        feature_visible=torch.tensor(False),
-        feature_new=torch.tensor(False),
-        image_joint_position=q,
-        nullspace_input=torch.zeros_like(q),
-        # A tensor, so that one compiled step serves all rates.
-        dt=torch.tensor(dt, dtype=torch.float64),
-    )
-    return controller, observation
+    return controller, Observation.unseen(chain.ready, target, dt)
 
 
 def _run_serve(

@@ -312,6 +312,29 @@ class Observation:
     stop: Bool[Tensor, "*batch"] | None = None
     """True to brake to rest and stay there, for a watchdog or a person; None: no."""
 
+    @classmethod
+    def unseen(
+        cls, joint_position: Float[Tensor, " n"], target: Float[Tensor, " rows"], dt: float
+    ) -> Observation:
+        """Observation of an arm at rest before the first image, with every field that the loop
+        of an arm and a camera sets.
+
+        Args:
+            joint_position: Joint positions [rad].
+            target: Place in the image that stands for the feature [px].
+            dt: Time until the next step [s]; a tensor in the observation, so that one compiled
+                step serves all rates.
+        """
+        return cls(
+            joint_position=joint_position,
+            feature=target,
+            feature_visible=torch.tensor(False),
+            feature_new=torch.tensor(False),
+            image_joint_position=joint_position,
+            nullspace_input=torch.zeros_like(joint_position),
+            dt=joint_position.new_tensor(dt),
+        )
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)

@@ -246,9 +246,9 @@ def live_view(title: str, on_open: Callable[[str], None]) -> LiveView:
         def snapshot() -> RunRecording | None:
             return record(title, cell, world, motion) if len(motion) else None
 
-        with serve_stream() as server:
-            on_open(server.viewer)
-            with live_dashboard(server.stream, snapshot):
+        with serve_stream() as (stream, address):
+            on_open(address)
+            with live_dashboard(stream, snapshot):
                 yield
 
     return watch

@@ -1,6 +1,5 @@
 """Real arms, grippers and cameras; a driver is imported when its device is opened."""
 
-from hrc_learn.hardware.camera_delay import measure_delay as measure_delay
 from hrc_learn.hardware.driver_process import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.driver_process import ArmProcess as ArmProcess
 from hrc_learn.hardware.driver_process import DriverError as DriverError
@@ -18,5 +17,6 @@ from hrc_learn.hardware.lerobot_arm import LeRobotArm as LeRobotArm
 from hrc_learn.hardware.lerobot_arm import LeRobotConfig as LeRobotConfig
 from hrc_learn.hardware.opencv_cameras import CameraError as CameraError
 from hrc_learn.hardware.opencv_cameras import CaptureCamera as CaptureCamera
+from hrc_learn.hardware.opencv_cameras import measure_delay as measure_delay
 from hrc_learn.hardware.ros2_arm import Ros2Arm as Ros2Arm
 from hrc_learn.hardware.ros2_arm import Ros2Config as Ros2Config

@@ -138,13 +138,6 @@ class FrankaArm(Connected):
         return self._shared.message if stopped else ""
 
     @property
-    def costs(self) -> Float[np.ndarray, " bins"]:
-        """Number of answers by their duration, from reading the state to sending the answer,
-        in bins of 1 us.
-        """
-        return self._shared.costs.copy()
-
-    @property
     def report(self) -> Report:
         """Newest report of the loop, with its counts of cycles and faults."""
         line = self._shared.report.read()

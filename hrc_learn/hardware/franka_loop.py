@@ -29,14 +29,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.deploy import StepRunner
-from hrc_learn.hardware.franka_memory import (
-    COST_BINS,
-    JOINTS,
-    Orders,
-    Phase,
-    Report,
-    Shared,
-)
+from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
 from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig, RealtimeError
 
 _AGREES = 1e-5
@@ -214,7 +207,7 @@ class ControlLoop:
         self._driver = import_pylibfranka()
         self._ip, self._config, self._runner, self._parent = ip, config, runner, parent
         self._shared, self._report = shared, Report()
-        self._orders, self._costs = Orders(), shared.costs
+        self._orders = Orders()
         self._sent = self._reported = np.full(JOINTS, np.nan)
         self._recovered = -np.inf  # a velocity from before must not move the arm afterwards
         self._velocity = runner.observation["joint_velocity"]
@@ -312,11 +305,9 @@ class ControlLoop:
             answer = self._driver.JointVelocities(self._sent.tolist())
             answer.motion_finished = finished
             control.writeOnce(answer)
-            cost = time.perf_counter() - begin
+            report.cost = time.perf_counter() - begin
             report.resting = rests
             report.cycles += 1
-            if not finished:  # that waits for the box to confirm
-                self._costs[min(int(1e6 * cost), COST_BINS - 1)] += 1
             self._publish(Phase.MOVING)
 
     def _adopt(self, state: Any) -> None:

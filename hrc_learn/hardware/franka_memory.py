@@ -15,10 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 JOINTS = 7
-COST_BINS = 2000
-"""Number of bins of the histogram of cycle costs, each 1 us wide; the last holds all longer
-ones.
-"""
 _TEXT = 2000
 """Longest message about a fault [bytes]."""
 _TRIES = 100
@@ -136,6 +132,8 @@ class Report(Numbers):
     """Answered in motion."""
     lost: int = 0
     """Cycles whose state could not be answered in time."""
+    cost: float = 0.0
+    """Duration from reading the state that was answered last to sending the answer [s]."""
     resting: bool = True
     """True if the velocity sent last is zero."""
     joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
@@ -153,7 +151,6 @@ class Shared:
     def __init__(self):
         self.orders, self.report = Mailbox(Orders().line()), Mailbox(Report().line())
         self._text = RawArray("c", _TEXT)
-        self._costs = RawArray("d", COST_BINS)
 
     @property
     def message(self) -> str:
@@ -163,8 +160,3 @@ class Shared:
     @message.setter
     def message(self, text: str) -> None:
         self._text.value = text.encode()[: _TEXT - 1]
-
-    @property
-    def costs(self) -> Float[np.ndarray, " bins"]:
-        """Number of cycles by their cost [us], from reading a state to answering it."""
-        return np.frombuffer(self._costs, dtype=float)

@@ -69,8 +69,6 @@ class ArmServer:
         link: Server of the protocol, from franky-sim.
         cycles: Number of cycles so far.
         missed: Number of cycles of a motion that the driver did not answer in time.
-        longest_gap: Largest number of consecutive cycles of a motion without an answer. A
-            control box stops the arm after 20; this server holds the velocity from then on.
     """
 
     def __init__(
@@ -88,7 +86,7 @@ class ArmServer:
             ImportError: The package franky-sim is not installed.
         """
         self.world, self._on_cycle = world, on_cycle
-        self.cycles = self.missed = self.longest_gap = self._gap = 0
+        self.cycles = self.missed = self._gap = 0
         try:
             from hrc_learn.hardware.served_robot import PunctualServer, ServedRobot
         except ImportError as error:
@@ -208,7 +206,6 @@ class ArmServer:
         self._await_answer()
         if motion := self.link.current_motion_id:
             self._gap = 0 if robot.answered else self._gap + 1
-            self.longest_gap = max(self.longest_gap, self._gap)
             if not robot.answered and self._gap <= _BRIDGED:
                 robot.go_on()
             if self._on_cycle is not None:
@@ -267,12 +264,12 @@ class ServedArm:
             self._arm.close()
 
 
-def loopback_addresses(number: int = 50) -> list[str]:
+def loopback_addresses() -> list[str]:
     """Some of this machine's own addresses, at random, so that servers do not meet."""
     chance = random.Random()
     return [
         f"127.{chance.randrange(1, 255)}.{chance.randrange(256)}.{chance.randrange(1, 255)}"
-        for _ in range(number)
+        for _ in range(50)
     ]
 
 

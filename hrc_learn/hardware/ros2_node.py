@@ -154,19 +154,11 @@ class ControllerNode:
         J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
         estimator = KalmanEstimator(RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1))
         pose = self._chain.forward(q)
-        pixel, no = q.new_zeros(2) + 100.0, torch.tensor(False)
+        pixel = q.new_zeros(2) + 100.0
         goals = Goals.at(pose.position, pose.orientation, pixel).with_vision(False)
         controller = AdaptiveController(self._chain, estimator, goals, config=config)
-        observation = Observation(
-            joint_position=q,
-            feature=pixel,
-            feature_visible=no,
-            feature_new=no,
-            feature_age=q.new_zeros(()),
-            image_joint_position=q,
-            nullspace_input=torch.zeros_like(q),
-            goals=goals,
-            dt=q.new_tensor(0.002),
+        observation = replace(
+            Observation.unseen(q, pixel, 0.002), feature_age=q.new_zeros(()), goals=goals
         )
         self._runner, self._detector = self._make(controller, observation), None
         if (marker := round(self._value("marker"))) >= 0:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.error import URLError
 from urllib.request import urlopen
 
@@ -37,19 +37,12 @@ _EVERY = 0.1
 """Time between two looks for new data [s]."""
 
 
-class DashboardServer(NamedTuple):
-    """Recording stream that is served to browsers."""
-
-    stream: RecordingStream
-    viewer: str
-    """Address of the page, with its secret."""
-
-
 @contextmanager
-def serve_stream(port: int | None = 9090) -> Iterator[DashboardServer]:
+def serve_stream(port: int | None = 9090) -> Iterator[tuple[RecordingStream, str]]:
     """Serve a recording stream and its viewer until the `with` block ends.
 
-    A page that is opened later shows all earlier data.
+    A page that is opened later shows all earlier data. Yields the stream and the address of
+    the page, with its secret.
 
     Args:
         port: Port of the page; None: the first free one from 8080 on.
@@ -68,7 +61,7 @@ def serve_stream(port: int | None = 9090) -> Iterator[DashboardServer]:
         return parts
 
     with _served(port, data) as url:
-        yield DashboardServer(stream, url)
+        yield stream, url
         data()
         time.sleep(2 * _EVERY)  # pages that are open receive the end
 

@@ -132,7 +132,7 @@ def gizmo_nullspace_input(
     chain: SerialChain,
     joint_position: Float[np.ndarray, " joints"],
     joint: int,
-    point: Float[np.ndarray, "3"],
+    point: Float[np.ndarray, "3"] | None,
     displacement: Float[np.ndarray, "3"],
     config: InteractionForceConfig,
 ) -> Float[np.ndarray, " joints"]:
@@ -145,7 +145,8 @@ def gizmo_nullspace_input(
         chain: The arm.
         joint_position: Joint positions [rad].
         joint: The joint that moves the link, counted from 1.
-        point: Point at which the link is held, in the base frame [m].
+        point: Point at which the link is held, in the base frame [m]; the joint's origin if
+            None.
         displacement: Vector from there to the gizmo, in the base frame [m].
         config: Gains and bounds.
 
@@ -425,9 +426,11 @@ class LinkGuide(Human):
     def read(self, state: ArmState) -> HumanInput:
         """The null-space input now."""
         asked, config = self._human.read(state), self._config
-        # As a gizmo's displacement, whose largest force and speed are those of the device.
-        force = capped(config.max_force / config.speed * asked.twist[:3], config.max_force)
-        d = force_to_nullspace_input(self._chain, state.joint_position, _ELBOW, force, config)
+        # A gizmo with the largest force at the largest speed of the device.
+        displacement = config.max_force / config.stiffness / config.speed * asked.twist[:3]
+        d = gizmo_nullspace_input(
+            self._chain, state.joint_position, _ELBOW, None, displacement, config
+        )
         return replace(
             asked,
             nullspace_input=bounded(asked.effort(len(d)) + d, config.max_nullspace_input),

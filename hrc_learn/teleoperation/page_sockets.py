@@ -19,19 +19,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from hrc_learn.teleoperation.gate import messages
 from hrc_learn.teleoperation.gate.admission import same_secret
-from hrc_learn.teleoperation.gate.gate import Content, Visitor, first_of, incoming
-
-if TYPE_CHECKING:
-    from viser import ViserServer as ViserServer
-    from websockets.asyncio.server import ServerConnection as ServerConnection
-else:
-    ServerConnection = ViserServer = Any
+from hrc_learn.teleoperation.gate.gate import (
+    Content,
+    ServerConnection,
+    Visitor,
+    first_of,
+    incoming,
+)
+from hrc_learn.teleoperation.page_scene import ViserServer
 
 _STATUS_EVERY = 0.1  # [s]
 _SCENE_EVERY = {"leads": 1 / 60, "watches": 1 / 20}

@@ -13,11 +13,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Human, HumanInput
-from hrc_learn.teleoperation.hand_guiding import (
-    TINY,
-    InteractionForceConfig,
-    force_to_nullspace_input,
-)
+from hrc_learn.teleoperation.hand_guiding import TINY, force_to_nullspace_input
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +99,6 @@ class ScriptedPerturbation(Human):
         chain: SerialChain,
         forces: Sequence[ScriptedForce],
         begin: float | None = 0.0,
-        config: InteractionForceConfig | None = None,
     ):
         """Prepare the script.
 
@@ -111,10 +106,7 @@ class ScriptedPerturbation(Human):
             chain: The arm.
             forces: Times, places and forces of the pulls.
             begin: Time from which their intervals count [s]; None: once `begin` is called.
-            config: Effect of a pull; with "pinv" a force asks for the velocity that a gizmo
-                displaced as far would ask for. None: as `InteractionForceConfig` has it.
         """
-        self._config = config or InteractionForceConfig()
         self._chain = chain
         self.forces = tuple(forces)
         self._begin = begin
@@ -134,7 +126,7 @@ class ScriptedPerturbation(Human):
                 origins = self._chain.joint_origins(torch.from_numpy(q))
                 origin = origins[scripted.joint - 1].numpy()
                 d += force_to_nullspace_input(
-                    self._chain, q, scripted.joint, scripted.force(time, origin), self._config
+                    self._chain, q, scripted.joint, scripted.force(time, origin)
                 )
         return HumanInput(nullspace_input=d)
 

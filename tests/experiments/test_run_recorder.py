@@ -22,7 +22,7 @@ def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
     def into_a_file():
         stream = rr.RecordingStream("test")
         stream.save(tmp_path / "live.rrd")
-        yield servers.DashboardServer(stream, "http://viewer")
+        yield stream, "http://viewer"
         stream.disconnect()
 
     monkeypatch.setattr(servers, "serve_stream", into_a_file)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.hardware import CameraError, measure_delay
-from hrc_learn.hardware.camera_delay import fit_delay, turning_velocity
+from hrc_learn.hardware.opencv_cameras import fit_delay, turning_velocity
 from hrc_learn.sim import Imperfections, World, open_camera
 from hrc_learn.sim.scene import HAND_MARKER
 from hrc_learn.sim.workplace import Workplace

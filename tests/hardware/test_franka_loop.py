@@ -59,6 +59,7 @@ def test_orders_and_reports_come_out_as_they_went_in():
         faults=4,
         cycles=5,
         lost=6,
+        cost=1e-4,
         resting=False,
         joint_position=rng.normal(size=7),
         joint_velocity=rng.normal(size=7),

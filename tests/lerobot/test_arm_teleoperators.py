@@ -13,6 +13,7 @@ from hrc_learn.kinematics import fr3, panda
 from hrc_learn.lerobot.arm_teleoperators import ArmExpertConfig, ArmPageConfig, GuidedRobot
 from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
 from hrc_learn.protocols import ArmState, Human, HumanInput
+from hrc_learn.sim import MovingBodies
 from hrc_learn.teleoperation import hand_guiding, page
 
 READY = panda.ready.numpy()
@@ -135,8 +136,8 @@ class Page(Human):
 
     requests = ()
 
-    def __init__(self, chain, bodies, boxes, config, *, guides):
-        self.chain, self.config = chain, config
+    def __init__(self, world, config, *, guides):
+        self.chain, self.config = world.arm.robot.chain, config
         self.open, self.human = False, self
         self.places = []
 
@@ -150,8 +151,8 @@ class Page(Human):
     def show(self, status):
         self.status = status
 
-    def place(self, positions, orientations):
-        self.places.append((positions, orientations))
+    def place(self, world):
+        self.places.append(MovingBodies(world).poses())
 
     def read(self, state):
         return HumanInput(twist=np.array([0.05, 0, 0, 0, 0, 0]), requests=self.requests)

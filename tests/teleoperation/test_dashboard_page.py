@@ -50,10 +50,10 @@ async def parts(url, count=None):
 @pytest.mark.usefixtures("without_viewer")
 def test_a_page_that_opens_late_gets_the_whole_run(tmp_path):
     run = sample_run()
-    with serve_stream(0) as server:
-        with live_dashboard(server.stream, lambda: run):
+    with serve_stream(0) as (stream, address):
+        with live_dashboard(stream, lambda: run):
             pass
-        got = asyncio.run(parts(server.viewer, 1))
+        got = asyncio.run(parts(address, 1))
     (tmp_path / "got.rrd").write_bytes(got[0])
     (tab,) = (tab for tab in run_tabs(run) if tab.title == "Primitive")
     joint = tab.plots[0].curves[-1]
@@ -62,15 +62,15 @@ def test_a_page_that_opens_late_gets_the_whole_run(tmp_path):
 
 @pytest.mark.usefixtures("without_viewer")
 def test_new_data_arrives_while_a_page_is_open():
-    async def go(server):
-        watching = asyncio.create_task(parts(server.viewer, 2))
+    async def go(stream, address):
+        watching = asyncio.create_task(parts(address, 2))
         for value in range(2):
-            server.stream.log("value", rr.Scalars(float(value)))
+            stream.log("value", rr.Scalars(float(value)))
             await asyncio.sleep(0.5)
         return await watching
 
-    with serve_stream(0) as server:
-        assert len(asyncio.run(go(server))) == 2
+    with serve_stream(0) as served:
+        assert len(asyncio.run(go(*served))) == 2
 
 
 @pytest.mark.usefixtures("without_viewer")
