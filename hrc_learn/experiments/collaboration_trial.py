@@ -44,12 +44,11 @@ from hrc_learn.sim import (
 from hrc_learn.sim.hand_over import HandOver
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.grasping import as_load
+from hrc_learn.skills.grasping import INTERACT, as_load
 from hrc_learn.skills.marker_sensor import feature_sensor
 from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
 from hrc_learn.skills.pick_and_place import (
     HOME,
-    INTERACT,
     RECEIVE,
     RELEASE,
     PickAndPlace,

@@ -22,7 +22,7 @@ from hrc_learn.sim import CameraKind, Imperfections, MotionLog, ObjectConfig, Wo
 from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
+from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspJob
 from hrc_learn.skills.marker_sensor import MarkerSensor, feature_sensor
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
@@ -129,8 +129,8 @@ class GraspingRun:
     cell: WorkCell
     motion: MotionLog
     item: ObjectConfig
-    result: GraspResult | None
-    """Report of the task; None if it failed."""
+    result: GraspJob | None
+    """Record of the task; None if it failed."""
     failure: str = ""
     """Reason of a failure; empty after a success."""
 
@@ -166,7 +166,7 @@ def simulate_grasp(
     world = scene.world()
     item, sizes = workplace.scene.objects[0], world.imperfections.sizes
     eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
-    result, failure = None, ""
+    job, failure = GraspJob(item=item), ""
     with simulated_cell(
         world,
         human=human or ScriptedPerturbation(workplace.robot.chain, ()),
@@ -184,7 +184,7 @@ def simulate_grasp(
     ) as (cell, motion):
         task = Grasping(cell, workplace, aiming, config, check=plan_checker(world))
         try:
-            result = task.grasp(item)
+            task.grasp(job)
             task.go_home()
         except TaskFailedError as error:
             failure = str(error)
@@ -194,7 +194,7 @@ def simulate_grasp(
         cell=cell,
         motion=motion,
         item=item,
-        result=result,
+        result=None if failure else job,
         failure=failure,
     )
 

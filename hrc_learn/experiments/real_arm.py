@@ -41,7 +41,7 @@ from hrc_learn.kinematics import SerialChain, fr3, panda
 from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.grasping import Grasping, as_load, joint_plan
+from hrc_learn.skills.grasping import Grasping, GraspJob, as_load, joint_plan
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, place_along
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
@@ -236,7 +236,7 @@ def task_of(experiment: Experiment[Any], shelf: str) -> tuple[Workplace, Task]:
 
         def grasp(cell: WorkCell, check: Callable[[Plan], None]) -> str:
             grasping = Grasping(cell, workplace, servoing, experiment.config, check=check)
-            grasping.grasp(workplace.scene.objects[0])
+            grasping.grasp(GraspJob(item=workplace.scene.objects[0]))
             grasping.go_home()
             return ""
 

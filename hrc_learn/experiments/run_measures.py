@@ -17,7 +17,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import MotionLog, Touch, World
-from hrc_learn.skills.pick_and_place import INTERACT
+from hrc_learn.skills.grasping import INTERACT
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.vision import CameraModel

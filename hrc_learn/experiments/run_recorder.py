@@ -32,7 +32,8 @@ from hrc_learn.protocols import HINDRANCES
 from hrc_learn.sim import MotionLog, RecordedWorld, RenderingUnavailableError, World
 from hrc_learn.sim.cameras import OffscreenRenderer
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.pick_and_place import HOME, INTERACT, RELEASE, TRANSFER
+from hrc_learn.skills.grasping import INTERACT
+from hrc_learn.skills.pick_and_place import HOME, RELEASE, TRANSFER
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCell

@@ -1,15 +1,23 @@
 """Grasping an object with an uncalibrated camera, with recovery from failures.
 
-    detect -> servo -> grasp -> lift
+    detect -> servo -> interact -> grasp -> lift
+      ^         |                    |
+      +---------+---- start over ----+
 
-The skill waits until the object is detected, up to a timeout. If the grasp misses or servoing
-times out, it starts again from home.
+Detect and servo are the paper's approach and vision-based control; interact is time for a
+person, where a task gives it. Recoveries from failures are noted in the job:
+
+- occluded marker of the end effector: the controller holds the end effector until the marker is
+  detected again; after a timeout the arm goes home and starts over;
+- undetected object: the arm waits, up to a timeout;
+- missed grasp: the arm starts over from home.
 """
 
 import copy
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,6 +29,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraConfig, CameraEstimator
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
+from hrc_learn.skills.marker_sensor import longest_occlusion
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
@@ -41,6 +50,17 @@ DESCENT_SPEED = 0.08
 """Mean speed of the last centimetres down to an object [m/s]."""
 CLOSING_TIME = 0.7
 """Shortest time for the fingers to close and the grip to settle [s]."""
+INTERACT = "interact"
+"""Phase in which a person reaches under the arm."""
+
+Mishap = Literal[
+    "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
+]
+"""Kinds of failures from which a job recovers."""
+
+# Delays and occlusions up to this do not count as a recovery [s]: a few lost images, or a
+# blink.
+_NEGLIGIBLE = 0.3
 
 # Shortest time for the fingers to open before the arm leaves [s].
 _OPENING_TIME = 0.3
@@ -89,20 +109,39 @@ class GraspingConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GraspResult:
-    """Result of a grasp."""
+class Recovery:
+    """A failure from which the job recovered."""
 
-    servo_time: float
-    """Time from the start of visual servoing until the target was reached [s]."""
-    pixel_error: float
+    time: float
+    """Time [s]."""
+    mishap: Mishap
+    """Kind of failure."""
+    what: str
+    """Description of the failure and of the recovery."""
+
+
+@dataclass(kw_only=True)
+class GraspJob:
+    """Grasp of one object, with its results."""
+
+    item: GraspObject
+    """Object to grasp."""
+    time_for_person: float = 0.0
+    """Time to keep servoing while a person reaches under the arm [s]."""
+    servo_time: float = float("nan")
+    """Duration of the last visual servoing [s]."""
+    pixel_error: float = float("nan")
     """Pixel error at the start of the descent [px]."""
-    setbacks: tuple[str, ...] = ()
-    """Reasons why earlier attempts failed."""
+    picked_up: Pose | None = None
+    """Pose of the end effector at the grasp."""
+    attempts: int = 1
+    """Number of starts."""
+    recoveries: list[Recovery] = field(default_factory=list)
+    """Recoveries from failures."""
 
-    @property
-    def attempts(self) -> int:
-        """Number of grasps."""
-        return len(self.setbacks) + 1
+
+class UndetectedObjectError(TaskFailedError):
+    """The camera does not see the object."""
 
 
 class Grasping:
@@ -163,33 +202,67 @@ class Grasping:
         )
         self.servo = VisualServo(cell, law)
 
-    def grasp(self, item: GraspObject) -> GraspResult:
-        """Grasp an object and lift it.
+    def grasp(self, job: GraspJob) -> None:
+        """Grasp an object and lift it, in as many attempts as are allowed.
 
         Args:
-            item: Object to grasp.
+            job: Object, and record of the grasp.
 
         Raises:
-            TaskFailedError: The object is not detected, or all attempts fail.
+            UndetectedObjectError: The object's marker stays undetected.
+            MissedGraspError: All attempts failed.
         """
         self._cell.gripper.move(OPEN)
-        setbacks: list[str] = []
+        mishap: Mishap
         while True:
-            target = self.locate(item)
+            begun, mishap = self._cell.time, "marker occluded"
+            target = self.locate(job.item)
+            if (waited := self._cell.time - begun) > _NEGLIGIBLE:
+                what = f"waited {waited:.1f} s for its marker"
+                self.note(job, "object not detected", what)
             try:
-                servo_time = self.servo_to(target)
-                pixel_error = self.servo.error(target)
-                self.close_on(item)
+                self._aim(job, target)
+                mishap = "missed grasp"
+                self.close_on(job.item)
             except MissedGraspError as error:
-                setbacks.append(str(error))
-                if len(setbacks) == self._config.attempts:
+                self.note(job, mishap, str(error))
+                if job.attempts == self._config.attempts:
                     raise
                 self.start_over()
+                job.attempts += 1
             else:
+                job.picked_up = self._cell.pose
                 self.lift()
-                return GraspResult(
-                    servo_time=servo_time, pixel_error=pixel_error, setbacks=tuple(setbacks)
-                )
+                return
+
+    def note(self, job: GraspJob, mishap: Mishap, what: str) -> None:
+        """Note a failure and the recovery from it."""
+        job.recoveries.append(Recovery(time=self._cell.time, mishap=mishap, what=what))
+
+    def _aim(self, job: GraspJob, target: ServoTarget) -> None:
+        """Bring the end effector above the object, with time for the person if there is any."""
+        self._servo(job, target)
+        if job.time_for_person > 0:
+            self._cell.begin_phase(INTERACT)
+            self.servo.hold(target, job.time_for_person)
+            job.time_for_person = 0.0
+            # A push may leave up to twice the tolerance; beyond that the target is lost.
+            on_target = self.servo.error(target) < 2 * self._config.servo.tolerance
+            target = replace(target, posture=None)
+            if not on_target:
+                self._servo(job, target)
+        job.pixel_error = self.servo.error(target)
+
+    def _servo(self, job: GraspJob, target: ServoTarget) -> None:
+        """Visual servoing to a target; an occlusion of the marker is noted."""
+        cell, start = self._cell, self._cell.time
+        cell.begin_phase("servo")
+        cell.tracked_markers = (self._workplace.tool_marker,)
+        job.servo_time = self.servo.servo_to(target)
+        occluded = longest_occlusion(cell.log, self._workplace.hover(), start, cell.chain)
+        if occluded > _NEGLIGIBLE:
+            what = f"held the end effector for {occluded:.1f} s"
+            self.note(job, "marker occluded", what)
 
     def locate(self, item: GraspObject) -> ServoTarget:
         """Detect an object before the arm moves above the table, and return the servo target.
@@ -198,7 +271,7 @@ class Grasping:
         home first.
 
         Raises:
-            TaskFailedError: The object's marker stays undetected.
+            UndetectedObjectError: The object's marker stays undetected.
         """
         detected = self._detect(item)
         away = self._cell.joints - self._workplace.home_joints()
@@ -206,7 +279,7 @@ class Grasping:
             self.go_home()
             detected = self._detect(item)
         if detected is None:
-            raise TaskFailedError(
+            raise UndetectedObjectError(
                 f"detect: the camera does not see marker {item.marker.id} of {item.name!r}. "
                 "Move the object into the camera's view, and the arm out of it."
             )
@@ -247,16 +320,6 @@ class Grasping:
                 return posture
         self.go_home()
         return postures[0]
-
-    def servo_to(self, target: ServoTarget) -> float:
-        """Bring the end effector above the object; returns the duration [s].
-
-        Raises:
-            MissedGraspError: Servoing times out.
-        """
-        self._cell.begin_phase("servo")
-        self._cell.tracked_markers = (self._workplace.tool_marker,)
-        return self.servo.servo_to(target)
 
     def refusal(self, pose: Pose) -> str:
         """Reason why the end effector cannot go to a pose from here; empty if it can.
@@ -345,7 +408,15 @@ class Grasping:
             if (via := next(reachable, None)) is not None:
                 self._cell.follow_path(joint_plan(self._cell, here, via).path)
                 break
-        plan = joint_plan(self._cell, self._cell.joints, home)
+        self.move_joints(home)
+
+    def move_joints(self, goal: Float[Tensor, " joints"]) -> None:
+        """Move the joints on a straight line in joint space [rad].
+
+        Raises:
+            BlockedPathError: The path is blocked.
+        """
+        plan = joint_plan(self._cell, self._cell.joints, goal)
         self._check(plan)
         self._cell.follow_path(plan.path)
 

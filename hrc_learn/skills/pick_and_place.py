@@ -1,25 +1,20 @@
 """Pick and place near a person: grasp, carry to the cabinet, put on a shelf.
 
-    detect -> servo -> interact -> grasp -> home -> transfer -> release -> retreat -> over
-      ^         |                    |       |         |
-      +---------+--- start over -----+-------+---------+-- put back -> over
+    pick -> home -> transfer -> release -> retreat -> over
+      ^      |         |
+      +------+---------+-- put back -> over
 
-Detect and servo are the paper's approach and vision-based control, interact is the time for the
-person, home to release is the placing. Each phase is a method that does its work and returns
-the next phase. Recoveries from failures are logged and counted:
+Picking is `Grasping.grasp`, or the hand-over by a person; home to release is the placing. Each
+phase is a method that does its work and returns the next phase. Recoveries from failures are
+logged and counted, besides those of grasping:
 
-- occluded marker of the end effector: the controller holds the end effector until the marker is
-  detected again; after a timeout the arm goes home and starts over;
-- undetected object: the arm waits;
-- missed grasp, or object dropped over the table: the arm starts over from home;
+- object dropped over the table: the arm starts over from home;
 - blocked path: another height, via point or arm angle, then waiting; finally the object is put
 back.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from typing import Literal
+from dataclasses import dataclass, field
 
 from hrc_learn.geometry import Pose
 from hrc_learn.skills.grasping import (
@@ -27,15 +22,14 @@ from hrc_learn.skills.grasping import (
     OPEN,
     Grasping,
     GraspingConfig,
+    GraspJob,
+    UndetectedObjectError,
     holds,
-    joint_plan,
     move_fingers,
     raised,
 )
-from hrc_learn.skills.marker_sensor import longest_occlusion
 from hrc_learn.skills.placing import PlacingSkill, Plan, plan_candidates
 from hrc_learn.skills.receiving import Receipt, Receiving
-from hrc_learn.skills.servo_target import ServoTarget
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import (
@@ -45,54 +39,29 @@ from hrc_learn.skills.work_cell import (
     WorkCell,
 )
 
-Mishap = Literal[
-    "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
-]
-"""Kinds of failures that a job recovers from."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recovery:
-    """A failure from which the job recovered."""
-
-    time: float
-    """Time [s]."""
-    mishap: Mishap
-    """Kind of failure."""
-    what: str
-    """Description of the failure and of the recovery."""
+RECEIVE, HOME, TRANSFER, RELEASE = "receive", "home", "transfer", "release"
+"""Phases that other modules look up in the log."""
+RELEASE_TIME = 0.8
+"""Shortest time for the fingers to open and the released object to come to rest [s]."""
+# Straight retreat along the end effector's own axis until the object is out of the fingers [m],
+# and its speed [m/s]: at the usual speed the shoulder comes near its limits.
+_CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
 
 
 @dataclass(kw_only=True)
-class PickPlaceJob:
+class PickPlaceJob(GraspJob):
     """Job of one object from the table to its shelf, with its results."""
 
-    item: GraspObject
-    """Object to place."""
     shelf: str
     """Name of its shelf."""
     goal: Pose
     """Pose of the end effector at the release, if the object is held in the middle."""
-    time_for_person: float = 0.0
-    """Time to keep servoing while a person reaches under the arm [s]."""
-    target: ServoTarget | None = None
-    """Servo target of the last detection."""
-    servo_time: float = float("nan")
-    """Duration of the last visual servoing [s]."""
-    pixel_error: float = float("nan")
-    """Pixel error at the start of the descent [px]."""
-    picked_up: Pose | None = None
-    """Pose of the end effector at the grasp."""
     plan: Plan | None = None
     """Path to the shelf."""
     release: Pose | None = None
     """Pose of the end effector at the release on the shelf."""
     failure: str = ""
     """Reason why the job was given up."""
-    attempts: int = 1
-    """Number of starts."""
-    recoveries: list[Recovery] = field(default_factory=list)
-    """Recoveries from failures."""
     receipt: Receipt | None = None
     """Hand-over of the object by a person; None: the object lay on the table."""
     span: tuple[float, float] = (0.0, 0.0)
@@ -104,34 +73,8 @@ class PickPlaceJob:
         return self.release is not None and not self.failure
 
 
-class Phase(StrEnum):
-    """Phase of a job; its start is an event of the log."""
-
-    DETECT = "detect"
-    RECEIVE = "receive"
-    SERVO = "servo"
-    INTERACT = "interact"
-    GRASP = "grasp"
-    HOME = "home"
-    TRANSFER = "transfer"
-    RELEASE = "release"
-    RETREAT = "retreat"
-    PUT_BACK = "put back"
-    OVER = "over"
-
-
-RECEIVE, INTERACT, HOME = Phase.RECEIVE, Phase.INTERACT, Phase.HOME
-TRANSFER, RELEASE = Phase.TRANSFER, Phase.RELEASE
-"""Phases that other modules look up in the log."""
-
-# Delays and occlusions up to this do not count as a recovery [s]: a few lost images, or a
-# blink.
-_NEGLIGIBLE = 0.3
-RELEASE_TIME = 0.8
-"""Shortest time for the fingers to open and the released object to come to rest [s]."""
-# Straight retreat along the end effector's own axis until the object is out of the fingers [m],
-# and its speed [m/s]: at the usual speed the shoulder comes near its limits.
-_CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
+type Phase = Callable[[PickPlaceJob], Phase | None]
+"""Phase of a job, which returns the next one; None: the job is over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,14 +110,14 @@ def place_along(
     Returns:
         Time at which it started to put down [s].
     """
-    cell.begin_phase(Phase.TRANSFER)
+    cell.begin_phase(TRANSFER)
     cell.follow_path(plan.path)
     # The arm lags behind: at the end of the path it is not quite there.
     cell.move_straight(goal)
-    cell.begin_phase(Phase.RELEASE)
+    cell.begin_phase(RELEASE)
     begun = cell.time
     _put_down(cell, goal, lowering)
-    cell.begin_phase(Phase.RETREAT)
+    cell.begin_phase("retreat")
     clear = goal.apply(goal.position.new_tensor([0.0, 0.0, -size * _CLEARANCE]))
     cell.move_straight(Pose(clear, goal.orientation), speed=_RETREAT_SPEED)
     return begun
@@ -228,18 +171,6 @@ class PickAndPlace:
         self._check = check
         self._config = config = config or PickAndPlaceConfig()
         self._grasping = Grasping(cell, workplace, servoing, config.grasping, check=check)
-        self._work: dict[Phase, Callable[[PickPlaceJob], Phase]] = {
-            Phase.DETECT: self._detect,
-            Phase.RECEIVE: self._receive,
-            Phase.SERVO: self._servo,
-            Phase.INTERACT: self._interact,
-            Phase.GRASP: self._grasp,
-            Phase.HOME: self._home,
-            Phase.TRANSFER: self._transfer,
-            Phase.RELEASE: self._release,
-            Phase.RETREAT: self._retreat,
-            Phase.PUT_BACK: self._put_back,
-        }
 
     def run(
         self,
@@ -279,114 +210,77 @@ class PickAndPlace:
 
     def _deliver(self, job: PickPlaceJob) -> None:
         start = self._cell.time
-        self._cell.gripper.move(OPEN)
-        phase = Phase.RECEIVE if job.item.name in self._receiving else Phase.DETECT
+        received = job.item.name in self._receiving
+        phase: Phase | None = self._receive if received else self._pick
         try:
-            while phase is not Phase.OVER:
-                phase = self._work[phase](job)
+            while phase is not None:
+                phase = phase(job)
         finally:
             job.span = start, self._cell.time
 
-    def _receive(self, job: PickPlaceJob) -> Phase:
+    def _receive(self, job: PickPlaceJob) -> Phase | None:
         """Take the object from a person's hand."""
         receiving, robot = self._receiving[job.item.name], self._workplace.robot
         job.receipt = receiving.receipt
+        self._cell.gripper.move(OPEN)
         posture = robot.inverse(receiving.wait, near=self._workplace.hover_joints())
-        plan = joint_plan(self._cell, self._cell.joints, posture)
-        self._check(plan)
-        self._cell.follow_path(plan.path)
-        self._cell.begin_phase(Phase.RECEIVE)
+        self._grasping.move_joints(posture)
+        self._cell.begin_phase(RECEIVE)
         try:
             receiving.receive(job.item)
         except MissedGraspError as error:
             job.failure = str(error)
             self._grasping.start_over()
-            return Phase.OVER
+            return None
         receiving.wait_until_away()
         job.picked_up = self._cell.pose
-        return Phase.HOME
+        return self._home
 
-    def _detect(self, job: PickPlaceJob) -> Phase:
-        start = self._cell.time
+    def _pick(self, job: PickPlaceJob) -> Phase | None:
+        """Grasp the object and lift it."""
         try:
-            job.target = self._grasping.locate(job.item)
-        except TaskFailedError as error:
+            self._grasping.grasp(job)
+        except UndetectedObjectError as error:
             job.failure = str(error)
-            return Phase.OVER
-        waited = self._cell.time - start
-        if waited > _NEGLIGIBLE:
-            self._note(job, "object not detected", f"waited {waited:.1f} s for its marker")
-        return Phase.SERVO
-
-    def _servo(self, job: PickPlaceJob) -> Phase:
-        assert job.target is not None
-        start = self._cell.time
-        try:
-            job.servo_time = self._grasping.servo_to(job.target)
+            return None
         except MissedGraspError as error:
-            return self._start_over(job, "marker occluded", str(error))
-        occluded = longest_occlusion(
-            self._cell.log, self._workplace.hover(), start, self._cell.chain
-        )
-        if occluded > _NEGLIGIBLE:
-            self._note(job, "marker occluded", f"held the end effector for {occluded:.1f} s")
-        return Phase.INTERACT if job.time_for_person > 0 else Phase.GRASP
+            self._grasping.start_over()
+            job.failure = str(error)
+            return None
+        return self._home
 
-    def _interact(self, job: PickPlaceJob) -> Phase:
-        """Keep servoing while the person reaches under the arm."""
-        assert job.target is not None
-        self._cell.begin_phase(Phase.INTERACT)
-        servo = self._grasping.servo
-        servo.hold(job.target, job.time_for_person)
-        job.time_for_person = 0.0
-        # A push may leave up to twice the tolerance; beyond that the target is lost.
-        on_target = servo.error(job.target) < 2 * self._config.grasping.servo.tolerance
-        job.target = replace(job.target, posture=None)
-        return Phase.GRASP if on_target else Phase.SERVO
-
-    def _grasp(self, job: PickPlaceJob) -> Phase:
-        assert job.target is not None
-        job.pixel_error = self._grasping.servo.error(job.target)
-        try:
-            self._grasping.close_on(job.item)
-        except MissedGraspError as error:
-            return self._start_over(job, "missed grasp", str(error))
-        job.picked_up = self._cell.pose
-        self._grasping.lift()
-        return Phase.HOME
-
-    def _home(self, job: PickPlaceJob) -> Phase:
+    def _home(self, job: PickPlaceJob) -> Phase | None:
         if not holds(self._cell, job.item):
-            return self._start_over(job, "dropped object", "lost on the way up")
+            return self._dropped(job, "lost on the way up")
         for _ in range(1 + self._config.waits):
             try:
                 self._grasping.go_home()
             except BlockedPathError as error:
-                self._note(job, "blocked path", f"waited: {error}")
+                self._grasping.note(job, "blocked path", f"waited: {error}")
                 self._cell.hold_pose(self._config.wait)
             else:
-                return Phase.TRANSFER
+                return self._transfer
         job.failure = "home: the path stayed blocked"
-        return Phase.PUT_BACK
+        return self._put_back
 
-    def _transfer(self, job: PickPlaceJob) -> Phase:
+    def _transfer(self, job: PickPlaceJob) -> Phase | None:
         """Carry to the shelf along the learned motion."""
         if not holds(self._cell, job.item):
-            return self._start_over(job, "dropped object", "lost on the way home")
-        self._cell.begin_phase(Phase.TRANSFER)
+            return self._dropped(job, "lost on the way home")
+        self._cell.begin_phase(TRANSFER)
         plan = self._free_plan(job)
         if plan is None:
             job.failure = f"transfer: all paths to the {job.shelf} shelf stayed blocked"
-            return Phase.PUT_BACK
+            return self._put_back
         job.plan = plan
         tracked = self._cell.follow_path(
             plan.path, until=lambda: not holds(self._cell, job.item)
         )
         if tracked < len(plan.path):
             self._cell.follow_path(plan.path[:tracked][::-1])
-            return self._start_over(job, "dropped object", "lost on the way to the shelf")
+            return self._dropped(job, "lost on the way to the shelf")
         self._cell.move_straight(plan.goal)
-        return Phase.RELEASE
+        return self._release
 
     def _free_plan(self, job: PickPlaceJob) -> Plan | None:
         """The first candidate with a free path, now or after a wait."""
@@ -406,50 +300,45 @@ class PickAndPlace:
                     self._check(plan)
                 except BlockedPathError as error:
                     if number == 0:  # as learned
-                        self._note(job, "blocked path", str(error))
+                        self._grasping.note(job, "blocked path", str(error))
                 else:
                     return plan
         return None
 
-    def _release(self, job: PickPlaceJob) -> Phase:
-        self._cell.begin_phase(Phase.RELEASE)
+    def _release(self, job: PickPlaceJob) -> Phase | None:
+        self._cell.begin_phase(RELEASE)
         lowering = self._workplace.lowering(job.item.half_size)
         job.release = _put_down(self._cell, job.goal, lowering)
-        return Phase.RETREAT
+        return self._retreat
 
-    def _retreat(self, job: PickPlaceJob) -> Phase:
+    def _retreat(self, job: PickPlaceJob) -> Phase | None:
         """Retreat along the same path, which was free before."""
         assert job.plan is not None
-        self._cell.begin_phase(Phase.RETREAT)
+        self._cell.begin_phase("retreat")
         self._cell.follow_path(job.plan.path[::-1])
-        return Phase.OVER
+        return None
 
-    def _put_back(self, job: PickPlaceJob) -> Phase:
+    def _put_back(self, job: PickPlaceJob) -> Phase | None:
         """Put the object back at its place, and go home."""
         assert job.picked_up is not None
         if job.receipt is not None:
-            return Phase.OVER  # a received object has no place on the table: the arm keeps it
-        self._cell.begin_phase(Phase.PUT_BACK)
-        plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
-        self._check(plan)
-        self._cell.follow_path(plan.path)
+            return None  # a received object has no place on the table: the arm keeps it
+        self._cell.begin_phase("put back")
+        self._grasping.move_joints(self._workplace.hover_joints())
         self._cell.move_straight(
             raised(job.picked_up, self._workplace.robot.hand_size * self._config.grasping.lift)
         )
         self._cell.move_straight(job.picked_up, speed=DESCENT_SPEED)
         self._grasping.start_over()
-        return Phase.OVER
+        return None
 
-    def _start_over(self, job: PickPlaceJob, mishap: Mishap, what: str) -> Phase:
+    def _dropped(self, job: PickPlaceJob, what: str) -> Phase | None:
         """Start over from home, unless the number of attempts is reached."""
-        self._note(job, mishap, what)
+        self._grasping.note(job, "dropped object", what)
         self._grasping.start_over()
         # The place of a lost received object is unknown.
         if job.receipt is not None or job.attempts == self._config.grasping.attempts:
             job.failure = what
-            return Phase.OVER
+            return None
         job.attempts += 1
-        return Phase.DETECT
-
-    def _note(self, job: PickPlaceJob, mishap: Mishap, what: str) -> None:
-        job.recoveries.append(Recovery(time=self._cell.time, mishap=mishap, what=what))
+        return self._pick

@@ -16,7 +16,7 @@ from hrc_learn.protocols import DrawnRegion, Human, OpenedArm, Request
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.pick_and_place import INTERACT
+from hrc_learn.skills.grasping import INTERACT
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder, pressed
 from hrc_learn.teleoperation.gate.messages import TrackedHand

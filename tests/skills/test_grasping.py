@@ -183,7 +183,7 @@ def test_a_missed_grasp_is_begun_anew(skill):
         run = grasped(replace(skill, target=target), turned(0.0))
     assert run.result is not None
     assert run.result.attempts == 2
-    assert "closed on nothing" in run.result.setbacks[0]
+    assert "closed on nothing" in run.result.recoveries[0].what
     assert succeeded(run)
 
 
