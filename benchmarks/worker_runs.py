@@ -23,7 +23,7 @@ from worker_tables import Workers, WorkerTables
 from hrc_learn.controller import Distances, WayMakingConfig
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig, ArmReading, FollowPath
-from hrc_learn.controller.contact_limits import PersonMode, region_numbers
+from hrc_learn.controller.contact_limits import ContactLimits, PersonMode, region_numbers
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.experiments.surroundings import margin_to_stop
 from hrc_learn.kinematics import CapsuleArm, Separation, panda, separation
@@ -32,7 +32,6 @@ from hrc_learn.sim.worker import REGIONS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.person_watch import (
     NEAR_PEOPLE,
-    ContactLimits,
     PersonWatchConfig,
     person_speeds,
     urgent_distances,

@@ -8,12 +8,12 @@ from hrc_learn.controller.arm_loop_state import ArmLoopConfig as ArmLoopConfig
 from hrc_learn.controller.arm_loop_state import ArmReading as ArmReading
 from hrc_learn.controller.constraint_layer import ConstraintConfig as ConstraintConfig
 from hrc_learn.controller.constraint_layer import Distances as Distances
-from hrc_learn.controller.constraint_layer import SeparationConfig as SeparationConfig
 from hrc_learn.controller.constraint_layer import (
     constrained_velocity as constrained_velocity,
 )
 from hrc_learn.controller.contact_limits import BODY_REGIONS as BODY_REGIONS
 from hrc_learn.controller.contact_limits import ContactConfig as ContactConfig
+from hrc_learn.controller.contact_limits import SeparationConfig as SeparationConfig
 from hrc_learn.controller.contact_limits import contact_speed as contact_speed
 from hrc_learn.controller.interface import GRIPPER_DOWN as GRIPPER_DOWN
 from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN

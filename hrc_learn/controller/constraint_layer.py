@@ -14,15 +14,15 @@ do not depend on the data, so they compile and export.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple, get_args
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils import _pytree
 
-from hrc_learn.controller.contact_limits import ContactConfig, PersonMode
+from hrc_learn.controller.contact_limits import SeparationConfig
 from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry.numerics import is_number, matmul, may_branch, orthonormal_basis
 from hrc_learn.pytree import pytree, zero_where
@@ -230,119 +230,6 @@ class ConstraintConfig:
     def slack_cost(self) -> float:
         """Cost of approaching 1 m/s too fast, relative to 1 rad/s of the null space."""
         return self.path_cost * self.distance_weight
-
-
-@dataclass(frozen=True, kw_only=True)
-class SeparationConfig:
-    """Speed allowed near a person: speed and separation monitoring, power and force limiting.
-
-    The first fields are the terms of the protective separation distance (ISO 10218-2:2025,
-    Annex L; before it ISO/TS 15066:2016, 5.5.4.2.3).
-    """
-
-    human_speed: float = 1.6
-    """v_h, speed of the person towards the arm where it is not measured [m/s]: walking speed
-    of ISO 13855."""
-    reaction_time: float = 0.1
-    """T_r, time from the person's motion to the arm's response [s]: sensing, transport, and
-    about 20 ms for a control step and the ramp of the acceleration."""
-    deceleration: float = 2.0
-    """Deceleration a of the tool while the arm stops [m/s^2]: T_s = v/a, S_s = v^2/(2 a)."""
-    clearance: float = 0.2
-    """C + Z_d + Z_r, intrusion and the uncertainty of both positions [m]: the distance left
-    when both have come to rest."""
-    mode: PersonMode = "ssm"
-    """Speed and separation monitoring ("ssm"), power and force limiting wherever contact is
-    allowed ("pfl"), or the one that allows the higher speed ("ssm+pfl"). From regions of the
-    body that must not be touched the protective distance is kept in all modes."""
-    contact: ContactConfig = field(default_factory=ContactConfig)
-    """Surface and load of the arm, for power and force limiting."""
-
-    def __post_init__(self):
-        if self.mode not in (modes := get_args(PersonMode)):
-            raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
-        terms = "human_speed", "reaction_time", "clearance"
-        check_settings(self, positive=["deceleration"], not_negative=terms)
-
-    def protective_distance(
-        self,
-        speed: Float[Tensor, "*batch"],
-        human_speed: Float[Tensor, "*batch"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
-        """S_p = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r [m].
-
-        Args:
-            speed: v, closing speed of the arm [m/s]; negative counts as zero.
-            human_speed: v_h, see `highest_speed`.
-        """
-        v = speed.clamp(min=0)
-        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
-        stopping = v / self.deceleration
-        arm = v * (self.reaction_time + stopping / 2)
-        return v_h * (self.reaction_time + stopping) + arm + self.clearance
-
-    def highest_speed(
-        self,
-        distance: Float[Tensor, "*batch"],
-        human_speed: Float[Tensor, "*batch"] | None = None,
-    ) -> Float[Tensor, "*batch"]:
-        """Speed towards a person that keeps the protective separation distance [m/s].
-
-        The root v of  d = S_p(v),  see `protective_distance`; zero where the person is too
-        close for any motion. An unknown distance (NaN) counts as zero.
-
-        Args:
-            distance: Distance between person and arm [m]; infinite: no person is near.
-            human_speed: v_h, measured speed of the person towards the arm, plus the speed they
-                may gain meanwhile [m/s]; negative counts as zero. None: the configured one.
-        """
-        a = self.deceleration
-        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
-        spare = distance - v_h * self.reaction_time - self.clearance
-        spare = torch.where(spare > 0, spare, 0.0)  # NaN compares false: too close
-        delay = self.reaction_time + v_h / a
-        return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)
-
-    def allowed_speed(
-        self,
-        distance: Float[Tensor, "*batch"],
-        human_speed: Float[Tensor, "*batch"],
-        contact_speed: Float[Tensor, "*batch"] | None,
-    ) -> Float[Tensor, "*batch"]:
-        """Speed of the arm towards a person that `mode` allows [m/s].
-
-        Args:
-            distance: Distance between person and arm [m].
-            human_speed: v_h, as of `highest_speed` [m/s].
-            contact_speed: Highest relative speed of an allowed contact (`contact_limits`), zero
-                where none is allowed [m/s]; None: nowhere.
-        """
-        kept = self.highest_speed(distance, human_speed)
-        if contact_speed is None or self.mode == "ssm":
-            return kept
-        touching = (contact_speed - human_speed.clamp(min=0)).clamp(min=0)
-        if self.mode == "pfl":
-            return torch.where(contact_speed > 0, touching, kept)
-        return torch.maximum(kept, touching)
-
-    def touches_gently(
-        self,
-        speed: Float[Tensor, "*batch"],
-        human_speed: Float[Tensor, "*batch"],
-        contact_speed: Float[Tensor, "*batch"] | None,
-    ) -> Bool[Tensor, "*batch"]:
-        """True where a contact at these speeds is allowed, so that no distance is needed.
-
-        Args:
-            speed: Closing speed of the arm [m/s].
-            human_speed: v_h, as of `highest_speed` [m/s].
-            contact_speed: As of `allowed_speed` [m/s].
-        """
-        if contact_speed is None or self.mode == "ssm":
-            return torch.zeros_like(speed, dtype=torch.bool)
-        # The solver leaves rounding.
-        gentle = speed + human_speed <= contact_speed + _TOLERANCE
-        return gentle & (contact_speed > 0)
 
 
 @pytree

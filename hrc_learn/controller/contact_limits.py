@@ -1,8 +1,10 @@
-"""Power and force limiting: the speed at which an arm may touch each region of a person's body.
+"""Speed of an arm near a person: its protective distance, and the speed of allowed contacts.
 
-Arm and body region are two masses with the spring of the region between them (ISO 10218-2:2025,
-Annex M; before it ISO/TS 15066:2016, A.3.4). A contact at the relative speed v has the peak
-force v sqrt(mu k), with 1/mu = 1/m_H + 1/m_R and the effective mass of the arm at its posture
+Speed and separation monitoring keeps a distance (`SeparationConfig`). For power and force
+limiting, arm and body region are two masses with the spring of the region between them (ISO
+10218-2:2025, Annex M; before it ISO/TS 15066:2016, A.3.4). A contact at the relative speed v
+has the peak force v sqrt(mu k), with 1/mu = 1/m_H + 1/m_R and the effective mass of the arm at
+its posture
 
     1/m_R = n^T J M^-1 J^T n
 
@@ -19,8 +21,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,7 +31,8 @@ from torch import Tensor
 from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Box
 from hrc_learn.geometry.numerics import Constant
-from hrc_learn.kinematics import Separation
+from hrc_learn.kinematics import Arm, CapsuleArm, Separation
+from hrc_learn.kinematics.inertia import MassMatrix
 
 PersonMode = Literal["ssm", "pfl", "ssm+pfl"]
 """Reaction to people: speed and separation monitoring, power and force limiting wherever
@@ -74,6 +77,8 @@ _TRANSIENT = 2.0
 _FACING = 0.5
 # Smallest distance that has a direction [m].
 _TOUCHING = 1e-6
+# Excess of a speed that counts as rounding, as the solver of constraints leaves it [m/s].
+_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +103,118 @@ class ContactConfig:
             raise ValueError(f"used must be at most 1, but is {self.used}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class SeparationConfig:
+    """Speed allowed near a person: speed and separation monitoring, power and force limiting.
+
+    The first fields are the terms of the protective separation distance (ISO 10218-2:2025,
+    Annex L; before it ISO/TS 15066:2016, 5.5.4.2.3).
+    """
+
+    human_speed: float = 1.6
+    """v_h, speed of the person towards the arm where it is not measured [m/s]: walking speed
+    of ISO 13855."""
+    reaction_time: float = 0.1
+    """T_r, time from the person's motion to the arm's response [s]: sensing, transport, and
+    about 20 ms for a control step and the ramp of the acceleration."""
+    deceleration: float = 2.0
+    """Deceleration a of the tool while the arm stops [m/s^2]: T_s = v/a, S_s = v^2/(2 a)."""
+    clearance: float = 0.2
+    """C + Z_d + Z_r, intrusion and the uncertainty of both positions [m]: the distance left
+    when both have come to rest."""
+    mode: PersonMode = "ssm"
+    """Speed and separation monitoring ("ssm"), power and force limiting wherever contact is
+    allowed ("pfl"), or the one that allows the higher speed ("ssm+pfl"). From regions of the
+    body that must not be touched the protective distance is kept in all modes."""
+    contact: ContactConfig = field(default_factory=ContactConfig)
+    """Surface and load of the arm, for power and force limiting."""
+
+    def __post_init__(self):
+        if self.mode not in (modes := get_args(PersonMode)):
+            raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
+        terms = "human_speed", "reaction_time", "clearance"
+        check_settings(self, positive=["deceleration"], not_negative=terms)
+
+    def protective_distance(
+        self,
+        speed: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """S_p = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r [m].
+
+        Args:
+            speed: v, closing speed of the arm [m/s]; negative counts as zero.
+            human_speed: v_h, see `highest_speed`.
+        """
+        v = speed.clamp(min=0)
+        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
+        stopping = v / self.deceleration
+        arm = v * (self.reaction_time + stopping / 2)
+        return v_h * (self.reaction_time + stopping) + arm + self.clearance
+
+    def highest_speed(
+        self,
+        distance: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """Speed towards a person that keeps the protective separation distance [m/s].
+
+        The root v of  d = S_p(v),  see `protective_distance`; zero where the person is too
+        close for any motion. An unknown distance (NaN) counts as zero.
+
+        Args:
+            distance: Distance between person and arm [m]; infinite: no person is near.
+            human_speed: v_h, measured speed of the person towards the arm, plus the speed they
+                may gain meanwhile [m/s]; negative counts as zero. None: the configured one.
+        """
+        a = self.deceleration
+        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
+        spare = distance - v_h * self.reaction_time - self.clearance
+        spare = torch.where(spare > 0, spare, 0.0)  # NaN compares false: too close
+        delay = self.reaction_time + v_h / a
+        return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)
+
+    def allowed_speed(
+        self,
+        distance: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"],
+        contact_speed: Float[Tensor, "*batch"] | None,
+    ) -> Float[Tensor, "*batch"]:
+        """Speed of the arm towards a person that `mode` allows [m/s].
+
+        Args:
+            distance: Distance between person and arm [m].
+            human_speed: v_h, as of `highest_speed` [m/s].
+            contact_speed: Highest relative speed of an allowed contact (`contact_limits`), zero
+                where none is allowed [m/s]; None: nowhere.
+        """
+        kept = self.highest_speed(distance, human_speed)
+        if contact_speed is None or self.mode == "ssm":
+            return kept
+        touching = (contact_speed - human_speed.clamp(min=0)).clamp(min=0)
+        if self.mode == "pfl":
+            return torch.where(contact_speed > 0, touching, kept)
+        return torch.maximum(kept, touching)
+
+    def touches_gently(
+        self,
+        speed: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"],
+        contact_speed: Float[Tensor, "*batch"] | None,
+    ) -> Bool[Tensor, "*batch"]:
+        """True where a contact at these speeds is allowed, so that no distance is needed.
+
+        Args:
+            speed: Closing speed of the arm [m/s].
+            human_speed: v_h, as of `highest_speed` [m/s].
+            contact_speed: As of `allowed_speed` [m/s].
+        """
+        if contact_speed is None or self.mode == "ssm":
+            return torch.zeros_like(speed, dtype=torch.bool)
+        gentle = speed + human_speed <= contact_speed + _TOLERANCE
+        return gentle & (contact_speed > 0)
+
+
 def region_numbers(names: Sequence[str]) -> Int[Tensor, " parts"]:
     """Numbers of body regions, for `contact_speed`.
 
@@ -115,9 +232,7 @@ def contact_speed(
     inverse_mass: Float[Tensor, "*batch"],
     region: Int[Tensor, "*#batch"],
     clamped: Bool[Tensor, "*#batch"],
-    config: ContactConfig,
-    reaction_time: float,
-    deceleration: float,
+    separation: SeparationConfig,
 ) -> Float[Tensor, "*batch"]:
     """Highest relative speed of a contact that keeps force and pressure [m/s].
 
@@ -129,16 +244,14 @@ def contact_speed(
         inverse_mass: 1/m_R of the arm in the direction of the contact [1/kg].
         region: Number of the body region.
         clamped: True where the body is between the arm and furniture.
-        config: Surface of the arm.
-        reaction_time: Time from the contact to the begin of braking [s].
-        deceleration: Deceleration of the arm [m/s^2].
+        separation: Surface, reaction time and deceleration of the arm.
     """
+    config, T, a = separation.contact, separation.reaction_time, separation.deceleration
     table = _TABLE.like(inverse_mass)[region]
     force, pressure, stiffness, mass, _ = table.unbind(-1)
     k = 1e3 / (1 / stiffness + 1 / config.padding)
     F = config.used * torch.minimum(force, pressure * config.area)
     free = _TRANSIENT * F * ((1 / mass + inverse_mass) / k).sqrt()
-    T, a = reaction_time, deceleration
     driven = a * ((T**2 + 2 * F / (k * a)).sqrt() - T)
     held = torch.minimum(F * (inverse_mass / k).sqrt(), driven)
     return torch.where(clamped, torch.minimum(held, free), free)
@@ -153,36 +266,54 @@ class ContactSpeeds(NamedTuple):
     """Speeds that keep quasi-static limits, for contacts that last."""
 
 
-def contact_speeds(
-    found: Separation,
-    mass: Float[Tensor, "*#batch joints joints"],
-    region: Int[Tensor, "*#batch H"],
-    furniture: Sequence[Box],
-    config: ContactConfig,
-    reaction_time: float,
-    deceleration: float,
-) -> ContactSpeeds:
-    """`contact_speed` of all parts of an arm with all parts of a person [m/s].
+class ContactLimits:
+    """Contact speeds of an arm beside furniture, for power and force limiting."""
 
-    Args:
-        found: Distances between arm and person.
-        mass: Mass matrix of the arm with its load.
-        region: Body region of each part of the person.
-        furniture: Boxes against which a person may be clamped, in the base frame.
-        config: Surface of the arm.
-        reaction_time: Time from the contact to the begin of braking [s].
-        deceleration: Deceleration of the arm [m/s^2].
-    """
-    rows, factor = found.gradient.flatten(-3, -2), torch.linalg.cholesky(mass)
-    whitened = torch.linalg.solve_triangular(factor, rows.mT, upper=False)
-    inverse_mass = (whitened * whitened).sum(-2).unflatten(-1, found.distance.shape[-2:])
-    region = region.unsqueeze(-2)
-    held = clamped(found, furniture, _TABLE.like(mass)[region][..., -1])
+    def __init__(self, arm: CapsuleArm, separation: SeparationConfig, furniture: Sequence[Box]):
+        """Prepare the mass matrix of the arm.
 
-    def speeds(held: Tensor) -> Tensor:
-        return contact_speed(inverse_mass, region, held, config, reaction_time, deceleration)
+        Args:
+            arm: Capsules of arm and tool.
+            separation: Reaction and deceleration of the arm, its surface and load.
+            furniture: Boxes against which the arm may clamp people, in the base frame.
 
-    return ContactSpeeds(speeds(held), speeds(torch.ones_like(held)))
+        Raises:
+            ValueError: The chain of the capsules is no arm with masses.
+        """
+        if not isinstance(arm.chain, Arm):
+            raise ValueError(
+                f"power and force limiting (mode={separation.mode!r}) needs the masses of the "
+                "arm: use one of `hrc_learn.kinematics.arm`, or mode='ssm'."
+            )
+        self._separation, self._furniture = separation, furniture
+        self._mass = MassMatrix(arm.chain, separation.contact.rotor_inertia)
+
+    def speeds(
+        self,
+        found: Separation,
+        joints: Float[Tensor, "*batch joints"],
+        regions: Int[Tensor, "*#batch H"],
+        holds: bool,
+    ) -> ContactSpeeds:
+        """`contact_speed` of all parts of the arm with all parts of a person.
+
+        Args:
+            found: Distances between arm and person.
+            joints: Joint positions [rad].
+            regions: Body region of each part of the person (`region_numbers`).
+            holds: True if the gripper holds an object.
+        """
+        mass = self._mass(joints, self._separation.contact.load if holds else 0.0)
+        rows, factor = found.gradient.flatten(-3, -2), torch.linalg.cholesky(mass)
+        whitened = torch.linalg.solve_triangular(factor, rows.mT, upper=False)
+        inverse_mass = (whitened * whitened).sum(-2).unflatten(-1, found.distance.shape[-2:])
+        regions = regions.unsqueeze(-2)
+        held = clamped(found, self._furniture, _TABLE.like(mass)[regions][..., -1])
+        first, lasting = (
+            contact_speed(inverse_mass, regions, held, self._separation)
+            for held in (held, torch.ones_like(held))
+        )
+        return ContactSpeeds(first, lasting)
 
 
 def clamped(

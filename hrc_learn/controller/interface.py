@@ -16,8 +16,8 @@ from hrc_learn.controller.constraint_layer import (
     ConstraintConfig,
     ConstraintReport,
     Distances,
-    SeparationConfig,
 )
+from hrc_learn.controller.contact_limits import SeparationConfig
 from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.kinematics import TaskSpace
 from hrc_learn.pytree import pytree

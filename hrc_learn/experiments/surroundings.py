@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller import SeparationConfig
-from hrc_learn.controller.contact_limits import region_numbers
+from hrc_learn.controller.contact_limits import ContactLimits, region_numbers
 from hrc_learn.dmp import InteractionPrimitive
 from hrc_learn.geometry import Box, Pose, minimum_jerk, quaternion
 from hrc_learn.jacobian.perspective import MARKER
@@ -35,7 +35,6 @@ from hrc_learn.sim.unmarked_scene import UnmarkedLook, unmarked
 from hrc_learn.sim.worker import IMAGE_RATE, PARTS, REGIONS
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace, pose_on_table
-from hrc_learn.skills.person_watch import ContactLimits
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.vision import Marker

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig, SeparationConfig
-from hrc_learn.controller.contact_limits import ContactSpeeds, contact_speeds, region_numbers
+from hrc_learn.controller.contact_limits import ContactLimits, ContactSpeeds, region_numbers
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, separation
-from hrc_learn.kinematics.inertia import MassMatrix
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
@@ -150,55 +149,6 @@ class PersonWatch:
             age=age,
             speed_scale=float(speed_scale),
             speed_cap=float(speed_cap),
-        )
-
-
-class ContactLimits:
-    """Contact speeds of an arm beside furniture, for power and force limiting."""
-
-    def __init__(self, arm: CapsuleArm, separation: SeparationConfig, furniture: Sequence[Box]):
-        """Prepare the mass matrix of the arm.
-
-        Args:
-            arm: Capsules of arm and tool.
-            separation: Reaction and deceleration of the arm, its surface and load.
-            furniture: Boxes against which the arm may clamp people, in the base frame.
-
-        Raises:
-            ValueError: The chain of the capsules is no arm with masses.
-        """
-        if not isinstance(arm.chain, Arm):
-            raise ValueError(
-                f"power and force limiting (mode={separation.mode!r}) needs the masses of the "
-                "arm: use one of `hrc_learn.kinematics.arm`, or mode='ssm'."
-            )
-        self._separation, self._furniture = separation, furniture
-        self._mass = MassMatrix(arm.chain, separation.contact.rotor_inertia)
-
-    def speeds(
-        self,
-        found: Separation,
-        joints: Float[Tensor, "*batch joints"],
-        regions: Int[Tensor, "*#batch H"],
-        holds: bool,
-    ) -> ContactSpeeds:
-        """Highest relative speeds of contacts.
-
-        Args:
-            found: Distances between arm and person.
-            joints: Joint positions [rad].
-            regions: Body region of each part of the person (`region_numbers`).
-            holds: True if the gripper holds an object.
-        """
-        config = self._separation.contact
-        return contact_speeds(
-            found,
-            self._mass(joints, config.load if holds else 0.0),
-            regions,
-            self._furniture,
-            config,
-            self._separation.reaction_time,
-            self._separation.deceleration,
         )
 
 

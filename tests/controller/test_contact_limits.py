@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import BODY_REGIONS, ContactConfig, SeparationConfig, contact_speed
-from hrc_learn.controller.contact_limits import clamped, contact_speeds, region_numbers
+from hrc_learn.controller.contact_limits import ContactLimits, clamped, region_numbers
 from hrc_learn.controller.task_pace import capped_scale
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda, separation
@@ -28,11 +28,15 @@ def allowed(name, mass, *, held=False, config=None):
         torch.tensor(1 / mass, dtype=DOUBLE),
         region_numbers([name])[0],
         torch.tensor(held),
-        config or ContactConfig(),
-        T,
-        A,
+        near(config),
     )
     return float(found)
+
+
+def near(config=None):
+    return SeparationConfig(
+        reaction_time=T, deceleration=A, mode="pfl", contact=config or ContactConfig()
+    )
 
 
 def peak_of_free_masses(v, m_arm, m_body, k):
@@ -119,12 +123,11 @@ def test_the_mass_behind_a_contact_is_that_of_the_arm_at_its_posture(load):
     q = panda.ready.clone()
     ends, radius = person((0.5, 0.1, 0.6), (0.2, -0.3, 0.7), (0.45, 0.0, 0.1))
     found = separation(panda.whole, q, ends, radius)
-    matrix = MassMatrix(panda, 0.1)
-    speeds = contact_speeds(
-        found, matrix(q, load), region_numbers(["hand"] * 3), (), ContactConfig(used=1.0), T, A
-    ).first
+    config = near(ContactConfig(used=1.0, load=load))
+    limits = ContactLimits(panda.whole, config, ())
+    speeds = limits.speeds(found, q, region_numbers(["hand"] * 3), holds=load > 0).first
     region, h = BODY_REGIONS["hand"], 1e-6
-    M = matrix(q, load).numpy()
+    M = MassMatrix(panda, 0.1)(q, load).numpy()
     for c, p in product((3, 6, 9, -1), range(3)):
         slope = np.array(
             [
@@ -145,12 +148,11 @@ def test_the_mass_behind_a_contact_is_that_of_the_arm_at_its_posture(load):
 def test_a_load_makes_contacts_slower():
     q = panda.ready.clone()
     ends, radius = person((0.6, 0.0, 0.48))
-    found, matrix = separation(panda.whole, q, ends, radius), MassMatrix(panda)
+    found = separation(panda.whole, q, ends, radius)
+    limits = ContactLimits(panda.whole, near(ContactConfig(load=3.0)), ())
     light, heavy = (
-        contact_speeds(
-            found, matrix(q, load), region_numbers(["chest"]), (), ContactConfig(), T, A
-        ).first[-1]
-        for load in (0.0, 3.0)
+        limits.speeds(found, q, region_numbers(["chest"]), holds).first[-1]
+        for holds in (False, True)
     )
     assert (heavy < 0.95 * light).all()
 
@@ -174,16 +176,10 @@ def test_only_what_lies_between_arm_and_furniture_is_clamped():
     assert not clamped(found, [TABLE], 0.02 * gap).any()
     assert not clamped(found, [], gap).any()
     free, squeezed = (
-        contact_speeds(
-            found,
-            MassMatrix(panda)(q),
-            region_numbers(["hand"] * 3),
-            near,
-            ContactConfig(),
-            T,
-            A,
-        ).first
-        for near in ([], [TABLE])
+        ContactLimits(panda.whole, near(), boxes)
+        .speeds(found, q, region_numbers(["hand"] * 3), holds=False)
+        .first
+        for boxes in ([], [TABLE])
     )
     assert squeezed[hand, 0] < 0.1 * free[hand, 0]
     assert (squeezed[~held] == free[~held]).all()
