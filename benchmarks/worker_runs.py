@@ -33,8 +33,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.person_watch import (
     NEAR_PEOPLE,
     PersonWatchConfig,
-    person_speeds,
-    urgent_distances,
+    person_limits,
 )
 from hrc_learn.teleoperation import ScriptedForce
 
@@ -346,8 +345,7 @@ class _Batch:
                 self._watch,
                 contact,
             )
-            part = urgent_distances(*observed)
-            scale[rows], cap[rows] = person_speeds(*observed)
+            part, scale[rows], cap[rows] = person_limits(*observed)
             distance[rows] = part.distance
             gradient[rows], approach[rows] = part.gradient, part.approach_speed
             if part.contact_speed is not None:

@@ -37,7 +37,6 @@ CORE: dict[str, set[str]] = {
     "controller": {
         "pytree",
         "protocols",
-        "watchdog",
         "geometry",
         "kinematics",
         "regions",

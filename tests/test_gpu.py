@@ -12,7 +12,7 @@ from pinhole import Pinhole, image_demonstrations, wander
 from torch import Tensor
 from torch.utils import _pytree
 
-from hrc_learn.controller import constrained_velocity
+from hrc_learn.controller.constraint_layer import constrained_velocity
 from hrc_learn.dmp import JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
 from hrc_learn.dmp.learned_motion import choose
 from hrc_learn.jacobian import RBFCenters, RBFImageJacobian, paper_grid

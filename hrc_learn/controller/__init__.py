@@ -8,13 +8,9 @@ from hrc_learn.controller.arm_loop_state import ArmLoopConfig as ArmLoopConfig
 from hrc_learn.controller.arm_loop_state import ArmReading as ArmReading
 from hrc_learn.controller.constraint_layer import ConstraintConfig as ConstraintConfig
 from hrc_learn.controller.constraint_layer import Distances as Distances
-from hrc_learn.controller.constraint_layer import (
-    constrained_velocity as constrained_velocity,
-)
 from hrc_learn.controller.contact_limits import BODY_REGIONS as BODY_REGIONS
 from hrc_learn.controller.contact_limits import ContactConfig as ContactConfig
 from hrc_learn.controller.contact_limits import SeparationConfig as SeparationConfig
-from hrc_learn.controller.contact_limits import contact_speed as contact_speed
 from hrc_learn.controller.interface import GRIPPER_DOWN as GRIPPER_DOWN
 from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from hrc_learn.controller.interface import INTERVENTIONS as INTERVENTIONS
@@ -25,10 +21,7 @@ from hrc_learn.controller.interface import SafetyConfig as SafetyConfig
 from hrc_learn.controller.interface import SafetyReport as SafetyReport
 from hrc_learn.controller.interface import SafetyState as SafetyState
 from hrc_learn.controller.resolved_rate import BlendingConfig as BlendingConfig
-from hrc_learn.controller.resolved_rate import VisionBlending as VisionBlending
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
 from hrc_learn.controller.task_pace import WayMakingConfig as WayMakingConfig
 from hrc_learn.controller.velocity_step import VelocityStep as VelocityStep
 from hrc_learn.controller.velocity_step import WantedVelocity as WantedVelocity
-from hrc_learn.watchdog import Watchdog as Watchdog
-from hrc_learn.watchdog import WatchdogError as WatchdogError

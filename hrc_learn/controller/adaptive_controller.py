@@ -30,7 +30,7 @@ from hrc_learn.controller.resolved_rate import (
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.controller.setting_checks import check_settings
-from hrc_learn.controller.task_pace import WayMakingConfig, way_making_velocity
+from hrc_learn.controller.task_pace import WayMakingConfig, null_space_input
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
@@ -396,11 +396,14 @@ class AdaptiveController(nn.Module):
         """Joint velocity of the law, with drift compensation while a person acts."""
         observation, goals, _, q, pose, J = given
         descent = s
-        d, rate = self._nullspace_input(observation), self.config.drift_compensation_rate
+        rate, damping = self.config.drift_compensation_rate, self.config.null_damping
+        d = null_space_input(
+            observation.nullspace_input, observation.distances, self.config.way_making, damping
+        )
         xi_q = self.joint_region.gradient(q)
         if goals.rest is not None:
-            xi_q = xi_q + self.config.null_damping * goals.rest.gradient(q)
-        null = (-xi_q if d is None else d - xi_q) / self.config.null_damping
+            xi_q = xi_q + damping * goals.rest.gradient(q)
+        null = (-xi_q if d is None else d - xi_q) / damping
 
         # B^T B J is the Jacobian of the controlled part of the tool's motion.
         basis, controlled = self._basis(goals, pose, J), J
@@ -484,18 +487,6 @@ class AdaptiveController(nn.Module):
         if task == "pose" and not self._nearest:
             return None
         return task_basis(J, pose.orientation, task, self._ranks[task])
-
-    def _nullspace_input(self, observation: Observation) -> Tensor | None:
-        """Null-space input of the person, plus the input equivalent to way-making."""
-        d, way = observation.nullspace_input, self.config.way_making
-        if way is None:
-            return d
-        if not way.expert:
-            d = None
-        if not way.automatic or observation.distances is None:
-            return d
-        push = self.config.null_damping * way_making_velocity(observation.distances, way)
-        return push if d is None else d + push
 
     def _adapted(
         self,

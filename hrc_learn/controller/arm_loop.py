@@ -51,8 +51,8 @@ from hrc_learn.controller.task_pace import (
     TaskPace,
     capped_scale,
     closes_in,
+    null_space_input,
     people_bind,
-    way_making_velocity,
 )
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import null_projection
@@ -225,12 +225,12 @@ class ArmLoop:
 
     def _requested_null_velocity(self, reading: ArmReading) -> Tensor:
         """Joint velocity whose null-space part is requested, by people or the repulsion."""
-        config, way = self.config, self.config.way_making
-        push = reading.nullspace_input
-        if way is not None and not way.expert:
-            push = torch.zeros_like(push)
-        if way is not None and way.automatic and reading.distances is not None:
-            push = push + config.damping * way_making_velocity(reading.distances, way)
+        config = self.config
+        push = null_space_input(
+            reading.nullspace_input, reading.distances, config.way_making, config.damping
+        )
+        if push is None:
+            push = torch.zeros_like(reading.nullspace_input)
         return _scaled(push, reading.person_speed_scale) / config.damping
 
     # Poses of the end effector.

@@ -103,13 +103,6 @@ def least_change(
     return LeastChange(now.y, now.side * now.dual, _solved(now, rows, lower, upper))
 
 
-def none_binds(
-    lower: Float[Tensor, "*batch rows"], upper: Float[Tensor, "*batch rows"]
-) -> Bool[Tensor, "*batch"]:
-    """True where the origin is within the limits of `least_change`, for any rows."""
-    return torch.maximum(lower, -upper).amax(-1) <= _TOLERANCE
-
-
 def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "*batch"]:
     below, above = _violations(now, rows, lower, upper)
     # A pending limit is not active yet, so it counts as violated.
@@ -368,7 +361,7 @@ def constrained_velocity(
         least.append(torch.full_like(allowed, -torch.inf))
         most.append(allowed + torch.linalg.vecdot(gradient, wanted.unsqueeze(-2)))
     least, most = torch.cat(least, dim=-1), torch.cat(most, dim=-1)
-    if may_branch(wanted) and bool(none_binds(least, most).all()):
+    if may_branch(wanted) and bool((torch.maximum(least, -most) <= _TOLERANCE).all()):
         solved = torch.ones_like(zero, dtype=torch.bool)
         within = wanted.clamp(lower, upper).to(dtype)
         zero = zero.to(dtype)

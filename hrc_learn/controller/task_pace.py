@@ -215,3 +215,30 @@ def way_making_velocity(
     length = safe_norm(gradient)
     direction = gradient / torch.where(length > 0, length, 1.0).unsqueeze(-1)
     return speed.unsqueeze(-1) * direction
+
+
+def null_space_input(
+    push: Float[Tensor, "*batch n"] | None,
+    distances: Distances | None,
+    config: WayMakingConfig | None,
+    damping: float,
+) -> Float[Tensor, "*batch n"] | None:
+    """Null-space input of a person, plus the input equivalent to way-making [N m].
+
+    Args:
+        push: Input of a person [N m]; None: none.
+        distances: Distances from the bodies to keep away from; None: none is near.
+        config: Source of null-space motion; None: a person.
+        damping: c_d, null-space input per unit of joint velocity [N m s/rad].
+
+    Returns:
+        The input; None: none.
+    """
+    if config is None:
+        return push
+    if not config.expert:
+        push = None
+    if not config.automatic or distances is None:
+        return push
+    own = damping * way_making_velocity(distances, config)
+    return own if push is None else push + own

@@ -10,6 +10,7 @@ from torch import Tensor
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.controller.motion_filter import MotionFilter, MotionState
 from hrc_learn.controller.resolved_rate import task_rate
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.controller.task_pace import capped_scale
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import SerialChain
@@ -99,10 +100,7 @@ class PositionServoConfig:
     """Safety filter applied to every velocity."""
 
     def __post_init__(self) -> None:
-        if not (self.gain > 0 and self.lag > 0):
-            raise ValueError(
-                f"gain and lag must be positive, but are {self.gain} and {self.lag}."
-            )
+        check_settings(self, positive=("gain", "lag"))
 
 
 class PositionServo:

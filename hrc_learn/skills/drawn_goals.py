@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import Goals
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.protocols import DrawnRegion, HumanInput
 from hrc_learn.regions import PositionRegion
@@ -41,9 +42,7 @@ class DrawnGoalsConfig:
     pointer changes it 25 times a second, and each change would have to be checked."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
+        check_settings(self, positive=vars(self))
 
 
 class Drawing(NamedTuple):

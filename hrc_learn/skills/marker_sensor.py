@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import StepLog
@@ -156,11 +157,7 @@ class LatencyConfig:
     """Fraction of lost images."""
 
     def __post_init__(self) -> None:
-        if self.delay < 0 or not 0 <= self.frame_loss < 1:
-            raise ValueError(
-                "delay must not be negative and frame_loss must be in [0, 1), but are "
-                f"{self.delay:g} s and {self.frame_loss:g}."
-            )
+        check_settings(self, not_negative=["delay"], below_one=["frame_loss"])
 
 
 # Images closer than this are one image whose age was read from another clock; and memory of

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig, SeparationConfig
 from hrc_learn.controller.contact_limits import ContactLimits, ContactSpeeds, region_numbers
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
@@ -50,12 +52,7 @@ class PersonWatchConfig:
     the speed cap."""
 
     def __post_init__(self) -> None:
-        if self.acceleration < 0:
-            raise ValueError(f"acceleration must not be negative, but is {self.acceleration}.")
-        if self.pairs < 1:
-            raise ValueError(f"pairs must be at least 1, but is {self.pairs}.")
-        if not self.fastest > 0:
-            raise ValueError(f"fastest must be positive, but is {self.fastest}.")
+        check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,26 +138,48 @@ class PersonWatch:
         if self._limits is not None and seen.regions:
             regions = region_numbers(seen.regions)
             contact = self._limits.speeds(found, joints, regions, load is not None)
-        observed = (velocity, joints.new_tensor(age), self._separation, self._config, contact)
-        speed_scale, speed_cap = person_speeds(found, *observed)
+        limits = person_limits(
+            found, velocity, joints.new_tensor(age), self._separation, self._config, contact
+        )
         return WatchedPeople(
-            distances=urgent_distances(found, *observed),
+            distances=limits.distances,
             nearest=float(found.distance.min()),
             age=age,
-            speed_scale=float(speed_scale),
-            speed_cap=float(speed_cap),
+            speed_scale=float(limits.speed_scale),
+            speed_cap=float(limits.speed_cap),
         )
 
 
-def urgent_distances(
+class PersonLimits(NamedTuple):
+    """Limits of an arm near people that were observed some time ago."""
+
+    distances: Distances
+    """Distances of the most urgent pairs, reduced by the distance that people may have moved
+    since. NaN where they may touch the arm and must not."""
+    speed_scale: Float[Tensor, "*batch"]
+    """Speed scale of the arm in every direction, 0 to 1."""
+    speed_cap: Float[Tensor, "*batch"]
+    """Cap on the speed of all parts of the arm [m/s]; infinite: none."""
+
+
+def person_limits(
     found: Separation,
     velocity: Float[Tensor, "*batch H 2 3"],
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
     contact: ContactSpeeds | None = None,
-) -> Distances:
-    """Distances of the most urgent pairs, for people observed some time ago.
+) -> PersonLimits:
+    """Distances to keep from people, and limits of the speed near them.
+
+    The protective distance limits the speed towards people only. An arm that moves past
+    them, or makes way, approaches them as soon as they have come near; so it comes to rest
+    by the time at which they may touch any part of it, if they accelerate all the while.
+    People who recede count as at rest: a hand turns round faster than a tracker, which
+    averages over some images, can show.
+
+    Where contact is allowed, the cap takes the place of the scale: by that time the arm is
+    at rest, or no faster than a contact in any direction allows.
 
     Args:
         found: Distances of the arm as it is now from people as they were observed.
@@ -169,14 +188,11 @@ def urgent_distances(
         separation: Protective distance, by which the urgency of pairs is judged.
         config: Assumptions about people.
         contact: Highest relative speeds of contacts; None: no contact is allowed.
-
-    Returns:
-        The distances, reduced by the distance that people may have moved since. NaN where
-        they may touch the arm and must not.
     """
+    a, rate = config.acceleration, found.person_rate(velocity)
+    late = (age + separation.reaction_time)[..., None, None]
     # Speed that people may have gained since, and gain until the arm reacts.
-    gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
-    towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
+    towards = (a * late - rate).clamp(min=0).flatten(-2)
     distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
     # A contact that has begun may last, so that quasi-static limits hold.
     near, speed = found.distance < config.contact, None
@@ -188,7 +204,7 @@ def urgent_distances(
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
     touching = near.flatten(-2).any(-1, keepdim=True)
-    return Distances(
+    distances = Distances(
         distance=distance.gather(-1, urgent).masked_fill(touching, _NAN),
         gradient=found.gradient_of(urgent),
         approach_speed=towards.gather(-1, urgent),
@@ -196,40 +212,15 @@ def urgent_distances(
         contact_speed=None if speed is None else speed.gather(-1, urgent),
     )
 
-
-def person_speeds(
-    found: Separation,
-    velocity: Float[Tensor, "*batch H 2 3"],
-    age: Float[Tensor, "*batch"],
-    separation: SeparationConfig,
-    config: PersonWatchConfig,
-    contact: ContactSpeeds | None = None,
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Speed scale of the arm, 0 to 1, and cap on the speed of all its parts [m/s].
-
-    The protective distance limits the speed towards people only. An arm that moves past
-    them, or makes way, approaches them as soon as they have come near; so it comes to rest
-    by the time at which they may touch any part of it, if they accelerate all the while.
-    People who recede count as at rest: a hand turns round faster than a tracker, which
-    averages over some images, can show.
-
-    Where contact is allowed, the cap takes the place of the scale: by that time the arm is
-    at rest, or no faster than a contact in any direction allows. The cap is infinite where
-    no such contact may come about. The arguments are those of `urgent_distances`.
-    """
-    coming = (-found.person_rate(velocity)).clamp(min=0)
+    coming = (-rate).clamp(min=0)
     # The root t of  coming t + a t^2/2 = distance.
-    a, distance = config.acceleration, (found.distance - config.contact).clamp(min=0)
-    root = (coming**2 + 2 * a * distance).sqrt()
-    arrival = 2 * distance / (coming + root).clamp(min=1e-9)
-    late = (age + separation.reaction_time)[..., None, None]
+    gap = (found.distance - config.contact).clamp(min=0)
+    arrival = 2 * gap / (coming + (coming**2 + 2 * a * gap).sqrt()).clamp(min=1e-9)
     scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)
-    if contact is None:
-        slowest = scale.amin((-2, -1))
-        return slowest, torch.full_like(slowest, math.inf)
-    cap = torch.maximum(contact.first - coming - a * late, config.fastest * scale)
-    applies = (contact.first > 0) & (scale < 1)
-    return (
-        scale.masked_fill(contact.first > 0, 1.0).amin((-2, -1)),
-        torch.where(applies, cap, math.inf).amin((-2, -1)),
-    )
+    cap = torch.full_like(scale, math.inf)
+    if contact is not None:
+        slowest = torch.maximum(contact.first - coming - a * late, config.fastest * scale)
+        touchable = contact.first > 0
+        cap = torch.where(touchable & (scale < 1), slowest, math.inf)
+        scale = scale.masked_fill(touchable, 1.0)
+    return PersonLimits(distances, scale.amin((-2, -1)), cap.amin((-2, -1)))

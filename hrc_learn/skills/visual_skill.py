@@ -98,7 +98,14 @@ class MarkerAngle:
                 forth.
             chosen: Turn chosen before; None: none.
         """
-        return _within(heading + self.offset - _heading(reference), now, turn_range, chosen)
+        turn, (low, high) = heading + self.offset - _heading(reference), turn_range
+        candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
+        if chosen is not None:
+            same = min(candidates, key=lambda c: abs(c - chosen))
+            if low - _KEPT <= same <= high + _KEPT:
+                return same
+        inside = [c for c in candidates if low <= c <= high]
+        return min(inside or [min(max(turn, low), high)], key=lambda c: abs(c - now))
 
     def save(self, path: Path) -> None:
         """Write a JSON file, atomically."""
@@ -120,23 +127,6 @@ def _heading(orientation: Float[Tensor, "4"]) -> float:
     """Heading of a tool's x axis in the horizontal plane [rad]."""
     x, y, _ = quaternion.to_matrix(orientation)[:, 0].tolist()
     return math.atan2(y, x)
-
-
-def _within(
-    turn: float, now: float, turn_range: tuple[float, float], chosen: float | None
-) -> float:
-    """Turn in the range that equals `turn` modulo half turns.
-
-    The one nearest to the present turn; the one chosen before, if it is nearly in the range.
-    """
-    low, high = turn_range
-    candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
-    if chosen is not None:
-        same = min(candidates, key=lambda c: abs(c - chosen))
-        if low - _KEPT <= same <= high + _KEPT:
-            return same
-    inside = [c for c in candidates if low <= c <= high]
-    return min(inside or [min(max(turn, low), high)], key=lambda c: abs(c - now))
 
 
 def _wrapped(angle: float) -> float:

@@ -227,10 +227,7 @@ class WorkCell:
 
     def watchful(self, safety: SafetyConfig) -> SafetyConfig:
         """Settings of a safety filter that keeps its distance from the people tracked here."""
-        if self._watch is None:
-            return safety
-        separation = self.config.safety.separation
-        return replace(self._watch.watchful(safety), separation=separation)
+        return safety if self._watch is None else self._watch.watchful(safety)
 
     # Messages and images.
 

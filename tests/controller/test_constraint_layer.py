@@ -19,8 +19,8 @@ from hrc_learn.controller import (
     SafetyConfig,
     SafetyFilter,
     SeparationConfig,
-    constrained_velocity,
 )
+from hrc_learn.controller.constraint_layer import constrained_velocity
 from hrc_learn.geometry.numerics import (
     null_projection,
     orthonormal_basis,

@@ -10,8 +10,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import BODY_REGIONS, ContactConfig, SeparationConfig, contact_speed
-from hrc_learn.controller.contact_limits import ContactLimits, clamped, region_numbers
+from hrc_learn.controller import BODY_REGIONS, ContactConfig, SeparationConfig
+from hrc_learn.controller.contact_limits import (
+    ContactLimits,
+    clamped,
+    contact_speed,
+    region_numbers,
+)
 from hrc_learn.controller.task_pace import capped_scale
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda, separation

@@ -4,9 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.controller import BlendingConfig, VisionBlending
+from hrc_learn.controller import BlendingConfig
 from hrc_learn.controller.resolved_rate import (
     BlendingState,
+    VisionBlending,
     approach_velocity,
     fade,
     next_task_level,

@@ -10,7 +10,7 @@ from grasp_trials import CORNERS, TrialConfig, run_trials
 from pinhole_camera import PinholeCamera
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import VisionBlending
+from hrc_learn.controller.resolved_rate import VisionBlending
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     BroydenEstimator,
