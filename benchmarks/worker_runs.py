@@ -22,7 +22,12 @@ from worker_tables import Workers, WorkerTables
 
 from hrc_learn.controller import Distances, WayMakingConfig
 from hrc_learn.controller.arm_loop import ArmLoop
-from hrc_learn.controller.arm_loop_state import ArmLoopConfig, ArmReading, FollowPath
+from hrc_learn.controller.arm_loop_state import (
+    ArmLoopConfig,
+    ArmReading,
+    FollowPath,
+    WatchedPeople,
+)
 from hrc_learn.controller.contact_limits import ContactLimits, PersonMode, region_numbers
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.experiments.surroundings import margin_to_stop
@@ -33,7 +38,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.person_watch import (
     NEAR_PEOPLE,
     PersonWatchConfig,
-    person_limits,
+    watched_people,
 )
 from hrc_learn.teleoperation import ScriptedForce
 
@@ -291,7 +296,7 @@ class _Batch:
         q = self._q[live] + job.encoder_offset[live] + noise[live, step % noise.shape[1]]
         cycle, progress = self._progress()
         holding = self._holding[cycle, progress.long()]
-        distances, scale, cap, stop = self._look(step, q, holding)
+        people, stop = self._look(step, q, holding)
         pose, jacobian = panda.forward_and_jacobian(q)
         pulls = self._reaction.way_making.expert
         return ArmReading(
@@ -300,16 +305,14 @@ class _Batch:
             jacobian=jacobian,
             nullspace_input=self._pulled(step, q) if pulls else torch.zeros_like(q),
             pause=torch.zeros_like(stop),
-            distances=distances,
-            person_speed_scale=scale,
-            person_speed_cap=cap,
+            people=people,
             stop=stop,
         )
 
     def _look(
         self, step: int, measured: Tensor, holding: Tensor
-    ) -> tuple[Distances | None, Tensor, Tensor | None, Bool[Tensor, " live"]]:
-        """Distances to keep, speed scale and cap, and True where the arm must rest."""
+    ) -> tuple[WatchedPeople | None, Bool[Tensor, " live"]]:
+        """People near the arms, and True where an arm must rest."""
         seen, age = self._job.workers.seen(step, self.live)
         # Arms rest as long as nothing was seen.
         stop, age = age.isnan(), age.nan_to_num()
@@ -319,7 +322,7 @@ class _Batch:
             limit = self._reaction.stop_distance
             for rows, found, _ in self._near(measured, holding, seen, bound, bound < limit):
                 stop[rows] |= found.distance.amin((-2, -1)) < limit
-            return None, scale, None, stop
+            return None, stop
         gain = self._watch.acceleration * (age + self._separation.reaction_time)
         towards = gain.unsqueeze(-1) + seen.velocity.norm(dim=-1).amax(-1)
         allowed = self._separation.highest_speed(bound - age.unsqueeze(-1) * towards, towards)
@@ -345,7 +348,9 @@ class _Batch:
                 self._watch,
                 contact,
             )
-            part, scale[rows], cap[rows] = person_limits(*observed)
+            people = watched_people(*observed)
+            scale[rows], cap[rows] = people.speed_scale, people.speed_cap
+            part = people.distances
             distance[rows] = part.distance
             gradient[rows], approach[rows] = part.gradient, part.approach_speed
             if part.contact_speed is not None:
@@ -357,7 +362,11 @@ class _Batch:
             person=torch.ones(shape, dtype=torch.bool),
             contact_speed=touch,
         )
-        return distances, scale, cap, stop
+        nearest = distance.amin(-1)
+        people = WatchedPeople(
+            distances=distances, nearest=nearest, age=age, speed_scale=scale, speed_cap=cap
+        )
+        return people, stop
 
     def _bound(self, q: Tensor, holding: Tensor, workers: Workers) -> Float[Tensor, "live H"]:
         """Lower bounds of the distances between the workers' capsules and the arms [m]."""

@@ -35,6 +35,7 @@ from hrc_learn.controller.arm_loop_state import (
     TrackPose,
     WantedMotion,
 )
+from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.interface import Command, SafetyReport
 from hrc_learn.controller.null_space_motion import (
     Clearance,
@@ -227,11 +228,11 @@ class ArmLoop:
         """Joint velocity whose null-space part is requested, by people or the repulsion."""
         config = self.config
         push = null_space_input(
-            reading.nullspace_input, reading.distances, config.way_making, config.damping
+            reading.nullspace_input, _distances(reading), config.way_making, config.damping
         )
         if push is None:
             push = torch.zeros_like(reading.nullspace_input)
-        return _scaled(push, reading.person_speed_scale) / config.damping
+        return _scaled(push, reading) / config.damping
 
     # Poses of the end effector.
 
@@ -253,26 +254,19 @@ class ArmLoop:
     ) -> tuple[Tensor, ArmLoopState, ArmReport]:
         """Send a joint velocity through the safety filter."""
         velocity = wanted.joint_velocity
-        if reading.person_speed_cap is not None:
-            scale = capped_scale(
-                self.chain,
-                reading.joint_position,
-                reading.jacobian,
-                velocity,
-                reading.person_speed_cap,
-            )
-            if reading.person_speed_scale is not None:
-                scale = torch.minimum(scale, reading.person_speed_scale)
-            reading = replace(reading, person_speed_scale=scale)
-        J, load = reading.jacobian, reading.load
+        J, q, load = reading.jacobian, reading.joint_position, reading.load
+        if (people := reading.people) is not None:
+            scale = capped_scale(self.chain, q, J, velocity, people.speed_cap)
+            people = replace(people, speed_scale=torch.minimum(scale, people.speed_scale))
+            reading = replace(reading, people=people)
         sent, safety, filtered = self.safety.step(
             state.safety,
-            reading.joint_position,
-            _scaled(velocity, reading.person_speed_scale),
+            q,
+            _scaled(velocity, reading),
             self.config.dt,
             jacobian=J,
             load=None if load is None else quaternion.rotate(reading.pose.orientation, load),
-            distances=reading.distances,
+            distances=_distances(reading),
             stop=reading.stop,
         )
         slowed = self._slowed_by_people(reading, sent, filtered)
@@ -311,27 +305,27 @@ class ArmLoop:
         self, reading: ArmReading, sent: Tensor, report: SafetyReport
     ) -> Tensor:
         """True where people near the arm hold it back."""
-        slowed = torch.zeros_like(sent[..., 0], dtype=torch.bool)
-        if reading.person_speed_scale is not None:
-            slowed = slowed | (reading.person_speed_scale < 1)
+        slowed, people = torch.zeros_like(sent[..., 0], dtype=torch.bool), reading.people
         if reading.stop is not None:
             slowed = slowed | reading.stop
-        if reading.distances is not None and report.constraints is not None:
+        if people is None:
+            return slowed
+        slowed = slowed | (people.speed_scale < 1)
+        if report.constraints is not None:
             config = self.safety.config
-            slowed = slowed | people_bind(reading.distances, sent, report.constraints, config)
+            slowed = slowed | people_bind(people.distances, sent, report.constraints, config)
         return slowed
 
     def _explained(
         self, reading: ArmReading, report: ArmReport, velocity: Tensor, sent: Tensor
     ) -> ArmReport:
         """The report with the part of a push that the safety filter removes."""
-        J, scale = reading.jacobian, reading.person_speed_scale
+        J, people, config = reading.jacobian, reading.people, self.safety.config
         slowed = torch.zeros_like(sent[..., 0], dtype=torch.bool)
-        if scale is not None:
-            slowed = slowed | (scale < 1)
-        config, distances = self.safety.config, reading.distances
-        if distances is not None and config.constraints is not None:
-            slowed = slowed | closes_in(distances, sent, config)
+        if people is not None:
+            slowed = people.speed_scale < 1
+            if config.constraints is not None:
+                slowed = slowed | closes_in(people.distances, sent, config)
         motion = null_projection(J, velocity), null_projection(J, sent)
         return report._replace(slowed_by_people=slowed, null_motion=motion)
 
@@ -341,5 +335,11 @@ def _without_path(state: ArmLoopState) -> ArmLoopState:
     return replace(state, path=replace(state.path, followed=torch.zeros_like(state.aside)))
 
 
-def _scaled(velocity: Tensor, scale: Tensor | None) -> Tensor:
-    return velocity if scale is None else scale.unsqueeze(-1) * velocity
+def _distances(reading: ArmReading) -> Distances | None:
+    return None if reading.people is None else reading.people.distances
+
+
+def _scaled(velocity: Tensor, reading: ArmReading) -> Tensor:
+    """Joint values scaled by the speed that people leave."""
+    people = reading.people
+    return velocity if people is None else people.speed_scale.unsqueeze(-1) * velocity

@@ -56,6 +56,25 @@ class ArmLoopConfig(YieldingConfig):
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
+class WatchedPeople:
+    """People near the arm, as far as they may have moved since they were observed."""
+
+    distances: Distances
+    """Distances of the most urgent pairs, reduced by the distance that people may have moved
+    since the observation. NaN, for which the arm brakes, while there is no observation and
+    where people may touch the arm and must not."""
+    nearest: Float[Tensor, "*batch"]
+    """Smallest distance between people as observed and the arm as it is now [m]."""
+    age: Float[Tensor, "*batch"]
+    """Age of the observation [s]."""
+    speed_scale: Float[Tensor, "*batch"]
+    """Speed scale of the arm in every direction, 0 to 1."""
+    speed_cap: Float[Tensor, "*batch"]
+    """Cap on the speed of all parts of the arm [m/s]; infinite: none."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
 class ArmReading:
     """One reading of the arm and of the people near it."""
 
@@ -72,12 +91,9 @@ class ArmReading:
     load: Float[Tensor, "*batch 3"] | None = None
     """Far end of a load in the frame of the end effector, whose speed is capped as well [m];
     None: no load."""
-    distances: Distances | None = None
-    """Distances from people, which the safety filter keeps; None: people are not tracked."""
-    person_speed_scale: Float[Tensor, "*batch"] | None = None
-    """Speed scale imposed by approaching people, 0 to 1; None: 1."""
-    person_speed_cap: Float[Tensor, "*batch"] | None = None
-    """Cap on the speed of all parts of the arm near people [m/s]; None: none."""
+    people: WatchedPeople | None = None
+    """People near the arm, which slow it down and whose distances the safety filter keeps;
+    None: people are not tracked."""
     stop: Bool[Tensor, "*batch"] | None = None
     """True where the arm must come to rest for the sake of people; None: nowhere."""
     explain: bool = static(False)

@@ -189,9 +189,9 @@ class PositionServo:
         if self._watch is not None:
             watched = self._watch.look(state.time, q)
             distances, u = watched.distances, torch.from_numpy(wanted)
-            cap = q.new_tensor(watched.speed_cap)
-            scale = capped_scale(self._chain, q, self._chain.jacobian(q), u, cap)
-            wanted = min(watched.speed_scale, float(scale)) * wanted
+            J, cap = self._chain.jacobian(q), watched.speed_cap
+            scale = capped_scale(self._chain, q, J, u, cap)
+            wanted = float(torch.minimum(watched.speed_scale, scale)) * wanted
         filtered, self.safety, _ = self._filter.step(
             self.safety,
             q,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig, SeparationConfig
+from hrc_learn.controller.arm_loop_state import WatchedPeople
 from hrc_learn.controller.contact_limits import ContactLimits, ContactSpeeds, region_numbers
 from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Box
@@ -53,24 +53,6 @@ class PersonWatchConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
-
-
-@dataclass(frozen=True, kw_only=True)
-class WatchedPeople:
-    """People near the arm, as far as they may have moved since they were observed."""
-
-    distances: Distances
-    """Distances of the most urgent pairs, reduced by the distance that people may have moved
-    since the observation. NaN, for which the arm brakes, while there is no observation and
-    where people may touch the arm."""
-    nearest: float = _NAN
-    """Smallest distance between people as observed and the arm as it is now [m]."""
-    age: float = _NAN
-    """Age of the observation [s]."""
-    speed_scale: float = 1.0
-    """Speed scale of the arm in every direction, 0 to 1."""
-    speed_cap: float = math.inf
-    """Cap on the speed of all parts of the arm [m/s]."""
 
 
 class PersonWatch:
@@ -128,7 +110,11 @@ class PersonWatch:
                     gradient=unknown[:, None].expand(number, len(joints)),
                     approach_speed=unknown,
                     person=torch.ones_like(unknown, dtype=torch.bool),
-                )
+                ),
+                nearest=unknown[0],
+                age=unknown[0],
+                speed_scale=joints.new_tensor(1.0),
+                speed_cap=joints.new_tensor(math.inf),
             )
         ends, radius, velocity = (
             torch.from_numpy(x).to(joints) for x in (seen.ends, seen.radius, seen.velocity)
@@ -138,38 +124,18 @@ class PersonWatch:
         if self._limits is not None and seen.regions:
             regions = region_numbers(seen.regions)
             contact = self._limits.speeds(found, joints, regions, load is not None)
-        limits = person_limits(
-            found, velocity, joints.new_tensor(age), self._separation, self._config, contact
-        )
-        return WatchedPeople(
-            distances=limits.distances,
-            nearest=float(found.distance.min()),
-            age=age,
-            speed_scale=float(limits.speed_scale),
-            speed_cap=float(limits.speed_cap),
-        )
+        age = joints.new_tensor(age)
+        return watched_people(found, velocity, age, self._separation, self._config, contact)
 
 
-class PersonLimits(NamedTuple):
-    """Limits of an arm near people that were observed some time ago."""
-
-    distances: Distances
-    """Distances of the most urgent pairs, reduced by the distance that people may have moved
-    since. NaN where they may touch the arm and must not."""
-    speed_scale: Float[Tensor, "*batch"]
-    """Speed scale of the arm in every direction, 0 to 1."""
-    speed_cap: Float[Tensor, "*batch"]
-    """Cap on the speed of all parts of the arm [m/s]; infinite: none."""
-
-
-def person_limits(
+def watched_people(
     found: Separation,
     velocity: Float[Tensor, "*batch H 2 3"],
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
     contact: ContactSpeeds | None = None,
-) -> PersonLimits:
+) -> WatchedPeople:
     """Distances to keep from people, and limits of the speed near them.
 
     The protective distance limits the speed towards people only. An arm that moves past
@@ -223,4 +189,10 @@ def person_limits(
         touchable = contact.first > 0
         cap = torch.where(touchable & (scale < 1), slowest, math.inf)
         scale = scale.masked_fill(touchable, 1.0)
-    return PersonLimits(distances, scale.amin((-2, -1)), cap.amin((-2, -1)))
+    return WatchedPeople(
+        distances=distances,
+        nearest=found.distance.amin((-2, -1)),
+        age=age,
+        speed_scale=scale.amin((-2, -1)),
+        speed_cap=cap.amin((-2, -1)),
+    )

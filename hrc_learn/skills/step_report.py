@@ -10,11 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import INTERVENTIONS, SafetyReport, SeparationConfig
-from hrc_learn.controller.arm_loop_state import ArmReport, Limitation
+from hrc_learn.controller.arm_loop_state import ArmReport, Limitation, WatchedPeople
 from hrc_learn.controller.null_space_motion import fraction_kept
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reason
-from hrc_learn.skills.person_watch import WatchedPeople
 
 # Fraction of a motion above which it counts as followed: late servos and the curvature of the
 # null space leave no more of it either.
@@ -297,8 +296,8 @@ def separation_columns(
     )
     tightest = (near.distance - needed).argmin()
     return {
-        "person_distance": watched.nearest,
-        "person_age": watched.age,
+        "person_distance": float(watched.nearest),
+        "person_age": float(watched.age),
         "protective_distance": float(needed[tightest]),
         "separation_margin": float((near.distance - needed)[tightest]),
         "pace": people_scale,

@@ -37,7 +37,7 @@ from hrc_learn.skills.marker_sensor import (
     LatencyConfig,
     MarkerObservation,
 )
-from hrc_learn.skills.person_watch import PersonWatch, WatchedPeople
+from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.step_report import (
     NO_VISION,
     PersonFeedback,
@@ -126,7 +126,6 @@ class WorkCell:
     load: GraspedBox | None
     state: ArmState
     _reading: ArmReading
-    _watched: WatchedPeople | None
 
     def __init__(
         self,
@@ -213,7 +212,7 @@ class WorkCell:
     @property
     def distances(self) -> Distances | None:
         """Distances from people, for a safety filter to keep; None: people are not tracked."""
-        return self._reading.distances
+        return None if self._reading.people is None else self._reading.people.distances
 
     @property
     def pace(self) -> TaskPace:
@@ -453,14 +452,14 @@ class WorkCell:
         self._give_up_if_blocked()
         self.region = region
         self._feedback.note_step(report, filtered=explained)
-        if (watched := self._watched) is not None:
+        if (watched := reading.people) is not None:
             separation, scale = self.config.safety.separation, float(self.pace.people_scale)
             columns = columns | separation_columns(watched, separation, velocity, scale)
         told = self._feedback.told(
             self.state,
             self.jacobian,
             pushed=reading.explain,
-            person_distance=None if watched is None else watched.nearest,
+            person_distance=None if watched is None else float(watched.nearest),
             pace=float(self.pace.scale),
             load=self.load,
             contact_expected=self.time < self._contact_expected,
@@ -500,13 +499,12 @@ class WorkCell:
     def _sense(self, state: ArmState, asked: HumanInput) -> None:
         """Take in a reading with its kinematics, and the people near the arm."""
         joints = torch.from_numpy(state.joint_position)
-        watched = None
+        people = None
         if self._watch is not None:
-            watched = self._watch.look(state.time, joints, self.load)
+            people = self._watch.look(state.time, joints, self.load)
         push, way = asked.effort(len(joints)), self.config.way_making
         pose, jacobian = self.chain.forward_and_jacobian(joints)
-        scale = None if watched is None else joints.new_tensor(watched.speed_scale)
-        self.state, self._watched = state, watched
+        self.state = state
         self._reading = ArmReading(
             joint_position=joints,
             pose=pose,
@@ -514,9 +512,7 @@ class WorkCell:
             nullspace_input=torch.from_numpy(push),
             pause=torch.tensor(asked.pause),
             load=None if self.load is None else joints.new_tensor(self.load.end),
-            distances=None if watched is None else watched.distances,
-            person_speed_scale=scale,
-            person_speed_cap=None if watched is None else joints.new_tensor(watched.speed_cap),
+            people=people,
             explain=bool(push.any()) and (way is None or way.expert),
         )
 

@@ -16,6 +16,7 @@ from hrc_learn.controller.arm_loop_state import (
     FollowPath,
     MoveJoints,
     TrackPose,
+    WatchedPeople,
 )
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.kinematics import panda
@@ -53,13 +54,18 @@ def reading(k, q):
         jacobian=jacobian,
         nullspace_input=pushed[:, None] * torch.tensor([[1.0], [-2], [0.5], [0]]) * GENTLE,
         pause=torch.tensor([False, False, 20 < k < 50, False]),
-        distances=Distances(
-            distance=near[:, None],
-            gradient=jacobian[:, :1, :].contiguous(),
-            approach_speed=torch.zeros(ARMS, 1, dtype=torch.float64),
-            person=torch.ones(ARMS, 1, dtype=torch.bool),
+        people=WatchedPeople(
+            distances=Distances(
+                distance=near[:, None],
+                gradient=jacobian[:, :1, :].contiguous(),
+                approach_speed=torch.zeros(ARMS, 1, dtype=torch.float64),
+                person=torch.ones(ARMS, 1, dtype=torch.bool),
+            ),
+            nearest=near,
+            age=torch.zeros_like(near),
+            speed_scale=near.clamp(max=1.0),
+            speed_cap=torch.full_like(near, torch.inf),
         ),
-        person_speed_scale=near.clamp(max=1.0),
         stop=torch.tensor([False, False, False, k > 110]),
         explain=True,
     )
