@@ -296,7 +296,7 @@ class AdaptiveController(nn.Module):
         """
         state = self._restored(state)
         self.safety.joint_vector(observation.joint_position, "joint_position")
-        goals, known = law.effective_goals(observation, self.goals)
+        goals = self.goals if observation.goals is None else observation.goals
         self._check_task(goals)
         dt, timed = law.validated_step(observation.dt, self.config.safety.longest_step)
         q, stale = law.validated_position(observation, state.safety.position)
@@ -306,7 +306,7 @@ class AdaptiveController(nn.Module):
         task_level = law.next_task_level(
             state.task_level, goals.posture, q, state.blending.active, dt, blend_time
         )
-        usable = visible = observation.feature_visible & goals.vision_enabled & known
+        usable = visible = observation.feature_visible & goals.vision_enabled
         if goals.posture is not None:
             usable = usable & (task_level > 0)  # no vision during a joint-space approach
         blending, seen, stop = self.blending.step(

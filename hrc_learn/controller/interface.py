@@ -284,9 +284,6 @@ class Observation:
     joint_velocity: Float[Tensor, "*batch n"] | None = None
     """Measured joint velocities [rad/s]. In the first step after a start they take the place of
     those of the start, where they differ. None: not measured."""
-    target: Float[Tensor, "*#batch rows"] | None = None
-    """Target in the image [px]; None: that of the goals. NaN (unknown) switches vision feedback
-    off."""
     nullspace_input: Float[Tensor, "*batch n"] | None = None
     """Null-space input d of the paper: joint torques exerted by a person [N m]; None: none."""
     goals: Goals | None = None

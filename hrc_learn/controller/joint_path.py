@@ -37,9 +37,6 @@ NARROW = 0.07
 """Smallest singular value of the Jacobian along a path below which the joints cannot leave it.
 Damping begins at 0.05."""
 
-# Distance from the path at which joints that were pushed count as aside when a path begins, and
-# at which they count as back [rad]. Servos lag by 0.03 rad at the speed of transfers.
-_ASIDE, _BACK = 0.1, 0.03
 # Distance at which a path that has waited goes on [rad].
 _NEAR_AGAIN = 1.4
 # Distances from the path [rad]: joints nearer than the first find back whatever the alignment,
@@ -114,28 +111,6 @@ class JointPaths:
         return first + (progress - k).clamp(max=1.0).unsqueeze(-1) * (following - first)
 
 
-def begins_aside(error: Float[Tensor, "*batch n"]) -> Bool[Tensor, "*batch"]:
-    """True where joints [rad] are so far from the start of a path that a push moved them."""
-    return error.norm(dim=-1) > _ASIDE
-
-
-def stays_aside(
-    pushed: Bool[Tensor, "*batch"],
-    aside: Bool[Tensor, "*batch"],
-    error: Float[Tensor, "*batch n"],
-) -> Bool[Tensor, "*batch"]:
-    """True where the joints are off their path because they are, or were, pushed.
-
-    Joints that lag without a push are in contact with something: they continue along the path.
-
-    Args:
-        pushed: True while the null space is pushed.
-        aside: True if the joints were off their path in the last step.
-        error: Path minus joint positions [rad].
-    """
-    return pushed | (aside & (error.norm(dim=-1) > _BACK))
-
-
 def return_alignment(
     null_error: Float[Tensor, "*batch n"], error: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch"]:
@@ -183,25 +158,6 @@ def push_fraction(
     """
     fade = (alignment - POORLY_ALIGNED) / (WELL_ALIGNED - POORLY_ALIGNED)
     return torch.where(torch.linalg.vecdot(push, null_error) > 0, 1.0, fade.clamp(0.0, 1.0))
-
-
-def eased_return(
-    previous: Float[Tensor, "*batch n"],
-    null_error: Float[Tensor, "*batch n"],
-    dt: float,
-    config: YieldingConfig,
-) -> Float[Tensor, "*batch n"]:
-    """Null-space velocity back to a path, smoothed [rad/s].
-
-    Args:
-        previous: That of the last step [rad/s].
-        null_error: Null-space part of the path error [rad]; zero for joints that stay aside.
-        dt: Control step [s].
-        config: Gain and highest speed of the return.
-    """
-    fastest = config.return_speed / null_error.norm(dim=-1, keepdim=True).clamp(min=1e-9)
-    back = fastest.clamp(max=config.pose_gain) * null_error
-    return previous + min(dt / config.nullspace_rise, 1.0) * (back - previous)
 
 
 def waiting_time(

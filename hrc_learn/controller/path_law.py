@@ -25,6 +25,10 @@ from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.pytree import apply_where
 
+# Distance from the path at which joints that were pushed count as aside when a path begins, and
+# at which they count as back [rad]. Servos lag by 0.03 rad at the speed of transfers.
+_ASIDE, _BACK = 0.1, 0.03
+
 
 class PathTarget(NamedTuple):
     """Point of a joint path."""
@@ -81,7 +85,8 @@ class PathLaw:
         path = PathState.none(joint_position, state.path.pose)
         goal, last = paths.position[which, 0], paths.last[which].to(path.last)
         path = replace(path, goal=goal, last=last)
-        return replace(state, aside=joint_path.begins_aside(goal - joint_position), path=path)
+        aside = (goal - joint_position).norm(dim=-1) > _ASIDE
+        return replace(state, aside=aside, path=path)
 
     def go_on(self, state: ArmLoopState, reading: ArmReading) -> PathState:
         """Progress along the path, one step later."""
@@ -196,7 +201,9 @@ class PathLaw:
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        aside = (~target.narrow | aside) & joint_path.stays_aside(pushed, aside, error)
+        # Joints that lag without a push touch something: they go on along the path.
+        stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
+        aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
         null_error = null_error.masked_fill(~aside.unsqueeze(-1), 0.0)
         lost = torch.zeros_like(aside)
@@ -210,7 +217,9 @@ class PathLaw:
             fraction = torch.where(aside, kept, 1.0)
             returns = returns | ~pushed
         null_error = null_error.masked_fill(~returns.unsqueeze(-1), 0.0)
-        back = joint_path.eased_return(state.return_velocity, null_error, config.dt, config)
+        fastest = config.return_speed / null_error.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+        back, last = fastest.clamp(max=config.pose_gain) * null_error, state.return_velocity
+        back = last + min(config.dt / config.nullspace_rise, 1.0) * (back - last)
         return OffPath(
             aside=aside,
             lost=lost,

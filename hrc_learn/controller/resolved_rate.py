@@ -614,16 +614,3 @@ def validated_step(
         return dt, True
     known = (dt > 0) & (dt <= longest)
     return torch.where(known, dt, 0.0), known
-
-
-def effective_goals(
-    observation: Observation, default: Goals
-) -> tuple[Goals, Bool[Tensor, "*batch"] | bool]:
-    """Goals of this step, and True where the target is known (not NaN)."""
-    goals = default if observation.goals is None else observation.goals
-    target = observation.target
-    if target is None:
-        return goals, True
-    known = is_number(target).all(-1)
-    target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
-    return replace(goals, vision=replace(goals.vision, target=target)), known

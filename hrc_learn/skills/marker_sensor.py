@@ -53,8 +53,36 @@ class FeatureSensor(ABC):
         """Take an image, and find features in it, by number; those not found are left out.
 
         Args:
-            ids: Numbers to search for; None: all.
+            ids: Numbers to search for; None: all. Searching for an invisible marker takes ten
+                times as long as tracking a visible one.
         """
+
+    def detect(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
+        """Take an image; return the pixel (u, v) of each feature in it, as `features` does."""
+        return {number: seen.pixel for number, seen in self.features(ids).items()}
+
+
+class MarkerSensor(FeatureSensor):
+    """Detects markers in a camera's images."""
+
+    def __init__(self, camera: Camera, marker_ids: Iterable[int]):
+        """Set up the detector.
+
+        Args:
+            camera: Source of the images.
+            marker_ids: ArUco numbers to report; others are ignored.
+        """
+        super().__init__(camera)
+        self._detector = MarkerDetector(marker_ids)
+
+    def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
+        """Take an image; centre and direction of each marker in it, by number."""
+        found = self.corners(ids).items()
+        return {id: SeenFeature(centre(corners), angle(corners)) for id, corners in found}
+
+    def corners(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "4 2"]]:
+        """Take an image; return the corners of each marker in it, clockwise from top left."""
+        return self._detector.detect(self.read(), ids)
 
 
 class LandmarkSensor(FeatureSensor):
@@ -69,8 +97,7 @@ class LandmarkSensor(FeatureSensor):
             names: Landmark of each number.
         """
         super().__init__(camera)
-        self._names = dict(names)
-        self._detector = LandmarkDetector(landmarks)
+        self._names, self._detector = names, LandmarkDetector(landmarks)
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
         """Take an image; landmarks found in it with a certain place, by number."""
@@ -98,38 +125,6 @@ def feature_sensor(
         return MarkerSensor(camera, [tool, *objects])
     names = {number: name for number in objects for name in landmarks.objects}
     return LandmarkSensor(camera, landmarks, {tool: "tool", **names})
-
-
-class MarkerSensor(FeatureSensor):
-    """Detects the centres of markers in a camera's images."""
-
-    def __init__(self, camera: Camera, marker_ids: Iterable[int]):
-        """Set up the detector.
-
-        Args:
-            camera: Source of the images.
-            marker_ids: ArUco numbers to report; others are ignored.
-        """
-        super().__init__(camera)
-        self._detector = MarkerDetector(marker_ids)
-
-    def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
-        """Take an image; centre and direction of each marker in it, by number."""
-        found = self.corners(ids).items()
-        return {id: SeenFeature(centre(corners), angle(corners)) for id, corners in found}
-
-    def detect(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
-        """Take an image; return the pixel (u, v) of each marker in it, by number.
-
-        Args:
-            ids: Markers to search for; None: all. Searching for an invisible marker takes ten
-                times as long as tracking a visible one.
-        """
-        return {id: centre(corners) for id, corners in self.corners(ids).items()}
-
-    def corners(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "4 2"]]:
-        """Take an image; return the corners of each marker in it, clockwise from top left."""
-        return self._detector.detect(self.read(), ids)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -320,11 +315,6 @@ class MarkerConsistency:
             images += 1
             mean = mean + (first - mean) / images
         consistent = bool(np.linalg.norm(first - mean) <= self.tolerance)
-        return MarkerConsistency(
-            tolerance=self.tolerance,
-            consistent=consistent,
-            time=time,
-            start=start,
-            pixel=mean,
-            images=images,
+        return replace(
+            self, consistent=consistent, time=time, start=start, pixel=mean, images=images
         )

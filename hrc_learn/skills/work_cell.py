@@ -345,11 +345,8 @@ class WorkCell:
                 self.track_pose(line.at(passed)[0], _STILL)
                 begun, moving = self.task_time - passed, 0
                 waited += self.config.dt
-                if waited > self.config.longest_wait:
-                    raise TaskFailedError(
-                        f"the null space was pushed for {waited:.0f} s while the gripper felt "
-                        "for a contact: let it go, or raise longest_wait."
-                    )
+                busy = "while the gripper felt for a contact, the null space was pushed"
+                self._give_up_after(waited, busy, "let it go")
                 continue
             self._track_line(line, passed)
             force_now = contact_force(self.jacobian, self.state)
@@ -490,11 +487,8 @@ class WorkCell:
             self._come_to_rest()
             raise StoppedByPersonError(f"stopped: {asked.stop}")
         self._tell_of_pause(asked.pause, before)
-        if (held := float(self.loop_state.path.held)) > self.config.longest_wait:
-            raise TaskFailedError(
-                f"the arm was held aside for {held:.0f} s while its "
-                "path waited: let it go, or raise longest_wait."
-            )
+        held = float(self.loop_state.path.held)
+        self._give_up_after(held, "while its path waited, the arm was held aside", "let it go")
 
     def _sense(self, state: ArmState, asked: HumanInput) -> None:
         """Take in a reading with its kinematics, and the people near the arm."""
@@ -527,16 +521,19 @@ class WorkCell:
 
     def _give_up_if_blocked(self) -> None:
         """Raise where people block the arm for too long, or obstacles its way back."""
-        blocked_for = float(self.pace.blocked_for)
-        if blocked_for > self.config.longest_wait:
-            raise TaskFailedError(
-                f"a person has been in the way of the arm for {blocked_for:.0f} s: clear its "
-                "path, or raise longest_wait."
-            )
+        blocked = "a person has been in the way of the arm"
+        self._give_up_after(float(self.pace.blocked_for), blocked, "clear its path")
         if self.loop_state.path.direct_return.blocked:
             raise BlockedPathError(
                 "path: the arm was pushed aside and finds no way back that is clear of its "
                 "surroundings."
+            )
+
+    def _give_up_after(self, waited: float, blocked: str, cure: str) -> None:
+        """Give the task up once it has waited for `longest_wait`."""
+        if waited > self.config.longest_wait:
+            raise TaskFailedError(
+                f"{blocked} for {waited:.0f} s: {cure}, or raise longest_wait."
             )
 
     def _come_to_rest(self) -> None:

@@ -69,7 +69,6 @@ class Scene:
             feature_age=torch.full_like(q[:, 0], 0.02),
             image_joint_position=q,
             joint_state_stale=torch.zeros_like(visible),
-            target=self.target.expand(len(q), 2).clone(),
             nullspace_input=self.pull,
             human_distance=torch.full_like(q[:, 0], 3.0),
             stop=torch.zeros_like(visible),
@@ -169,7 +168,9 @@ def run(
 def test_one_tick_of_poison_leaves_the_next_healthy(estimator):
     """At the start and under way."""
     injected = cases(Scene(estimator, 1), (0, 15))
-    assert {"goals.orientation.goal", "target", "feature_age"} <= {c.name for c in injected}
+    assert {"goals.orientation.goal", "goals.vision.target", "feature_age"} <= {
+        c.name for c in injected
+    }
     scene = Scene(estimator, len(injected) + 1)
     velocities, invalid, healthy = run(scene, 160, injected)
     clean = velocities[:, -1]
