@@ -29,10 +29,9 @@ from hrc_learn.controller.resolved_rate import (
     VisionBlending,
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
-from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.controller.task_pace import WayMakingConfig, null_space_input
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import ArrayLike, is_number
+from hrc_learn.geometry.numerics import ArrayLike, check_settings, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import Arm, SerialChain, TaskSpace, task_basis, task_rank
 from hrc_learn.kinematics.inverse import TASK_ROWS
@@ -61,14 +60,11 @@ class ControllerConfig:
     is computed at the joint positions predicted for that time."""
     null_damping: float = 3.0
     """c_d: null-space velocity is null-space input divided by c_d."""
-    null_space_saturation: bool = True
-    """Saturation in the null space: free joints take over the motion that limits deny to
-    others."""
-    task_slows: bool = True
-    """Slow the whole task down where a limit on single joints would make the tool faster than
-    requested."""
-    null_space_yields: bool = True
-    """Scale the whole null-space motion where a limit would cut single joints."""
+    yields_to_limits: bool = True
+    """Near the limits of single joints, free joints take over motion of the task that limits
+    deny to others (saturation in the null space), the whole task slows down where a limit would
+    make the tool faster than requested, and the whole null-space motion is scaled. False: the
+    safety filter alone keeps the limits."""
     drift_compensation_rate: float = 2.0
     """Decay rate of the tool's pose drift while a person moves the null space [1/s]; 0:
     none."""
@@ -96,9 +92,7 @@ class ControllerConfig:
             linear_speed=math.inf,
             angular_speed=math.inf,
             vision_rate=math.inf,
-            null_space_saturation=False,
-            task_slows=False,
-            null_space_yields=False,
+            yields_to_limits=False,
             drift_compensation_rate=0.0,
             blending=BlendingConfig(hysteresis=0.0, blend_time=0.0),
         )
@@ -443,15 +437,14 @@ class AdaptiveController(nn.Module):
             J_task, rows = basis @ J, (basis @ twist.unsqueeze(-1)).squeeze(-1)
         task, null = law.resolved_rate(J_task, rows, null)
         # Constraints resolve the conflict of task and null space themselves.
-        scaled = config.safety.constraints is None
-        if scaled and config.null_space_saturation:
+        yields = config.yields_to_limits and config.safety.constraints is None
+        if yields:
             task = law.saturate_in_null_space(task, J_task, rows, *bounds)
-        if scaled and config.task_slows:
             task = law.scale_task(task, J, *bounds, self.caps[0])
         if posture is not None:
             approach = law.approach_velocity(posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
-        if scaled and config.null_space_yields:
+        if yields:
             null = law.scale_null_space(task, null, *bounds)
         return task, null
 

@@ -23,8 +23,13 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller.contact_limits import SeparationConfig
-from hrc_learn.controller.setting_checks import check_settings
-from hrc_learn.geometry.numerics import is_number, matmul, may_branch, orthonormal_basis
+from hrc_learn.geometry.numerics import (
+    check_settings,
+    is_number,
+    matmul,
+    may_branch,
+    orthonormal_basis,
+)
 from hrc_learn.pytree import pytree, zero_where
 
 # Violations of a limit up to this are rounding.

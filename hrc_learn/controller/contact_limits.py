@@ -28,9 +28,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Box
-from hrc_learn.geometry.numerics import Constant
+from hrc_learn.geometry.numerics import Constant, check_settings
 from hrc_learn.kinematics import Arm, CapsuleArm, Separation
 from hrc_learn.kinematics.inertia import MassMatrix
 

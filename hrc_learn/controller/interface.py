@@ -18,7 +18,7 @@ from hrc_learn.controller.constraint_layer import (
     Distances,
 )
 from hrc_learn.controller.contact_limits import SeparationConfig
-from hrc_learn.controller.setting_checks import check_settings
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import TaskSpace
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import (

@@ -12,8 +12,7 @@ from torch import Tensor
 from hrc_learn.controller.constraint_layer import ConstraintReport, Distances
 from hrc_learn.controller.interface import SafetyConfig
 from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
-from hrc_learn.controller.setting_checks import check_settings
-from hrc_learn.geometry.numerics import safe_norm
+from hrc_learn.geometry.numerics import check_settings, safe_norm
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree, static
 

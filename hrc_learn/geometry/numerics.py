@@ -1,6 +1,6 @@
 """The delicate numerics of the package: singular functions, small matrices, fixed tensors.
 
-Arrays as users have them become tensors here as well.
+Arrays as users have them become tensors here as well, and the ranges of settings are checked.
 
 Functions with a removable singularity take the *squared* length: a Euclidean norm has no second
 derivative at zero, its square has all of them. On either side of a threshold a Taylor series or
@@ -10,7 +10,7 @@ argument, because a NaN there would reach the gradient as 0 * NaN.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import reduce
 from operator import add
 
@@ -43,6 +43,36 @@ def as_tensor(values: ArrayLike, like: Tensor | None = None) -> Tensor:
     if not values.is_floating_point():
         values = values.double()
     return values if like is None else values.to(like)
+
+
+def check_settings(
+    settings: object,
+    *,
+    positive: Iterable[str] = (),
+    not_negative: Iterable[str] = (),
+    below_one: Iterable[str] = (),
+) -> None:
+    """Check that settings are in their ranges; NaN is in none.
+
+    Args:
+        settings: Object with the settings as attributes.
+        positive: Names of those that must be positive.
+        not_negative: Names of those that must be zero or positive.
+        below_one: Names of those that must be in [0, 1).
+
+    Raises:
+        ValueError: A setting is not in its range.
+    """
+    rules = (
+        (positive, "must be positive", lambda x: x > 0),
+        (not_negative, "must not be negative", lambda x: x >= 0),
+        (below_one, "must be in [0, 1)", lambda x: 0 <= x < 1),
+    )
+    for names, rule, holds in rules:
+        for name in names:
+            value = getattr(settings, name)
+            if not holds(value):
+                raise ValueError(f"{name} {rule}, but is {value}")
 
 
 def cos_and_sinc(square: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ from hrc_learn.skills.complementary_motion import ComplementaryMotion as Complem
 from hrc_learn.skills.grasping import Grasping as Grasping
 from hrc_learn.skills.pick_and_place import PickAndPlace as PickAndPlace
 from hrc_learn.skills.placing import PlacingSkill as PlacingSkill
-from hrc_learn.skills.task_workplace import Workplace as Workplace
+from hrc_learn.skills.placing import Workplace as Workplace
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
 from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError

@@ -10,9 +10,9 @@ from torch import Tensor
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.controller.motion_filter import MotionFilter, MotionState
 from hrc_learn.controller.resolved_rate import task_rate
-from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.controller.task_pace import capped_scale
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState
 from hrc_learn.skills.person_watch import PersonWatch

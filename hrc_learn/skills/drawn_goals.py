@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import Goals
-from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import DrawnRegion, HumanInput
 from hrc_learn.regions import PositionRegion
 

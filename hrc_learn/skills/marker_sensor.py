@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import StepLog
 from hrc_learn.protocols import Camera, TimedCamera

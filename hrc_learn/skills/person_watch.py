@@ -13,8 +13,8 @@ from torch import Tensor
 from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig, SeparationConfig
 from hrc_learn.controller.arm_loop_state import WatchedPeople
 from hrc_learn.controller.contact_limits import ContactLimits, ContactSpeeds, region_numbers
-from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Box
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 

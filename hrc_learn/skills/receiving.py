@@ -18,7 +18,7 @@ from hrc_learn.dmp import InteractionEstimate, InteractionPrimitive
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import PersonObservation, PersonTracker
 from hrc_learn.skills.grasping import CLOSED, CLOSING_TIME, OPEN, as_load, holds, move_fingers
-from hrc_learn.skills.task_workplace import GraspObject
+from hrc_learn.skills.placing import GraspObject
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 HAND_OVER = "hand over"

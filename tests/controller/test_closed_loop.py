@@ -272,10 +272,8 @@ def off_its_way(rng: torch.Generator, **options) -> tuple[Tensor, Tensor]:
 
 
 def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
-    # Alone: saturation in the null space leaves little to be slowed down.
-    alone = {"null_space_saturation": False}
-    cut, cut_turns = off_its_way(sampling.generator(11), task_slows=False, **alone)
-    slowed, slowed_turns = off_its_way(sampling.generator(11), **alone)
+    cut, cut_turns = off_its_way(sampling.generator(11), yields_to_limits=False)
+    slowed, slowed_turns = off_its_way(sampling.generator(11))
     cap = ControllerConfig().angular_speed
     assert slowed_turns.quantile(0.9) <= cap
     assert cut_turns.quantile(0.9) > cap  # else the starts would test nothing
@@ -283,8 +281,8 @@ def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
     assert slowed.amax() < 0.5 * cut.amax()
 
 
-@pytest.mark.parametrize("saturation", [True, False])
-def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(saturation):
+@pytest.mark.parametrize("yields", [True, False])
+def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(yields):
     """Where a servoed arm stood still: on its way it would turn joint 1 alone, at its limit."""
     q = torch.tensor([2.876, -1.141, -1.587, -1.918, -1.176, 1.713, -0.213], dtype=DOUBLE)
     start, turn = panda.forward(q), quaternion.exp(torch.tensor([0, 0, 0.5], dtype=DOUBLE))
@@ -296,7 +294,7 @@ def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(saturat
     assert (panda.jacobian(q)[:3, 0] * away).sum() / away.norm() > 0.5
     target = torch.tensor([500.0, 500.0], dtype=DOUBLE)
     goals = Goals.at(goal.position, goal.orientation, target, half_size=(0.01, 0.01, 0.01))
-    config = ControllerConfig(null_space_saturation=saturation)
+    config = ControllerConfig(yields_to_limits=yields)
     estimator = FixedEstimator(network(torch.zeros(2, 6, dtype=DOUBLE)))
     controller = AdaptiveController(panda, estimator, goals, config=config)
     state, unseen = controller.initial_state(q), torch.tensor(False)
@@ -305,8 +303,8 @@ def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(saturat
         q = q + 0.01 * command.joint_velocity
     end = panda.forward(q)
     off = (end.position - goal.position).abs().amax()
-    assert (off < 0.01) == saturation
-    assert (quaternion.angle(end.orientation, goal.orientation) < 0.2) == saturation
+    assert (off < 0.01) == yields
+    assert (quaternion.angle(end.orientation, goal.orientation) < 0.2) == yields
 
 
 @pytest.mark.parametrize("rests", [True, False])
