@@ -46,8 +46,7 @@ from hrc_learn.controller.null_space_motion import (
     guided_elbow_speed,
     limiting_joint,
 )
-from hrc_learn.controller.path_law import PathLaw
-from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
+from hrc_learn.controller.path_law import PathLaw, twist_of
 from hrc_learn.controller.task_pace import (
     TaskPace,
     capped_scale,
@@ -88,9 +87,8 @@ class ArmLoop:
         config = config or ArmLoopConfig()
         elbow_speed = min(config.elbow_speed, guided_elbow_speed(config.safety.tcp_speed))
         self.config = config = replace(config, elbow_speed=elbow_speed)
-        self._tracking = PoseTracking(chain, config, clearance)
-        self._paths = PathLaw(self._tracking)
-        self.safety = self._tracking.safety
+        self._law = PathLaw(chain, config, clearance)
+        self.safety = self._law.safety
 
     def initial_state(
         self,
@@ -135,7 +133,7 @@ class ArmLoop:
             joint_position: Joint positions now [rad].
             request: The paths.
         """
-        return self._paths.begin(state, joint_position, request)
+        return self._law.begin(state, joint_position, request)
 
     def step(
         self, state: ArmLoopState, reading: ArmReading, request: ArmRequest
@@ -169,7 +167,7 @@ class ArmLoop:
         null_velocity, limitations = self._eased_push(state, reading)
         pace = state.pace.overridden(reading.pause, self.config.dt)
         state = replace(state, null_velocity=null_velocity, pace=pace)
-        return replace(state, path=self._paths.go_on(state, reading)), limitations
+        return replace(state, path=self._law.go_on(state, reading)), limitations
 
     def act(
         self, state: ArmLoopState, reading: ArmReading, request: ArmRequest
@@ -181,7 +179,7 @@ class ArmLoop:
         if isinstance(request, SendCommand):
             return self._send(state, reading, request.command)
         if isinstance(request, FollowPath):
-            wanted, state = self._paths.follow(state, reading, request)
+            wanted, state = self._law.follow(state, reading, request)
         elif isinstance(request, TrackPose):
             wanted, state = self._track(state, reading, request), _without_path(state)
         else:
@@ -200,7 +198,7 @@ class ArmLoop:
         if not bool(acts.any()):
             return requested, ()
         q, J = reading.joint_position, reading.jacobian
-        config, bounds = self.config, self._tracking.task_margin.velocity_bounds(q)
+        config, bounds = self.config, self._law.task_margin.velocity_bounds(q)
 
         one = torch.ones_like(q[..., 0])
         eased = apply_where(
@@ -241,7 +239,7 @@ class ArmLoop:
     ) -> WantedMotion:
         """Joint velocity that tracks a pose of the end effector."""
         every, push = torch.ones_like(state.aside), state.null_velocity
-        tracked = self._tracking.track(
+        tracked = self._law.track(
             state, reading, request.pose, request.twist, push, every, slows=False
         )
         limitations = tracked.limitations() if reading.explain else ()

@@ -57,7 +57,7 @@ def test_the_fraction_asked_for_is_lost():
 
 @pytest.mark.parametrize("wrong", [{"delay": -0.1}, {"frame_loss": 1.0}, {"frame_loss": -0.1}])
 def test_what_no_camera_does_is_refused(wrong):
-    with pytest.raises(ValueError, match="delay must not be negative"):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         LatencyConfig(**wrong)
 
 
