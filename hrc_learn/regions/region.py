@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Literal, final
 
 import torch
 from jaxtyping import Float
@@ -70,9 +70,7 @@ class PositionRegion(Region):
     centre: Float[Tensor, "*#batch 3"]
     """Centre of the box [m]."""
     half_size: Float[Tensor, "*#batch 3"]
-    """Half edges of the box, all positive [m]."""
-    rotation: Float[Tensor, "*#batch 4"] | None = None
-    """Orientation of the box as a unit quaternion (w, x, y, z); None: along the base axes."""
+    """Half edges of the box, all positive, along the base axes [m]."""
     stiffness: float | tuple[float, float, float] = static(4e-3)
     """k_c, one for all or one for each axis of the box. Ten times the value of Table I, with
     which the excess near a wall of a box with half size 0.12 m takes 9 s to decay."""
@@ -80,14 +78,14 @@ class PositionRegion(Region):
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
         """Region function f of each pair of walls at the position x [m]."""
-        scaled = self._in_box(x) / self.half_size
+        scaled = (x - self.centre) / self.half_size
         return scaled * scaled - 1
 
     def feedback(
         self, x: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
         """Potential and its gradient over the position, in the base frame."""
-        scaled = self._in_box(x) / self.half_size
+        scaled = (x - self.centre) / self.half_size
         f = (scaled * scaled - 1).clamp(min=0)
         k_c = self.stiffness
         # One for each axis of the box, or one for all.
@@ -99,17 +97,7 @@ class PositionRegion(Region):
         else:
             pull = k_c * f
             P = 0.5 * (pull * f).sum(-1)
-        gradient = 2 * pull * scaled / self.half_size
-        if self.rotation is not None:
-            gradient = quaternion.rotate(self.rotation, gradient)
-        return P, gradient
-
-    def _in_box(self, x: Tensor) -> Tensor:
-        """Offset from the centre in the frame of the box [m]."""
-        offset = x - self.centre
-        if self.rotation is None:
-            return offset
-        return quaternion.rotate(quaternion.conjugate(self.rotation), offset)
+        return P, 2 * pull * scaled / self.half_size
 
 
 # Shorter axes are rounding noise. They occur only at the goal, inside the cone, where the
@@ -278,30 +266,25 @@ class VisionRegion(Region):
         cls,
         target: Float[Tensor, "*batch rows"],
         image_size: tuple[int, int],
-        border: float = 0.0,
-        **options: Any,
     ) -> VisionRegion:
         """Largest ellipse about the target that stays inside the image.
 
         Args:
             target: Desired feature position (u, v) [px].
             image_size: Width and height of the image [px].
-            border: Distance the ellipse keeps from the edge of the image [px].
-            options: The remaining fields.
 
         Raises:
-            ValueError: The target is not inside the image by more than the border.
+            ValueError: The target is not inside the image.
         """
         # Pixels are numbered from 0 to the size minus one.
         far_edge = target.new_tensor(image_size).repeat(target.shape[-1] // 2) - 1
-        half_size = torch.minimum(target, far_edge - target) - border
+        half_size = torch.minimum(target, far_edge - target)
         if not bool((half_size > 0).all()):
             raise ValueError(
-                f"the vision target must lie more than {border} px inside the image of "
-                f"{image_size[0]} x {image_size[1]} px, but is {target.tolist()}; "
-                "move the target or lower `border`"
+                f"the vision target must lie inside the image of {image_size[0]} x "
+                f"{image_size[1]} px, but is {target.tolist()}"
             )
-        return cls(target=target, half_size=half_size, **options)
+        return cls(target=target, half_size=half_size)
 
     def value(self, x: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*both"]:
         """Region function f at the feature position x [px]; the largest of several points."""

@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from hrc_learn.geometry import quaternion
 from hrc_learn.regions import PositionRegion
 
 BOX = {
@@ -24,15 +23,6 @@ def test_printed_gradient():
     x = BOX["centre"] + torch.tensor([0.24, 0.05, -0.16], dtype=torch.float64)
     expected = [2 * 4e-3 * 3 * 0.24 / 0.12**2, 0, -2 * 4e-3 * 3 * 0.16 / 0.08**2]
     assert region.gradient(x).tolist() == pytest.approx(expected)
-
-
-def test_a_turned_box_is_the_box_seen_from_a_turned_frame():
-    turn = quaternion.exp(torch.tensor([0.3, -0.8, 1.1], dtype=torch.float64))
-    turned = PositionRegion(**BOX, rotation=turn)
-    offset = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
-    gradient = turned.gradient(BOX["centre"] + quaternion.rotate(turn, offset))
-    straight = PositionRegion(**BOX).gradient(BOX["centre"] + offset)
-    torch.testing.assert_close(gradient, quaternion.rotate(turn, straight))
 
 
 def test_the_rate_near_a_wall_is_the_documented_one():
