@@ -4,6 +4,7 @@ Models are written through `hrc_learn.store`: an interrupted save leaves the old
 but never an incomplete one.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,21 +64,28 @@ class SavedModel:
         if field not in self.config:
             raise ValueError(f"{self.folder / CONFIG}: field {field!r} is missing")
         value = self.config[field]
-        if not isinstance(value, types) or isinstance(value, bool):
+        # Exactly these, because a truth value counts as an integer.
+        if type(value) not in types:
             names = " or ".join(t.__name__ for t in types)
             raise ValueError(
                 f"{self.folder / CONFIG}: field {field!r} must be {names}, got {value!r}"
             )
         return value
 
-    def flag(self, field: str) -> bool:
-        """Value of a config field, which must be true or false."""
-        value = self.config.get(field)
-        if not isinstance(value, bool):
-            raise ValueError(
-                f"{self.folder / CONFIG}: field {field!r} must be true or false, got {value!r}"
-            )
-        return value
+    def part[T](self, field: str, kind: type, make: Callable[[Any], T]) -> T:
+        """Object made of a config field of this type.
+
+        Raises:
+            ValueError: A missing or wrong field; the message names it.
+        """
+        value = self.get(field, kind)
+        try:
+            return make(value)
+        except KeyError as error:
+            complaint = f"{error} is missing"
+        except (TypeError, ValueError) as error:
+            complaint = str(error)
+        raise ValueError(f"{self.folder / CONFIG}: field {field!r}: {complaint}")
 
     def tensor(self, name: str) -> Tensor:
         """Tensor with this name, which must be finite."""
@@ -86,10 +94,6 @@ class SavedModel:
         if not self.tensors[name].isfinite().all():
             raise ValueError(f"{self.folder / MODEL}: tensor {name!r} is not finite")
         return self.tensors[name]
-
-    def invalid_field(self, field: str, complaint: object) -> ValueError:
-        """Error about the value of a config field."""
-        return ValueError(f"{self.folder / CONFIG}: field {field!r}: {complaint}")
 
     def invalid(self, complaint: object) -> ValueError:
         """Error of a constructor, with the folder that caused it."""

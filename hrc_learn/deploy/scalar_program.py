@@ -203,7 +203,6 @@ _COMPOSED: dict[str, _Each] = {
     "reciprocal": lambda of, x: of("div", 1.0, x),
     "rsqrt": lambda of, x: of("div", 1.0, of("sqrt", x)),
     "rsub": lambda of, x, other: of("sub", other, x),
-    "sigmoid": lambda of, x: of("div", 1.0, of("add", of("exp", of("neg", x)), 1.0)),
     "sign": lambda of, x: of("sub", of("gt", x, 0.0), of("lt", x, 0.0)),
     "square": lambda of, x: of("mul", x, x),
 }
@@ -376,14 +375,6 @@ class _Unroller:
         for k, element in enumerate(others, start=1):
             result = self._each("select", self._each("eq", index, float(k)), element, result)
         return result.expand(index.shape)
-
-    def aten_logsumexp(self, x: Tensor, dim: Any, keepdim: bool = False) -> Tensor:
-        most = self.aten_amax(x, dim, True)
-        infinite = self._each("eq", self._each("abs", most), math.inf)
-        shift = self._each("select", infinite, 0.0, most)
-        total = self.aten_sum(self._each("exp", self._each("sub", x, shift)), dim, True)
-        result = self._each("add", self._each("log", total), shift)
-        return result if keepdim else result.squeeze(dim)
 
     def aten_clamp(self, x: Tensor, low: Any = None, high: Any = None) -> Tensor:
         if low is not None:

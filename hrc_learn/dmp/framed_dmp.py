@@ -21,7 +21,7 @@ from hrc_learn.dmp._arguments import Mask, Points, Times
 from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive
-from hrc_learn.dmp.samples import check_samples, padded
+from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
 from hrc_learn.geometry import Pose, quaternion
 
@@ -119,7 +119,6 @@ class FramedDMP:
         Raises:
             ValueError: Fewer than two demonstrations, or frames of another number or size.
         """
-        time, mask, (position,) = padded(time, mask, position)
         dmps = JointDMP.fit(
             time, position, n_basis, mask=mask, joint_names=joint_names, units=units, **options
         )

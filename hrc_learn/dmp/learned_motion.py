@@ -321,13 +321,14 @@ class LearnedMotion:
             ValueError: A wrong field; the message names the file and the field.
         """
         saved = SavedModel(folder, cls.__name__)
-        own = dict(saved.get("learned", dict))
-        try:
+        error = saved.tensor("error")
+
+        def parts(own: dict[str, Any]) -> tuple[type[MotionPrimitive], bool, Candidate]:
             kind, by_ends = KINDS[own.pop("primitive")], bool(own.pop("by_ends"))
             own["strength"] = math.inf if own["strength"] is None else float(own["strength"])
-            chosen = Candidate(**own, error=saved.tensor("error"))
-        except (KeyError, TypeError, ValueError) as error:
-            raise saved.invalid_field("learned", error) from None
+            return kind, by_ends, Candidate(**own, error=error)
+
+        kind, by_ends, chosen = saved.part("learned", dict, parts)
         frames = None
         if chosen.family == "frames":
             frames = Frames(saved.tensor("frames.A"), saved.tensor("frames.b"))

@@ -522,24 +522,19 @@ class LinearPrimitive(nn.Module):
         """
         names = [*TENSORS, *(name for name in saved.tensors if name.startswith(REPORT))]
         arguments = _tensor_arguments({name: saved.tensor(name) for name in names})
-        shape = arguments["weights"].shape
+        shape = tuple(arguments["weights"].shape)
         for name in TENSORS[1:-1]:
-            found, fits = (
-                arguments[name].shape,
-                shape[:-2] if name == "duration" else shape[:-1],
-            )
-            if len(shape) < 2 or found != fits:
+            found = tuple(arguments[name].shape)
+            if len(shape) < 2 or found != shape[: -2 if name == "duration" else -1]:
                 raise saved.invalid(
-                    f"{name} has shape {tuple(found)}, which does not fit weights "
-                    f"{tuple(shape)}"
+                    f"{name} has shape {found}, which does not fit weights {shape}"
                 )
-        columns = saved.config.get("scaled_columns")
-        if columns is not None:
-            columns = saved.get("scaled_columns", int)
+        known = "scaled_columns" in saved.config
+        columns = saved.get("scaled_columns", int, NoneType) if known else None
         parts = {
-            "spring": _part(saved, "spring", dict, lambda fields: SpringDamper(**fields)),
-            "basis": _part(saved, "basis", dict, restored_basis),
-            "scaling": _part(saved, "scaling", str, lambda name: find_scaling(name, columns)),
+            "spring": saved.part("spring", dict, lambda fields: SpringDamper(**fields)),
+            "basis": saved.part("basis", dict, restored_basis),
+            "scaling": saved.part("scaling", str, lambda name: find_scaling(name, columns)),
         }
         try:
             return cls(
@@ -601,18 +596,3 @@ def _tensor_arguments(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
     if {"rmse", "peak", "span"} <= known:
         found["fit_report"] = FitReport(**{name: report[name] for name in known})
     return found
-
-
-def _part(saved: SavedModel, field: str, kind: type, make: Callable[[Any], Any]) -> Any:
-    """Part made of a field of the file.
-
-    Raises:
-        ValueError: A missing or wrong field; the message names it.
-    """
-    value = saved.get(field, kind)
-    try:
-        return make(value)
-    except KeyError as error:
-        raise saved.invalid_field(field, f"{error} is missing") from None
-    except (TypeError, ValueError) as error:
-        raise saved.invalid_field(field, error) from None

@@ -7,7 +7,6 @@ separates them by expectation-maximisation on their paths. What is known before 
 
 import math
 from dataclasses import dataclass, replace
-from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
 from hrc_learn.dmp.linear_primitive import LinearPrimitive
-from hrc_learn.dmp.motion_primitive import MotionPrimitive, ViaOptions
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.probabilistic_dmp import (
     PATH_TIMES,
     ProbabilisticDMP,
@@ -123,18 +122,14 @@ class MixtureDMP[P: MotionPrimitive]:
         velocity: Points | None = None,
         *,
         noise: float = 1e-6,
-        **options: Unpack[ViaOptions],
     ) -> "MixtureDMP[P]":
         """Mixture conditioned on via points; see `ProbabilisticDMP.condition`.
 
         The density of the values under each mode updates the probabilities, and each mode is
         conditioned.
         """
-        body = options.get("body")
-        densities = [mode.log_prob(time, value, noise=noise, body=body) for mode in self.modes]
-        modes = [
-            mode.condition(time, value, velocity, noise=noise, **options) for mode in self.modes
-        ]
+        densities = [mode.log_prob(time, value, noise=noise) for mode in self.modes]
+        modes = [mode.condition(time, value, velocity, noise=noise) for mode in self.modes]
         return replace(self._updated(torch.stack(densities)), modes=tuple(modes))
 
     def _updated(self, log_likelihood: Float[Tensor, "K"]) -> "MixtureDMP[P]":

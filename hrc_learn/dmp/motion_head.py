@@ -23,6 +23,7 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
+    check_not_negative,
     checked_vector,
     finite,
     full_precision,
@@ -304,8 +305,7 @@ class MotionHead(nn.Module):
         if since is None:
             return _Plan(x, duration, delay, start, velocity)
         now = to_tensor(since, torch.float64, x.device)
-        if readable(now) and not ((now >= 0) & (now < math.inf)).all():
-            raise ValueError("since must be finite, non-negative seconds since the start")
+        check_not_negative("since", now)
         s = ((now - delay.double()) / duration.double()).clamp(min=0)
         return _Plan(x, duration, delay, start, velocity, s)
 

@@ -59,22 +59,9 @@ class EndOptions(TypedDict, total=False):
     """Velocity at the end [1/s], (*batch, D); moving goals only."""
 
 
-class ViaOptions(TypedDict, total=False):
-    """Via points that some kinds of primitive have; NaN leaves a value free."""
-
-    body: Points | None
-    """Body of a pose, (*batch, n, K)."""
-    body_velocity: Points | None
-    """Velocity of the body of a pose, (*batch, n, K)."""
-
-
-class Retargeted(NamedTuple):
-    """State of a motion that received a new goal under way."""
-
-    columns: DMPState
-    frame: Any
-    target: Any = None
-    """New goal in columns; None keeps that of `columns`."""
+type Retargeted = tuple[DMPState, Any, Any]
+"""Columns, frame, and new goal in columns of a motion that received a new goal under way; the
+goal None keeps that of the columns."""
 
 
 class MotionPrimitive[Value, Path, State](nn.Module):
@@ -140,18 +127,15 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             goal: New goal; None if only `options` are new.
             options: Goals of this kind.
         """
-        return Retargeted(columns, frame, goal)
+        return columns, frame, goal
 
-    def _via(
-        self, now: ColumnPoints, value: Any, velocity: Any, **options: Any
-    ) -> ColumnPoints:
+    def _via(self, now: ColumnPoints, value: Any, velocity: Any) -> ColumnPoints:
         """Via points as columns in the frame of the primitive; see `via_points`.
 
         Args:
             now: Columns of the unchanged motion at these times.
             value: Values from the caller; None or NaN leaves them free.
             velocity: Velocities from the caller, per second; None or NaN leaves them free.
-            options: Values of this kind.
         """
         position = via_values(value, now.position)
         return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
@@ -332,7 +316,6 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         velocity: Points | None = None,
         *,
         within: tuple[float | int, float | int] | None = None,
-        **options: Unpack[ViaOptions],
     ) -> S:
         """Primitive that passes exactly through via points.
 
@@ -344,26 +327,21 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
         Args:
             time: Times of the via points [s], (*batch, n).
-            value: Values as for `via_points`, like all that follow; NaN leaves them free.
+            value: Values as for `via_points`, like the velocity; NaN leaves them free.
             velocity: Velocities. None or NaN keeps that of the motion if a value is given.
             within: Times [s] between which the motion may change; None: from start to end.
-            options: Via points of this kind of primitive.
 
         Raises:
             ValueError: Via points at one time or outside of the window, or too many or too
                 close together for the basis; the message names the distance that works.
         """
-        via = self.via_points(time, value, velocity, **options)
+        via = self.via_points(time, value, velocity)
         return self.with_motion(through_via_points(self.motion, via, within))
 
     def via_points(
-        self,
-        time: Times,
-        value: Any = None,
-        velocity: Points | None = None,
-        **options: Unpack[ViaOptions],
+        self, time: Times, value: Any = None, velocity: Points | None = None
     ) -> ViaPoints:
-        """Via points as columns (float64).
+        """Via points as columns (float64); the body of a pose stays free.
 
         An orientation becomes the error on the branch nearest to the motion there, so that both
         signs mean the same. An angular velocity becomes the rate of the error at the given
@@ -375,7 +353,6 @@ class MotionPrimitive[Value, Path, State](nn.Module):
                 (*batch, n). NaN leaves a coordinate free; in a quaternion, the orientation.
             velocity: Of joints (*batch, n, D); angular [rad/s], (*batch, n, 3); or a twist
                 (*batch, n, 6). NaN leaves it free.
-            options: Via points of this kind of primitive.
 
         Raises:
             ValueError: Negative times, or shapes that do not fit.
@@ -385,7 +362,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         duration = motion.duration.double()[..., None]
         now = motion.rollout_columns(Boundary(), motion.duration, time.detach())
         now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
-        via = self._via(now, value, velocity, **self._given(**options))
+        via = self._via(now, value, velocity)
         rate = via.velocity * duration[..., None]
         return ViaPoints(s=time / duration, position=via.position, rate=rate)
 
@@ -475,7 +452,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     ) -> Retargeted:
         columns, frame = self._columns(state)
         if goal is None and goal_body is None:
-            return Retargeted(columns, frame)
+            return columns, frame, None
         return self._retarget(columns, frame, goal, **self._given(goal_body=goal_body))
 
     def _given(self, **options: Any) -> dict[str, Any]:

@@ -54,13 +54,14 @@ class OrientationTrajectory(ArrayOutputs):
 
     def __init__(self, motion: Trajectory, reference: Float[Tensor, "*batch 4"]):
         """Describe the motion of columns with an error to the reference."""
-        self._motion = motion
+        self.motion = motion
+        """Motion of the columns."""
         self._reference = reference
 
     @property
     def time(self) -> Float[Tensor, "*batch T"]:
         """Time since the start of the motion [s]."""
-        return self._motion.time
+        return self.motion.time
 
     @output
     def orientation(self) -> Float[Tensor, "*batch T 4"]:
@@ -75,16 +76,16 @@ class OrientationTrajectory(ArrayOutputs):
     @output
     def angular_acceleration(self) -> Float[Tensor, "*batch T 3"]:
         """Angular acceleration in the base frame [rad/s^2]."""
-        second = self._motion.acceleration[..., self.error_columns]
+        second = self.motion.acceleration[..., self.error_columns]
         return orientation_error.angular_acceleration(self._error, self._rate, second)
 
     @property
     def _error(self) -> Tensor:
-        return self._motion.position[..., self.error_columns]
+        return self.motion.position[..., self.error_columns]
 
     @property
     def _rate(self) -> Tensor:
-        return self._motion.velocity[..., self.error_columns]
+        return self.motion.velocity[..., self.error_columns]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -277,7 +278,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             frame = new
         if goal_body is not None:
             target = _with_columns(target, B, goal_body)
-        return Retargeted(columns, frame, target)
+        return columns, frame, target
 
     def _to_reference(self, columns: DMPState, old: Tensor, new: Tensor) -> DMPState:
         """Columns with the error to another reference, for the same motion of the orientation.
@@ -310,12 +311,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         return push
 
     def _via(
-        self,
-        now: ColumnPoints,
-        value: Value | None,
-        velocity: Points | None,
-        body: Points | None = None,
-        body_velocity: Points | None = None,
+        self, now: ColumnPoints, value: Value | None, velocity: Points | None
     ) -> ColumnPoints:
         position, E, (P, B) = now.position, self.error_columns, self._others
         place, rotation = self._parts("value", value)
@@ -323,13 +319,9 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         error, rate = _via_errors(
             self.reference, position[..., E], rotation, twist[..., P.stop :]
         )
-        parts = via_values(place, position[..., P]), error
-        rates = twist[..., P], rate
+        place, body = via_values(place, position[..., P]), via_values(None, position[..., B])
         return ColumnPoints(
-            torch.cat([*parts, via_values(body, position[..., B], "body")], -1),
-            torch.cat(
-                [*rates, via_values(body_velocity, now.velocity[..., B], "body_velocity")], -1
-            ),
+            torch.cat([place, error, body], -1), torch.cat([twist[..., P], rate, body], -1)
         )
 
     @classmethod
@@ -416,10 +408,8 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
 
     @classmethod
     def restore[S: "OrientationDMP"](cls: type[S], saved: SavedModel) -> S:
-        try:
-            kind = _formulated(saved.config.get("formulation", "log"))
-        except ValueError as error:
-            raise saved.invalid_field("formulation", error) from None
+        named = "formulation" in saved.config
+        kind = saved.part("formulation", str, _formulated) if named else JointDMP
         return cls(kind.restore(saved), saved.tensor("goal_orientation"))
 
 

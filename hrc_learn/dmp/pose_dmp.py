@@ -1,7 +1,6 @@
 """Movement primitive of a pose, and of body coordinates such as an arm angle along with it."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar, Unpack
 
 import torch
@@ -24,7 +23,43 @@ POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
 """Columns of a pose: position [m], orientation error [rad], and body coordinates."""
 
 
-class PoseTrajectory(OrientationTrajectory):
+class PoseColumns:
+    """Pose and body among the columns of a motion, over time or in one state."""
+
+    motion: Any
+
+    @property
+    def position(self) -> Float[Tensor, "*batch 3"]:
+        """Position [m]."""
+        return self.motion.position[..., POSITION]
+
+    @property
+    def pose(self: Any) -> Pose:
+        """Position and orientation, (*batch)."""
+        return Pose(self.position, self.orientation)
+
+    @property
+    def velocity(self) -> Float[Tensor, "*batch 3"]:
+        """Linear velocity [m/s]."""
+        return self.motion.velocity[..., POSITION]
+
+    @property
+    def twist(self: Any) -> Float[Tensor, "*batch 6"]:
+        """Twist (linear [m/s], angular [rad/s]) in the base frame."""
+        return torch.cat([self.velocity, self.angular_velocity], dim=-1)
+
+    @property
+    def body(self) -> Float[Tensor, "*batch K"]:
+        """Body coordinates; K = 0 if none were learned."""
+        return self.motion.position[..., BODY]
+
+    @property
+    def body_velocity(self) -> Float[Tensor, "*batch K"]:
+        """Velocity of the body coordinates, per second."""
+        return self.motion.velocity[..., BODY]
+
+
+class PoseTrajectory(PoseColumns, OrientationTrajectory):
     """Pose over time; each output is computed on first access."""
 
     outputs = (
@@ -34,62 +69,16 @@ class PoseTrajectory(OrientationTrajectory):
     error_columns: ClassVar[slice] = ERROR
 
     @property
-    def position(self) -> Float[Tensor, "*batch T 3"]:
-        """Position [m]."""
-        return self._motion.position[..., POSITION]
-
-    @property
-    def pose(self) -> Pose:
-        """Position and orientation, (*batch, T)."""
-        return Pose(self.position, self.orientation)
-
-    @property
-    def velocity(self) -> Float[Tensor, "*batch T 3"]:
-        """Linear velocity [m/s]."""
-        return self._motion.velocity[..., POSITION]
-
-    @cached_property
-    def twist(self) -> Float[Tensor, "*batch T 6"]:
-        """Twist (linear [m/s], angular [rad/s]) in the base frame."""
-        return torch.cat([self.velocity, self.angular_velocity], dim=-1)
-
-    @property
     def acceleration(self) -> Float[Tensor, "*batch T 3"]:
         """Linear acceleration [m/s^2]."""
-        return self._motion.acceleration[..., POSITION]
-
-    @property
-    def body(self) -> Float[Tensor, "*batch T K"]:
-        """Body coordinates; K = 0 if none were learned."""
-        return self._motion.position[..., BODY]
-
-    @property
-    def body_velocity(self) -> Float[Tensor, "*batch T K"]:
-        """Velocity of the body coordinates, per second."""
-        return self._motion.velocity[..., BODY]
+        return self.motion.acceleration[..., POSITION]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PoseState(OrientationState):
+class PoseState(PoseColumns, OrientationState):
     """State of a pose primitive in closed loop."""
 
     error_columns: ClassVar[slice] = ERROR
-
-    @property
-    def pose(self) -> Pose:
-        """Position [m] and orientation."""
-        return Pose(self.motion.position[..., POSITION], self.orientation)
-
-    @property
-    def twist(self) -> Float[Tensor, "*batch 6"]:
-        """Twist (linear [m/s], angular [rad/s]) in the base frame."""
-        velocity = self.motion.velocity[..., POSITION]
-        return torch.cat([velocity, self.angular_velocity], dim=-1)
-
-    @property
-    def body(self) -> Float[Tensor, "*batch K"]:
-        """Body coordinates."""
-        return self.motion.position[..., BODY]
 
 
 torch.export.register_dataclass(PoseState, serialized_type_name="hrc_learn.dmp.PoseState")
@@ -114,9 +103,7 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
     """
 
     error_columns: ClassVar[slice] = ERROR
-    options: ClassVar[frozenset[str]] = frozenset(
-        {"start_body", "goal_body", "body", "body_velocity"}
-    )
+    options: ClassVar[frozenset[str]] = frozenset({"start_body", "goal_body"})
     state_type: ClassVar[type] = PoseState
     trajectory_type: ClassVar[type] = PoseTrajectory
 

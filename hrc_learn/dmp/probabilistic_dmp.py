@@ -7,7 +7,7 @@ their `motion`.
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -25,7 +25,7 @@ from hrc_learn.dmp._arguments import (
 )
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import MotionPrimitive, ViaOptions
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
 from hrc_learn.dmp.pose_dmp import PoseDMP
@@ -232,7 +232,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         saved = SavedModel(folder, cls.__name__)
         kind = saved.get("primitive", str)
         if kind not in KINDS:
-            raise saved.invalid_field("primitive", f"choose from {', '.join(KINDS)}")
+            raise saved.invalid(f"unknown primitive {kind!r}; choose from {', '.join(KINDS)}")
         own = {name: saved.tensor(f"gaussian.{name}") for name in GAUSSIAN}
         primitive: Any = KINDS[kind].restore(saved)
         dependence = float(saved.get("dependence", float, int))
@@ -261,7 +261,6 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         *,
         noise: Scalars | Vectors = 1e-6,
         duration: float | None = None,
-        **options: Unpack[ViaOptions],
     ) -> "ProbabilisticDMP[P]":
         """Gaussian conditioned on values and velocities at some times, and on a duration.
 
@@ -277,7 +276,6 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             noise: Standard deviation of each value in the units of its coordinate ([rad] for an
                 orientation), or of each velocity per second; one number, (D,) or (n, D).
             duration: Known duration [s].
-            options: Via points of the kind of primitive.
 
         Raises:
             ValueError: Noise that is not positive and finite, or values that do not fit.
@@ -294,7 +292,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             self = replace(known, primitive=primitive)
         if not len(seconds(time, self.mean.device)):
             return self
-        via = self._via(time, value, velocity, **options)
+        via = self._via(time, value, velocity)
         motion = self.primitive.motion
         H, tau = motion.response.evaluate(via.s), motion.duration.double()
         mean, root = self._observe(torch.cat([H[:, 0], H[:, 1] / tau]))
@@ -386,7 +384,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         return kl_divergence(self.observed(noise), other.observed(noise))
 
     def log_prob(
-        self, time: Times, value: Points | Pose, *, noise: float, **options: Unpack[ViaOptions]
+        self, time: Times, value: Points | Pose, *, noise: float
     ) -> Float[Tensor, "*batch"]:
         """Log density of values (*batch, n, D) observed at times (n,) with this sensor noise.
 
@@ -397,12 +395,9 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         value = value if isinstance(value, Pose) else to_tensor(value)
         batch = (value.position if isinstance(value, Pose) else value).shape[:-2]
         if batch:
-            densities = [
-                self.log_prob(time, value[i], noise=noise, **_element(options, i))
-                for i in range(batch[0])
-            ]
+            densities = [self.log_prob(time, value[i], noise=noise) for i in range(batch[0])]
             return torch.stack(densities)
-        via = self._via(time, value, None, **options)
+        via = self._via(time, value, None)
         motion = self.primitive.motion
         mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])
         seen = ~via.position.isnan().reshape(-1)
@@ -410,15 +405,11 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         return gaussian(mean[seen], root[seen], deviation).log_prob(values)
 
     def _via(
-        self,
-        time: Times,
-        value: Points | Pose | None,
-        velocity: Points | None,
-        **options: Unpack[ViaOptions],
+        self, time: Times, value: Points | Pose | None, velocity: Points | None
     ) -> ViaPoints:
         with torch.no_grad():
             middle = self.mean_primitive()
-        via = middle.via_points(time, value, velocity, **options)
+        via = middle.via_points(time, value, velocity)
         if via.position.ndim != 2:
             raise ValueError(f"via points must be (n, D), got {tuple(via.position.shape)}")
         return via
@@ -489,11 +480,6 @@ def gaussian(
     return LowRankMultivariateNormal(
         mean, root, noise.square().expand_as(mean), validate_args=False
     )
-
-
-def _element(options: Any, index: int) -> dict[str, Any]:
-    """Options of one motion of a batch."""
-    return {name: None if x is None else x[index] for name, x in options.items()}
 
 
 def _dependence_on_ends(motion: LinearPrimitive, x: Float[Tensor, "n D M"]) -> float:

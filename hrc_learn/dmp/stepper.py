@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import check_not_negative
 from hrc_learn.dmp.closed_loop_step import numpy_approach, numpy_step
 from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.joint_dmp import JointDMP
@@ -119,11 +120,8 @@ class Stepper:
             coupling: External acceleration [1/s^2].
             phase_stopping: The clock runs slower by the factor 1 + this.
         """
-        if not (0 <= dt < math.inf and 0 <= phase_stopping < math.inf):
-            raise ValueError(
-                f"dt and phase_stopping must be finite and not negative, got {dt} and "
-                f"{phase_stopping}"
-            )
+        check_not_negative("dt", dt)
+        check_not_negative("phase_stopping", phase_stopping)
         s, y, before, scale, start, target, displacement, duration, _ = state
         if goal is not None:
             target = _finite("goal", goal)

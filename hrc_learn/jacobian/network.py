@@ -294,7 +294,7 @@ class RBFImageJacobian(nn.Module):
                 weight=saved.tensor("weight"),
                 input_indices=saved.get("input_indices", list),
                 reference=saved.tensor("reference") if "reference" in saved.tensors else None,
-                normalized=saved.flag("normalized"),
+                normalized=saved.get("normalized", bool),
                 camera=_saved_camera(saved),
             )
         except (TypeError, ValueError) as error:
