@@ -222,7 +222,7 @@ _MODELS = {
 # Key in JSON of a channel, title, unit and largest value that passes. A primitive represents
 # its demonstration up to a centimetre in a motion of half a metre.
 _ROWS = (
-    # The maximum, so that one demonstration that is not represented shows.
+    # The maximum: a mean would hide one demonstration that its primitive misses.
     ("{}_nrmse_max", "worst NRMSE of a demonstration", "%", 2.0),
     ("mean_{}_nrmse_median", "median NRMSE of the common model", "%", None),
     ("{}_turn_rmse_max", "worst rotation error", "deg", None),

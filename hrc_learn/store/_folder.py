@@ -48,7 +48,7 @@ def try_lock(file: TextIO) -> bool:
 def sign(file: TextIO) -> None:
     """Write the process and host into its locked file."""
     os.truncate(file.fileno(), 0)
-    # Unbuffered: on a full disk, closing the file shall not fail as well.
+    # Without a buffer, so that closing the file cannot fail, too, on a full disk.
     os.write(file.fileno(), f"{os.getpid()} {socket.gethostname()}\n".encode())
 
 
@@ -123,7 +123,7 @@ def sync_folder(path: Path) -> None:
 
 
 def carry_over(names: Iterable[str], source: Path, target: Path) -> set[str]:
-    """Give entries of a folder a second name in another one.
+    """Link entries of a folder into another one; copy them where links are not supported.
 
     Returns:
         Entries carried over; a file whose name is taken by other content is not.

@@ -146,7 +146,7 @@ def transforms(values: Float64[np.ndarray, "frames 16"]) -> Tensor:
         # The tolerance allows for float32 and for few printed digits.
         if torch.allclose(matrices[:, 3], last.expand(len(matrices), 4), atol=1e-4):
             return matrices
-    raise ValueError("16 numbers that are no 4x4 transform: no last row 0, 0, 0, 1")
+    raise ValueError("the 16 numbers are no 4x4 transform: its last row must be 0, 0, 0, 1")
 
 
 def _rotations(matrices: Tensor) -> Tensor:
