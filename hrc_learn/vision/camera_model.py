@@ -1,7 +1,7 @@
 """A fixed camera: intrinsics, lens distortion, pose; projection and its derivatives.
 
-Distortion is that of Brown (1966) in OpenCV's parameter order. Its functions work on normalised
-image points, (x / z, y / z) in the camera frame. The controller never sees a `CameraModel`: it
+Distortion is that of Brown (1966) in OpenCV's parameter order, which works on normalised image
+points, (x / z, y / z) in the camera frame. The controller never sees a `CameraModel`, which
 belongs to simulation and evaluation.
 """
 
@@ -18,73 +18,6 @@ IMAGE_SIZE = (1440, 1080)
 """Width and height of the images of the paper's camera [px]."""
 
 NONE: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-def distort(
-    normalised: Float[np.ndarray, "*batch 2"], coefficients: Coefficients
-) -> Float[np.ndarray, "*batch 2"]:
-    """Distorted position of points that a pinhole camera images at `normalised`."""
-    k1, k2, p1, p2, k3 = coefficients
-    x, y = normalised[..., 0], normalised[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-
-
-def distort_jacobian(
-    normalised: Float[np.ndarray, "*batch 2"], coefficients: Coefficients
-) -> Float[np.ndarray, "*batch 2 2"]:
-    """Derivative of `distort` with respect to its points."""
-    k1, k2, p1, p2, k3 = coefficients
-    x, y = normalised[..., 0], normalised[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # d radial / d x = slope * x
-    mixed = slope * x * y + 2.0 * (p1 * x + p2 * y)
-    return np.stack(
-        [
-            np.stack([radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x, mixed], axis=-1),
-            np.stack([mixed, radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x], axis=-1),
-        ],
-        axis=-2,
-    )
-
-
-def undistort(
-    distorted: Float[np.ndarray, "*batch 2"], coefficients: Coefficients
-) -> Float[np.ndarray, "*batch 2"]:
-    """Inverse of `distort`, by Newton's method started at the distorted point.
-
-    Args:
-        distorted: Normalised points behind the lens.
-        coefficients: (k1, k2, p1, p2, k3).
-
-    Returns:
-        Normalised points of the pinhole.
-    """
-    if coefficients == NONE:
-        return distorted.copy()
-    points = distorted.copy()
-    # A few rounding errors of the polynomial: Newton's steps cannot get closer.
-    tolerance = 16 * np.finfo(points.dtype).eps
-    # Four steps reach machine precision for common lenses, and no number does where the
-    # distortion folds the image over.
-    for _ in range(10):
-        residual = distort(points, coefficients) - distorted
-        if np.abs(residual).max(initial=0.0) < tolerance:
-            break
-        J = distort_jacobian(points, coefficients)
-        (a, b), (c, d) = np.moveaxis(J, (-2, -1), (0, 1))
-        e, f = np.moveaxis(residual, -1, 0)
-        # Cramer's rule: np.linalg.solve takes three times as long for the rays of an image.
-        points -= np.stack([d * e - b * f, a * f - c * e], axis=-1) / (a * d - b * c)[..., None]
-    return points
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,13 +110,25 @@ class CameraModel:
         self, normalised: Float[np.ndarray, "*batch 2"]
     ) -> Float[np.ndarray, "*batch 2"]:
         """Pixels of normalised (x/z, y/z) points, through the lens."""
-        return distort(normalised, self.distortion) * self.focal + self.principal
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = normalised[..., 0], normalised[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        v = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        return np.stack([u, v], axis=-1) * self.focal + self.principal
 
     def to_normalised(
         self, pixels: Float[np.ndarray, "*batch 2"]
     ) -> Float[np.ndarray, "*batch 2"]:
         """Normalised (x/z, y/z) points seen at the given pixels: the lens undone."""
-        return undistort((pixels - self.principal) / self.focal, self.distortion)
+        import cv2
+
+        # Ten steps of the fixed point are enough for common lenses, thirty for wide ones.
+        steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+        points, lens = pixels.reshape(-1, 1, 2), np.array(self.distortion)
+        found = cv2.undistortPointsIter(points, self.matrix, lens, None, None, steps)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return np.asarray(found).reshape(pixels.shape)
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
         """True where points in the base frame lie in front of the camera and in the image."""
@@ -225,15 +170,12 @@ class CameraModel:
             J_s: derivative with respect to the twist (linear, angular) in the base frame
             [px/m, px/rad].
         """
-        p = self.to_camera(point)
-        x, y, z = p[..., 0], p[..., 1], p[..., 2]
-        zero = np.zeros_like(z)
-        perspective = np.stack(
-            [np.stack([z, zero, -x], axis=-1), np.stack([zero, z, -y], axis=-1)], axis=-2
-        )
-        perspective = perspective / (z * z)[..., None, None]
-        lens = distort_jacobian(p[..., :2] / p[..., 2:], self.distortion)
-        J_point = np.diag(self.focal) @ lens @ perspective @ self.pose[:3, :3].T
+        import cv2
+
+        p, still, lens = self.to_camera(point), np.zeros(3), np.array(self.distortion)
+        # The derivative over a shift of all points is that over each point.
+        _, slope = cv2.projectPoints(p.reshape(-1, 3), still, still, self.matrix, lens)
+        J_point = slope[:, 3:6].reshape(*p.shape[:-1], 2, 3) @ self.pose[:3, :3].T
         arm = np.zeros_like(point) if origin is None else point - origin
         # (omega x arm) . j = omega . (arm x j) for each row j of J_point.
         return np.concatenate([J_point, np.cross(arm[..., None, :], J_point)], axis=-1)
