@@ -8,7 +8,6 @@ demonstrations decides when to stop.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
 from hrc_learn import distributed
+from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import (
     FOLDS,
     ImageDemonstration,
@@ -317,43 +317,39 @@ def cross_validate(
     report = network.report
     if report is None:
         raise ValueError("a loaded network has no fit report: pass the network just fitted.")
-    network = network.double()
-    parts = recorded_parts(demonstrations)
+    basis, precision = network.double().basis, prior_precision(network.centers, config)
+    K, parts = len(network.centers), recorded_parts(demonstrations)
     seen = {i % FOLDS for i in range(min(len(parts), FOLDS)) if len(parts[i].motion(config).dx)}
     if len(seen) < 2:
         raise ValueError("held-out errors need pairs in at least two folds of the data.")
     pairs: list[HeldOutSamples] = []
     for fold in sorted(seen):
-        others = [parts[i] for i in range(len(parts)) if i % FOLDS != fold]
-        without = copy.deepcopy(network)
+        others, left = [parts[i] for i in range(len(parts)) if i % FOLDS != fold], parts
         if network.camera is not None:
             if image_size is None:
                 raise ValueError("image_size is missing: a camera is fitted to each fold.")
-            without.camera = fit_camera(others, image_size).camera
-            others = unexplained(others, without.camera)
-        K = len(network.centers)
-        total = reduce(add, statistics_by_fold(network.basis, K, others, config))
-        weights, _ = solve(total, prior_precision(network.centers, config), report.noise**2)
+            camera = fit_camera(others, image_size).camera
+            others, left = unexplained(others, camera), unexplained(parts, camera)
+        total = reduce(add, statistics_by_fold(basis, K, others, config))
+        weights, _ = solve(total, precision, report.noise**2)
         for i, part in distributed.local_items(parts):
             if i % FOLDS == fold:
-                pairs.append(_predicted(part, without, weights, config))
+                pairs.append(_predicted(part, left[i], basis, weights, config))
     return tree_map(lambda *columns: torch.cat(columns), *pairs)
 
 
 @torch.no_grad()
 def _predicted(
     part: ImageDemonstration,
-    network: RBFImageJacobian,
+    left: ImageDemonstration,
+    basis: Callable[[Pose], Tensor],
     weights: Float[Tensor, "P 2"],
     config: ImageJacobianFitConfig,
 ) -> HeldOutSamples:
-    motion = part.motion(config)
-    error = motion.dx - motion.regressors(network.basis) @ weights
-    before, after = network.first_pixel(motion.before), network.first_pixel(motion.after)
-    if before is not None and after is not None:
-        error = error - (after - before)
+    """Pairs of a demonstration, `left` with the feature that a camera leaves of it."""
+    motion = left.motion(config)
     return HeldOutSamples(
         position=(motion.before.position + motion.after.position) / 2,
-        motion=motion.dx,
-        error=error,
+        motion=part.motion(config).dx,
+        error=motion.dx - motion.regressors(basis) @ weights,
     )
