@@ -76,30 +76,29 @@ def turn_about_vertical(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ApproachFile:
+class Approach:
+    """Orientation of the end effector in front of an object, from demonstrated approaches.
+
+    As it would be were the gripper not turned about the vertical: objects lie at any yaw. The
+    fields are those of its file.
+    """
+
     version: Literal[1] = 1
     orientation_wxyz: tuple[float, float, float, float]
+    """Its z axis is the direction in which the end effector goes on to the object."""
     spread_rad: Radians
+    """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
     turned_rad: Radians
+    """Angle from the mean demonstrated orientation [rad]; 0 where the tangents are not used."""
 
     def __post_init__(self) -> None:
         if not math.isclose(math.hypot(*self.orientation_wxyz), 1.0, abs_tol=1e-3):
             raise ValueError("orientation_wxyz is no unit quaternion")
 
-
-@dataclass(frozen=True, kw_only=True)
-class Approach:
-    """Orientation of the end effector in front of an object, from demonstrated approaches.
-
-    As it would be were the gripper not turned about the vertical: objects lie at any yaw.
-    """
-
-    orientation: Float[Tensor, "4"]
-    """(wxyz); its z axis is the direction in which it goes on to the object."""
-    spread: float
-    """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
-    turned: float
-    """Angle from the mean demonstrated orientation [rad]; 0 where the tangents are not used."""
+    @property
+    def orientation(self) -> Float[Tensor, "4"]:
+        """The orientation as a tensor (wxyz), in float64."""
+        return torch.tensor(self.orientation_wxyz, dtype=torch.float64)
 
     @property
     def direction(self) -> Float[Tensor, "3"]:
@@ -129,20 +128,15 @@ class Approach:
         points = quaternion.to_matrix(demonstrated)[:, 2]
         turned = float(_angle(points, mean))
         if not max(spread, turned) < MAX_SPREAD:
-            return cls(orientation=demonstrated, spread=spread, turned=0.0)
+            turned = 0.0
         axis = torch.linalg.cross(points, mean)
         turn = quaternion.exp(turned * axis / axis.norm().clamp(min=_SHORTEST))
-        return cls(
-            orientation=quaternion.multiply(turn, demonstrated), spread=spread, turned=turned
-        )
+        w, x, y, z = quaternion.multiply(turn, demonstrated).tolist()
+        return cls(orientation_wxyz=(w, x, y, z), spread_rad=spread, turned_rad=turned)
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
-        w, x, y, z = self.orientation.tolist()
-        content = _ApproachFile(
-            orientation_wxyz=(w, x, y, z), spread_rad=self.spread, turned_rad=self.turned
-        )
-        write_json(path, content)
+        write_json(path, self)
 
     @classmethod
     def load(cls, path: Path) -> "Approach":
@@ -152,12 +146,7 @@ class Approach:
             FileNotFoundError: If there is no such file.
             ValueError: If it is not one of ours.
         """
-        content = read_json(path, _ApproachFile, "fit it again")
-        return cls(
-            orientation=torch.tensor(content.orientation_wxyz, dtype=torch.float64),
-            spread=content.spread_rad,
-            turned=content.turned_rad,
-        )
+        return read_json(path, cls, "fit it again")
 
 
 def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:

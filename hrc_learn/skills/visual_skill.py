@@ -223,8 +223,8 @@ class VisualServoSkill:
         if self.angle is not None:
             values["angle_spread_deg"] = math.degrees(self.angle.spread)
         if self.approach is not None:
-            values["approach_spread_deg"] = math.degrees(self.approach.spread)
-            values["approach_turned_deg"] = math.degrees(self.approach.turned)
+            values["approach_spread_deg"] = math.degrees(self.approach.spread_rad)
+            values["approach_turned_deg"] = math.degrees(self.approach.turned_rad)
         return values
 
 

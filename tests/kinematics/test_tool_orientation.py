@@ -44,8 +44,8 @@ def test_the_hand_points_where_it_went_and_turns_no_further():
     angle = 0.2
     approach = Approach.fit([path_along(tilted(angle)), path_along(tilted(angle))])
     torch.testing.assert_close(approach.direction, tilted(angle))
-    assert approach.turned == pytest.approx(angle)
-    assert approach.spread == pytest.approx(0.0, abs=1e-9)
+    assert approach.turned_rad == pytest.approx(angle)
+    assert approach.spread_rad == pytest.approx(0.0, abs=1e-9)
     turn = quaternion.multiply(approach.orientation, quaternion.conjugate(DOWN))
     vector = quaternion.log(quaternion.canonical(turn))
     assert vector.norm() == pytest.approx(angle)
@@ -56,14 +56,14 @@ def test_it_is_the_mean_of_demonstrations_whatever_their_signs():
     paths = [path_along(tilted(0.1)), path_along(tilted(-0.1), orientation=-DOWN)]
     approach = Approach.fit(paths)
     torch.testing.assert_close(approach.direction, tilted(0.0), rtol=0, atol=1e-12)
-    assert approach.spread == pytest.approx(0.1)
+    assert approach.spread_rad == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("angles", [(MAX_SPREAD + 0.01,), (0.6, -0.6), (math.pi / 2,)])
 def test_where_the_hand_came_from_the_side_it_keeps_its_orientation(angles):
     approach = Approach.fit([path_along(tilted(angle)) for angle in angles])
     assert float(quaternion.angle(approach.orientation, DOWN)) < 1e-7
-    assert approach.turned == 0.0
+    assert approach.turned_rad == 0.0
 
 
 def test_a_path_that_already_points_the_right_way_turns_nothing():
@@ -76,8 +76,7 @@ def test_it_is_written_and_read(tmp_path):
     approach = Approach.fit([path_along(tilted(0.2))])
     approach.save(tmp_path / "approach.json")
     again = Approach.load(tmp_path / "approach.json")
-    assert torch.equal(again.orientation, approach.orientation)
-    assert (again.spread, again.turned) == (approach.spread, approach.turned)
+    assert again == approach
     assert [file.name for file in tmp_path.iterdir()] == ["approach.json"]
 
 

@@ -218,7 +218,12 @@ def test_the_hand_is_turned_as_the_demonstrations_approached(skill):
     """By 8 degrees about the axis along which the fingers close."""
     axis = torch.tensor([0.14, 0.0, 0.0], dtype=torch.float64)
     shown = quaternion.multiply(quaternion.exp(axis), WORKPLACE.hover().orientation)
-    tilted = replace(skill, approach=Approach(orientation=shown, spread=0.0, turned=0.14))
+    tilted = replace(
+        skill,
+        approach=Approach(
+            orientation_wxyz=tuple(shown.tolist()), spread_rad=0.0, turned_rad=0.14
+        ),
+    )
     run = simulate_grasp(tilted, turned(20), camera="synthetic", rng=np.random.default_rng(0))
     assert succeeded(run)
     assert descent(run)[1] < 1.15
