@@ -250,7 +250,11 @@ def axis_drift(
 def drift_free_rate(
     e: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Solve e' = v + n(e, v) for v, given e' = `rate`; v is minus the angular velocity."""
+    """Solve e' = v + n(e, v) for v, given e' = `rate`; v is minus the angular velocity.
+
+    It is the product with the transposed left Jacobian J_l(e)^T, which also takes a derivative
+    over small rotations to one over e.
+    """
     square = (e * e).sum(-1, keepdim=True)
     cross = torch.linalg.cross(e, rate)
     return rate - _h(square) * cross + _k(square) * torch.linalg.cross(e, cross)
@@ -275,13 +279,6 @@ def drift_free_slope(
     cross, bend = torch.linalg.cross(e, rate), torch.linalg.cross(e, curvature)
     turning = torch.linalg.cross(e, k_rate * cross + k * bend)
     return curvature - h_rate * cross - h * bend + turning + k * torch.linalg.cross(rate, cross)
-
-
-def left_jacobian_transposed(
-    phi: Float[Tensor, "*batch 3"], slope: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
-    """J_l(phi)^T slope: from a derivative over small rotations to one over phi."""
-    return drift_free_rate(phi, slope)
 
 
 def _h(square: Tensor) -> Tensor:

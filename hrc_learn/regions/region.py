@@ -183,7 +183,7 @@ class OrientationRegion(_Cone):
         if not over_vector:
             return P, gradient
         r = quaternion.log(x).expand_as(gradient)
-        return P, quaternion.left_jacobian_transposed(r, gradient)
+        return P, quaternion.drift_free_rate(r, gradient)
 
     def _half_angle(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # The error p * p_g^-1 with the sign of the shortest rotation.
