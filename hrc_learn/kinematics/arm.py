@@ -301,19 +301,21 @@ class Arm(SerialChain):
         near: ArrayLike | None = None,
         samples: int = _SCAN,
     ) -> Float[Tensor, "*batch solutions joints"]:
-        """Several joint positions for each pose [rad]; rows without a solution are NaN.
+        """Joint positions by the closed-form inverse [rad]; rows without a solution are NaN.
 
         Args:
             pose: Poses of the tool centre point in the base frame.
-            q7: Position of joint 7 [rad], used by arms with a closed-form inverse: all branches
-                are returned. None scans joint 7. Other arms are solved from random starts.
-            near: Configuration from which the search starts as well [rad]; the ready posture
+            q7: Position of joint 7 [rad]: all branches are returned. None scans joint 7.
+            near: Configuration with another position of joint 7 to try [rad]; the ready posture
                 if None.
-            samples: Positions of joint 7, or random starts.
+            samples: Positions of joint 7.
+
+        Raises:
+            ValueError: The arm has no closed-form inverse.
         """
-        near = self.ready if near is None else as_tensor(near)
         if self._closed_form is None:
-            return self._numerical_solutions(pose, near.double(), samples)
+            raise ValueError(f"{self.name} has no closed-form inverse: use `postures`.")
+        near = self.ready if near is None else as_tensor(near)
         if q7 is not None:
             angles = q7 if isinstance(q7, float) else as_tensor(q7)
             return self._closed_form(self, pose, angles)
@@ -337,10 +339,18 @@ class Arm(SerialChain):
         Raises:
             UnreachableError: No joint positions within the limits reach the pose.
         """
+        limits = self.limits
         if self._closed_form is None:
-            found = self.solutions(pose, samples=_STARTS)
+            # The same starts each time: an answer depends on its arguments alone.
+            rng = torch.Generator().manual_seed(0)
+            # A joint that turns by more than one revolution repeats its poses.
+            low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
+            random = torch.rand(_STARTS, self.joints, generator=rng, dtype=torch.float64)
+            starts = torch.cat([self.ready[None].double(), low + (high - low) * random])
+            found = solutions_from(self, pose, starts, task=self.task)
+            found = unwound(self, found, self.ready)
         else:
-            lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
+            lower, upper = float(limits.lower[6]), float(limits.upper[6])
             scan = torch.linspace(lower, upper, _POSTURE_SCAN, dtype=torch.float64)
             many = _repeated(pose, scan.shape)
             found = self._closed_form(self, many, scan).flatten(0, 1)
@@ -382,31 +392,14 @@ class Arm(SerialChain):
         self, pose: Pose, q7: ArrayLike | None, near: Tensor, task: TaskSpace, samples: int
     ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
         """Solution closest to a configuration, for each pose by itself, and where none is."""
-        if task == self.task:
-            found = self.solutions(pose, q7, near=near, samples=samples)
-            distance = (found - near.to(found).unsqueeze(-2)).norm(dim=-1)
-            least = torch.where(distance.isnan(), torch.inf, distance).min(-1)
-            missing = least.values.isinf()
-            if self._closed_form is not None or not bool(missing.any()):
-                indices = least.indices[..., None, None]
-                return torch.take_along_dim(found, indices, dim=-2).squeeze(-2), missing
-        solution = solve_inverse(self, pose, near, task=task)
-        return solution.position, ~solution.found
-
-    def _numerical_solutions(
-        self, pose: Pose, near: Float[Tensor, "*#batch joints"], samples: int
-    ) -> Float[Tensor, "*batch solutions joints"]:
-        """Solutions from a configuration and from random starts; NaN where one fails."""
-        limits = self.limits
-        # The same starts each time: an answer depends on its arguments alone.
-        rng = torch.Generator().manual_seed(0)
-        # A joint that turns by more than one revolution repeats its poses.
-        low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
-        random = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
-        wish = near.unsqueeze(-2)
-        starts = (low + (high - low) * random).expand(*near.shape[:-1], -1, -1)
-        found = solutions_from(self, pose, torch.cat([wish, starts], dim=-2), task=self.task)
-        return unwound(self, found, wish)
+        if self._closed_form is None or task != self.task:
+            solution = solve_inverse(self, pose, near, task=task)
+            return solution.position, ~solution.found
+        found = self.solutions(pose, q7, near=near, samples=samples)
+        distance = (found - near.to(found).unsqueeze(-2)).norm(dim=-1)
+        least = torch.where(distance.isnan(), torch.inf, distance).min(-1)
+        indices = least.indices[..., None, None]
+        return torch.take_along_dim(found, indices, dim=-2).squeeze(-2), least.values.isinf()
 
     def with_hand(self, size: float = 1.0, mount: Float[Tensor, "4 4"] | None = None) -> Arm:
         """The same arm with the Franka hand in place of its gripper.

@@ -42,9 +42,9 @@ _LEVER = 0.3
 # last joint rolls it, which moves it by so much and no further.
 _RANK, _LED = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
-_STARTS, _ROUNDS, _ITERATIONS = 12, 6, 40
+_STARTS, _ROUNDS, _ITERATIONS = 24, 6, 40
 # Largest error of a solution's position [m] and orientation [rad].
-_TOLERANCE = 1e-6
+_TOLERANCE = 1e-9
 # Rotation by which a nearest pose may miss the wanted one [rad]: an arm that turns away further
 # does another task.
 _MISSED_TURN = 0.6
@@ -218,14 +218,14 @@ def solve_inverse(
         missing = distance.isinf().nonzero().flatten()
         if len(missing) == 0:
             break
-        # Drawn on the CPU: a seed means the same on every device.
-        random = torch.rand(len(missing), _STARTS, joints, generator=rng, dtype=torch.float64)
-        random = random.to(wish.device)
+        # The same starts for all poses: an answer does not depend on the others. They are drawn
+        # on the CPU: a seed means the same on every device.
+        random = torch.rand(_STARTS, joints, generator=rng, dtype=torch.float64).to(wish.device)
         half = ((upper - lower) / 2).clamp(max=math.pi)
-        start = (lower + upper) / 2 + (2 * random - 1) * half
+        start = ((lower + upper) / 2 + (2 * random - 1) * half).repeat(len(missing), 1, 1)
         if round_ == 0:
             start[:, 0] = best[missing]
-        q = solutions_from(chain, goal[missing], start, task=task, tolerance=_TOLERANCE)
+        q = solutions_from(chain, goal[missing], start, task=task)
         q = unwound(chain, q, wish[missing].unsqueeze(-2))
         apart = torch.linalg.vector_norm(q - wish[missing].unsqueeze(-2), dim=-1)
         apart = torch.where(apart.isnan(), torch.inf, apart)
@@ -246,7 +246,6 @@ def solutions_from(
     starts: Float[Tensor, "*#batch starts joints"],
     *,
     task: TaskSpace = "pose",
-    tolerance: float = 1e-9,
 ) -> Float[Tensor, "*batch starts joints"]:
     """Joint positions that reach poses within the limits, from each of several starts.
 
@@ -255,7 +254,6 @@ def solutions_from(
         pose: Poses of the tool centre point.
         starts: Joint positions [rad, m].
         task: Constrained part of the pose.
-        tolerance: Largest error of the position [m] and the orientation [rad].
 
     Returns:
         In the order of the starts; NaN for those that do not lead there.
@@ -266,7 +264,7 @@ def solutions_from(
     row = torch.arange(len(goal.position), device=starts.device).repeat_interleave(count)
     start = starts.detach().double().expand(*batch, count, joints).reshape(-1, joints)
     start = start.clamp(*_limits(chain, start))
-    q, reached = _descend(chain, goal[row], start, task, tolerance)
+    q, reached = _descend(chain, goal[row], start, task)
     return torch.where(reached[:, None], q, torch.nan).reshape(*batch, count, joints)
 
 
@@ -349,13 +347,13 @@ def _limits(chain: SerialChain, like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _descend(
-    chain: SerialChain, goal: Pose, q: Tensor, task: TaskSpace, tolerance: float
+    chain: SerialChain, goal: Pose, q: Tensor, task: TaskSpace
 ) -> tuple[Tensor, Tensor]:
     result, done = q.clone(), torch.zeros(len(q), dtype=torch.bool, device=q.device)
     rows = torch.arange(len(q), device=q.device)
     for _ in range(_ITERATIONS):
         after, error = _step(chain, goal[rows], q, task)
-        arrived = error.abs().amax(-1) < tolerance
+        arrived = error.abs().amax(-1) < _TOLERANCE
         result[rows[arrived]], done[rows[arrived]] = q[arrived], True
         rows, q = rows[~arrived], after[~arrived]
         if len(rows) == 0:
@@ -380,7 +378,7 @@ def _drawn_nearer(
     moved = q
     for _ in range(15):  # each removes most of what the null space can
         moved, _ = _step(chain, goal, moved, task, wish)
-    moved, reached = _descend(chain, goal, moved, task, _TOLERANCE)
+    moved, reached = _descend(chain, goal, moved, task)
     nearer = torch.linalg.vector_norm(moved - wish, dim=-1) < torch.linalg.vector_norm(
         q - wish, dim=-1
     )
