@@ -286,7 +286,7 @@ def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings
         print("\n".join(_listed("", default)))
         sys.exit(0)
     for text in texts:
-        default = _updated(default, _parsed(text), "--config ")
+        default = updated(default, _parsed(text), "--config ")
     return default
 
 
@@ -311,8 +311,12 @@ def _unknown(place: str, name: str, known: Iterable[str]) -> str:
     return f"{place}{name}: no such setting; {hint}"
 
 
-def _updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
-    """Dataclass with the given fields replaced. `place` precedes their names in errors."""
+def updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
+    """Dataclass with the given fields replaced. `place` precedes their names in errors.
+
+    Raises:
+        ValueError: There is no such field, or a value has another type.
+    """
     hints = typing.get_type_hints(type(config))
     known = [field.name for field in dataclasses.fields(config)]
     values = {}
@@ -321,7 +325,7 @@ def _updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
             raise ValueError(_unknown(place, name, known))
         current = getattr(config, name)
         if dataclasses.is_dataclass(current) and isinstance(value, Mapping):
-            values[name] = _updated(current, value, f"{place}{name}.")
+            values[name] = updated(current, value, f"{place}{name}.")
         elif isinstance(current, dict) and isinstance(value, dict):
             values[name] = _merged(current, _converted(value, hints[name], f"{place}{name}"))
         else:

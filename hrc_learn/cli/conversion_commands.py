@@ -2,10 +2,10 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
-from hrc_learn.cli._run import write_values
+from hrc_learn.cli._run import updated, write_values
 from hrc_learn.cli.arguments import Import
 from hrc_learn.demos.recording_import import plan_import, write_plan
 from hrc_learn.demos.recording_names import ImportOptions
@@ -44,11 +44,7 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
     said = ImportOptions()
     if mapping is not None:
         read = read_toml if mapping.suffix == ".toml" else read_json
-        known = {one.name for one in fields(ImportOptions)}
-        if unknown := read(mapping).keys() - known:
-            text = f"{mapping}: there is no field {min(unknown)!r} in a mapping file"
-            raise ValueError(f"{text}; known are {', '.join(sorted(known))}")
-        said = read(mapping, ImportOptions)
+        said = updated(said, read(mapping), f"{mapping}: ")
     turn = _words(args.orientation)
     columns = {
         "joint_position": _words(args.joints),

@@ -28,6 +28,8 @@ from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.report import (
     PAGE,
     Measurement,
+    Row,
+    measured,
     show_command,
     show_measurements,
     write_report,
@@ -219,13 +221,17 @@ _MODELS = {
 """Kinds of model that predict held-out demonstrations."""
 
 
-# Key in JSON of a channel, title, unit and largest value that passes. A primitive represents
-# its demonstration up to a centimetre in a motion of half a metre.
+_COUNTS: tuple[Row, ...] = (
+    ("demonstrations", "demonstrations", 1, "", None, 0.0),
+    ("left_out_error", "held-out error, relative to the spread of actions", 100, "%", None, 0),
+)
+# Key of a channel, name, factor, unit and largest value that passes. A primitive represents its
+# demonstration up to a centimetre in a motion of half a metre.
 _ROWS = (
     # The maximum: a mean would hide one demonstration that its primitive misses.
-    ("{}_nrmse_max", "worst NRMSE of a demonstration", "%", 2.0),
-    ("mean_{}_nrmse_median", "median NRMSE of the common model", "%", None),
-    ("{}_turn_rmse_max", "worst rotation error", "deg", None),
+    ("{}_nrmse_max", "worst NRMSE of a demonstration", 100, "%", 2.0),
+    ("mean_{}_nrmse_median", "median NRMSE of the common model", 100, "%", None),
+    ("{}_turn_rmse_max", "worst rotation error", 1, "deg", None),
 )
 _WORDS = {"joint": "joints", "orientation": "orientation"}
 _RESOLUTION = 0.01
@@ -234,28 +240,17 @@ _RESOLUTION = 0.01
 
 def _rows(metrics: Mapping[str, float]) -> list[Measurement]:
     """Main measured values, NRMSE relative to the range of motion."""
-    rows = [
-        Measurement(name=name, value=factor * metrics[key], unit=unit)
-        for key, name, factor, unit in (
-            ("demonstrations", "demonstrations", 1, ""),
-            ("left_out_error", "held-out error, relative to the spread of actions", 100, "%"),
-        )
-        if key in metrics
-    ]
+    rows = [*_COUNTS]
     for channel in CHANNELS:
-        keys = {kind: f"held_out_{channel}_{kind}_nrmse_median" for kind in _MODELS}
-        held_out = [kind for kind, key in keys.items() if key in metrics]
-        best = sorted(held_out, key=lambda kind: metrics[keys[kind]])[:1]
-        shown = [*_ROWS, *((keys[k], f"held out, by {_MODELS[k]}", "%", None) for k in best)]
-        rows += [
-            Measurement(
-                name=f"{_WORDS.get(channel, 'end effector')}: {name}",
-                value=(100 if unit == "%" else 1) * metrics[key.format(channel)],
-                unit=unit,
-                target=target,
-                resolution=_RESOLUTION,
-            )
-            for key, name, unit, target in shown
-            if key.format(channel) in metrics
+        held_out = [
+            (key, f"held out, by {words}", 100, "%", None)
+            for kind, words in _MODELS.items()
+            if (key := f"held_out_{channel}_{kind}_nrmse_median") in metrics
         ]
-    return rows
+        best = sorted(held_out, key=lambda row: metrics[row[0]])[:1]
+        words = _WORDS.get(channel, "end effector")
+        rows += [
+            (key.format(channel), f"{words}: {name}", factor, unit, target, _RESOLUTION)
+            for key, name, factor, unit, target in (*_ROWS, *best)
+        ]
+    return measured(rows, metrics)

@@ -35,19 +35,15 @@ from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.vision import MarkerDetector, centre
-from hrc_learn.viz.report import Measurement, show_command, show_measurements
+from hrc_learn.viz.report import Measurement, Row, measured, show_command, show_measurements
 
-# Key in JSON, title, factor, unit, largest value that passes, resolution. Most of a relative
-# error is image noise; a marker is detected to 0.1 px.
-_ROWS = (
+# Most of a relative error is image noise; a marker is detected to 0.1 px.
+_ROWS: tuple[Row, ...] = (
     ("pairs", "pairs of images", 1, "", None, 0.0),
     ("neurons", "neurons", 1, "", None, 0.0),
     ("motion_px", "image motion in a pair", 1, "px", None, 0.0),
     ("held_out_relative", "held-out error, relative to that motion", 100, "%", 2.0, 0.0),
-    (
-        *("held_out_relative_worst_cell", "held-out error, worst part of the workspace"),
-        *(100, "%", None, 0.0),
-    ),
+    ("held_out_relative_worst_cell", "held-out error, worst place", 100, "%", None, 0.0),
     ("focal_px", "focal length", 1, "px", None, 0.0),
     ("camera_place_std_mm", "place of the camera, standard deviation", 1, "mm", None, 0.0),
     ("target_error_px", "target in the image, error", 1, "px", None, 0.1),
@@ -187,17 +183,7 @@ def _write(
         if unmarked is not None:
             unmarked.save_picture(folder / FOUND)
     shown = metrics | dict(searched)
-    rows = [
-        Measurement(
-            name=name,
-            value=factor * shown[key] if unit else round(shown[key]),
-            unit=unit,
-            target=target,
-            resolution=resolution,
-        )
-        for key, name, factor, unit, target, resolution in _ROWS
-        if key in shown
-    ]
+    rows = measured(_ROWS, shown)
     title, more = f"Image Jacobian from {args.dataset}", len(shown) - len(rows)
     show_measurements(rows, title=title, more=more, elsewhere="metrics.json")
     print(f"Found: {skill.jacobian.camera_fit}.")
@@ -250,6 +236,6 @@ def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[s
     camera, offset = workplace.scene.camera, world.hand_marker_offset()
     figures: dict[str, float] = {}
     for name, tilt in (("upright", 0.0), ("tilted", _TILT)):
-        measured = compare_with_truth(network, held_out_grid(shown, tilt=tilt), camera, offset)
-        figures |= {f"{name}_{key}": value for key, value in measured.items()}
+        errors = compare_with_truth(network, held_out_grid(shown, tilt=tilt), camera, offset)
+        figures |= {f"{name}_{key}": value for key, value in errors.items()}
     return figures

@@ -20,7 +20,9 @@ from hrc_learn.learning.model_choice import best_models, predict
 from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, sampled
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
-from hrc_learn.viz.figures import measures_figure
+from hrc_learn.viz import palette
+from hrc_learn.viz.figures import Figure, plots_figure
+from hrc_learn.viz.panels import Plot, single
 
 UNITS = {
     "nrmse": "",
@@ -102,15 +104,31 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
         with new_folder(args.out, asdict(args), args.overwrite) as folder:
             write_json(folder / "metrics.json", figures)
             for channel, error in errors.items():
-                measures = {name: x.numpy() for name, x in error.columns().items()}
-                figure = measures_figure(measures, [demo.episode for demo in demos], UNITS)
-                figure.savefig(folder / f"{channel}.png", dpi=120)
+                _figure(demos, error).savefig(folder / f"{channel}.png", dpi=120)
     write_values(args.json, figures)
     if args.most_nrmse is None:
         return 0
     medians = [figures.get(f"{channel}_nrmse_median", 0.0) for channel in channels]
     # NaN does not meet the limit.
     return int(not all(median <= args.most_nrmse for median in medians))
+
+
+def _figure(demos: DemonstrationSet, error: ReproductionError) -> Figure:
+    """Each measure over the episodes, with its median."""
+    plots = []
+    for name, values in error.columns().items():
+        median = values.quantile(0.5).expand_as(values)
+        curves = (
+            single("", name, values.numpy(), palette.RUN_ON_DARK),
+            single("", "median", median.numpy(), palette.LIMIT),
+        )
+        plots.append(Plot(title=_with_unit(name), curves=curves))
+    episodes = np.array([float(demo.episode) for demo in demos])
+    return plots_figure(episodes, plots, columns=2, axis="episode (red: median)")
+
+
+def _with_unit(name: str) -> str:
+    return name.replace("_", " ") + (f" [{UNITS[name]}]" if UNITS[name] else "")
 
 
 def _demonstrations(args: Evaluate, model: Path, console: Console) -> DemonstrationSet:
@@ -167,9 +185,8 @@ def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> T
     table = Table(title=f"{channel}: predicted from start, goal and duration")
     table.add_column("episode", justify="right")
     for name in measures:
-        unit = f" [{UNITS[name]}]" if UNITS[name] else ""
         # Text, as rich would take the brackets around a unit for markup.
-        table.add_column(Text(name.replace("_", " ") + unit), justify="right")
+        table.add_column(Text(_with_unit(name)), justify="right")
     for i in shown:
         table.add_row(str(demos[i].episode), *(f"{x[i]:.3g}" for x in measures.values()))
     table.add_section()

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -123,9 +124,10 @@ def _table(model: FittedModel, robot: Arm | None, motion: PlayedMotion) -> str:
         if values is not None:
             names += labels
             columns.append(values)
-    rows = np.concatenate(columns, axis=1)
-    lines = [",".join(names), *(",".join(f"{x:.9g}" for x in row) for row in rows)]
-    return "\n".join(lines) + "\n"
+    text = StringIO()
+    rows, heads = np.concatenate(columns, axis=1), ",".join(names)
+    np.savetxt(text, rows, "%.9g", ",", header=heads, comments="")
+    return text.getvalue()
 
 
 def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -> None:

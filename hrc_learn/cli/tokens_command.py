@@ -109,7 +109,7 @@ def tokens(args: Tokens) -> None:
             write_json(out / "metrics.json", figures)
         print(f"Tokenizer in {shlex.quote(str(folder / MODEL))}")
     rows = [Measurement(name=_ROWS[name], value=value) for name, value in figures.items()]
-    show_measurements(rows, everything=True, title=f"Tokens of {args.dataset}")
+    show_measurements(rows, title=f"Tokens of {args.dataset}")
     write_values(args.json, figures)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.log import LoggedSteps
+from hrc_learn.log import Event, LoggedSteps
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.grasping import INTERACT
 from hrc_learn.skills.work_cell import WorkCell
@@ -39,14 +39,14 @@ _IN_HAND = quaternion.from_matrix(
 )
 
 
+def lasting(phases: Sequence[Event], last: float = math.inf) -> list[tuple[Event, float]]:
+    """Each phase with its end: the start of the next one, or the last end [s]."""
+    return list(zip(phases, [*(phase.time for phase in phases[1:]), last], strict=True))
+
+
 def spans(log: LoggedSteps, phase: str) -> list[tuple[float, float]]:
     """Start and end of each time a phase was entered [s]; the last end may be infinite."""
-    events = log.events
-    return [
-        (event.time, math.inf if following is None else following.time)
-        for event, following in zip(events, [*events[1:], None], strict=True)
-        if event.text == phase
-    ]
+    return [(event.time, end) for event, end in lasting(log.events) if event.text == phase]
 
 
 def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
@@ -269,14 +269,12 @@ def pull_effects(
     if encoder_offset is not None:
         tool = tool + _hidden_displacement(chain, log, torch.from_numpy(encoder_offset))
     off_path = path_distance(tool, log["goal_position"], time)
-    starts = [event.time for event in log.events]
-    phases = list(zip(starts, [*starts[1:], math.inf], strict=True))
     effects = []
     for pull in pulls:
         elbow, known = [], [math.nan]
         # Each phase has a path of its own, from which the elbow was displaced.
-        for begin, end in phases:
-            rows = (time >= max(pull.start, begin)) & (time < min(pull.end + _AFTER, end))
+        for phase, end in lasting(log.events):
+            rows = (time >= max(pull.start, phase.time)) & (time < min(pull.end + _AFTER, end))
             if not (rows & (time < pull.end)).any():
                 continue
             during = torch.from_numpy(rows)

@@ -13,14 +13,15 @@ from matplotlib.ticker import MaxNLocator
 
 from hrc_learn.experiments.placing_metrics import PlacingRun
 from hrc_learn.experiments.placing_trial import SPACES, demonstrated_path
-from hrc_learn.log import Event, JointRanges, RunRecording
+from hrc_learn.experiments.run_measures import lasting
+from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
+    DEMO_LOOK,
     STYLE,
     WIDTH,
     JointCurves,
     active_intervals,
-    demonstrated_joints,
     draw_box,
     frame_space,
     joint_grid_figure,
@@ -145,7 +146,7 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
         if run.demo_path is not None:
             axes.plot(*run.demo_path.T, color=palette.DEMO, lw=5.0, label="demonstration")
         carried = np.zeros(len(run.time), dtype=bool)
-        for event, end in _lasting(run):
+        for event, end in lasting(run.phases, float(run.time[-1])):
             if event.text in CARRYING:
                 carried |= _within(run.time, (event.time, end))
         for (name, span), colour in zip(objects.items(), palette.SERIES, strict=False):
@@ -209,7 +210,11 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
 
 def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
     """Phases of the task by object, with pushes and occlusions below."""
-    events = [(event, end) for event, end in _lasting(run) if end > event.time]
+    events = [
+        (event, end)
+        for event, end in lasting(run.phases, float(run.time[-1]))
+        if end > event.time
+    ]
     names = list(dict.fromkeys(event.text for event, _ in events))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 0.9 + 0.26 * (len(names) + 2)))
@@ -239,12 +244,6 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
         handles = [axes.plot([], [], lw=6, color=c)[0] for c in colours.values()]
         figure.legend(handles, colours, loc="outside upper right", ncols=len(colours))
     return figure
-
-
-def _lasting(run: RunRecording) -> list[tuple[Event, float]]:
-    """Each phase with the start of the next one [s]."""
-    ends = [*(event.time for event in run.phases[1:]), float(run.time[-1])]
-    return list(zip(run.phases, ends, strict=True))
 
 
 def _within(
@@ -290,7 +289,8 @@ def placing_joints_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
     """Joint positions over time: the demonstration, and the motion to each shelf."""
     shown, chain = run.demonstration, run.workplace.robot.chain
     assert shown.joint_position is not None
-    curves = [demonstrated_joints(shown.time - shown.time[0], shown.joint_position)]
+    time = shown.time - shown.time[0]
+    curves = [JointCurves("demonstration", time, shown.joint_position, *DEMO_LOOK)]
     for shelf, colour in zip(shelves, _SHELVES, strict=False):
         placed = run.placings["pose", shelf]
         label = f"{shelf} shelf"

@@ -54,7 +54,7 @@ class Trial:
         return cls(seed=seed, failure=failure, values=values)
 
 
-class TrialFile:
+class TrialFile(Claim):
     """File of trials with the same settings, to which each trial is added as soon as it ends.
 
     One process at a time may hold it.
@@ -78,25 +78,18 @@ class TrialFile:
         self.trials: dict[int, Trial] = {}
         made_by = parse_json(json_text(made_by))
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._claim = Claim(path)
+        super().__init__(path)
         try:
             if path.exists():
                 self._resume(made_by)
             else:
                 self._write(json_text({_MADE_BY: made_by}, indent=False))
         except BaseException:
-            self.close()
+            self.release()
             raise
 
     def __enter__(self) -> "TrialFile":
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Release the file for other processes."""
-        self._claim.release()
 
     def append(self, trial: Trial) -> None:
         """Add a trial; it is on disk when this method returns."""
@@ -126,7 +119,7 @@ class TrialFile:
         self.trials = {trial.seed: trial for trial in found}
 
     def _write(self, text: str) -> None:
-        with new_file(self._claim) as part:
+        with new_file(self) as part:
             part.write_text(text, encoding="utf-8")
 
 

@@ -24,8 +24,8 @@ from hrc_learn.log import JointRanges
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
+    DEMO_LOOK,
     JointCurves,
-    demonstrated_joints,
     joint_grid_figure,
 )
 from hrc_learn.viz.panels import Plot, Tab, joint_plot, joints_title, several, single, slug
@@ -196,7 +196,7 @@ def fit_report(
         command: Command line that repeats the fit.
     """
     shown = list(zip(fit.time, fit.demos, fit.reproductions, strict=True))[:4]
-    motions = [demonstrated_joints(time, demo) for time, demo, _ in shown]
+    motions = [JointCurves("demonstration", time, demo, *DEMO_LOOK) for time, demo, _ in shown]
     motions += [JointCurves("reproduction", time, made) for time, _, made in shown]
     joints = joint_grid_figure(fit.names, motions, fit.limits, fit.unit)
     caption = "The first four demonstrations and their reproductions."

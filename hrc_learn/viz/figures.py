@@ -4,7 +4,7 @@ Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Curves
 plots that the dashboards show (`panels.py`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -121,11 +121,8 @@ class JointCurves(NamedTuple):
     width: float = 1.8
 
 
-def demonstrated_joints(
-    time: Float[np.ndarray, " time"], position: Float[np.ndarray, "time joints"]
-) -> JointCurves:
-    """Thick grey curves of a demonstration."""
-    return JointCurves("demonstration", time, position, palette.DEMO, 4.5)
+DEMO_LOOK = palette.DEMO, 4.5
+"""Colour and width of the curves of a demonstration, thick and behind the others."""
 
 
 def joint_grid_figure(
@@ -162,9 +159,9 @@ def joint_grid_figure(
 
 def joints_figure(run: RunRecording) -> Figure:
     """Joint positions over time, with the demonstration and the limits."""
-    motions = []
-    if run.demo_joint_position is not None:
-        motions.append(demonstrated_joints(run.time, run.demo_joint_position))
+    motions, demo = [], run.demo_joint_position
+    if demo is not None:
+        motions.append(JointCurves("demonstration", run.time, demo, *DEMO_LOOK))
     motions.append(JointCurves("run", run.time, run.joint_position))
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
@@ -176,15 +173,17 @@ def plots_figure(
     columns: int = 1,
     shown: Bool[np.ndarray, " time"] | None = None,
     shaded: Bool[np.ndarray, " time"] | None = None,
+    axis: str = "time [s]",
 ) -> Figure:
-    """Plots of a dashboard on white paper, with a common time axis.
+    """Plots of a dashboard on white paper, with a common horizontal axis.
 
     Args:
-        time: Time of the curves [s].
+        time: Time of the curves [s], or what `axis` names.
         plots: Plots; their titles name the units.
         columns: Number of columns.
         shown: Samples that the time axis has to show; None, or none of them: all.
         shaded: Samples in which the background is shaded; None: none.
+        axis: Title of the horizontal axis.
     """
     rows = -(-len(plots) // columns)
     with matplotlib.rc_context(STYLE):
@@ -212,37 +211,5 @@ def plots_figure(
             axes.set_axis_off()
         if shown is not None and shown.any():
             grid[0].set_xlim(time[shown][0], time[shown][-1])
-        figure.supxlabel("time [s]", fontsize=9)
-    return figure
-
-
-def measures_figure(
-    measures: Mapping[str, Float[np.ndarray, " demos"]],
-    episodes: Sequence[int],
-    units: Mapping[str, str],
-) -> Figure:
-    """Each measure over the demonstrations, with its median.
-
-    Args:
-        measures: Values by name.
-        episodes: Number of each demonstration.
-        units: Unit of each measure.
-    """
-    rows = -(-len(measures) // 2)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.9 * rows))
-        grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        places = np.arange(len(episodes))
-        for axes, (name, values) in zip(grid, measures.items(), strict=False):
-            axes.bar(places, values, color=palette.RUN)
-            axes.axhline(float(np.median(values)), color=palette.LIMIT, lw=1.0)
-            unit = units.get(name, "")
-            axes.set_title(name.replace("_", " ") + (f" [{unit}]" if unit else ""))
-        for axes in grid[len(measures) :]:
-            axes.set_axis_off()
-        for axes in grid[max(len(measures) - 2, 0) : len(measures)]:
-            axes.tick_params(labelbottom=True)
-            if len(episodes) <= 20:
-                axes.set_xticks(places, [str(episode) for episode in episodes])
-        figure.supxlabel("episode (line: median)", fontsize=9)
+        figure.supxlabel(axis, fontsize=9)
     return figure

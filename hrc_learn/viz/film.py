@@ -41,30 +41,27 @@ def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
         pictures: RGB, one at least, all of the same even size.
         rate: Pictures per second [1/s].
     """
-    # In a file, which the index can be moved to the front of, so that it plays while it loads.
-    with TemporaryDirectory(prefix="hrc_film_") as folder:
-        path = Path(folder) / "film.mp4"
-        _encode(path, pictures, rate)
-        return path.read_bytes()
-
-
-def _encode(path: Path, pictures: Iterable[Picture], rate: float) -> None:
     import av
 
     stream = None
-    with av.open(path, "w", options={"movflags": "+faststart"}) as container:
-        for picture in pictures:
-            if stream is None:
-                height, width = picture.shape[:2]
-                assert height % 2 == width % 2 == 0, "chroma is halved"
-                stream: Any = container.add_stream(
-                    "libx264", rate=Fraction(rate).limit_denominator(1001), options=_CODEC
-                )
-                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            container.mux(stream.encode(frame))
-        assert stream is not None, "a film needs a picture"
-        container.mux(stream.encode())
+    # In a file, which the index can be moved to the front of, so that it plays while it loads.
+    with TemporaryDirectory(prefix="hrc_film_") as folder:
+        path = Path(folder) / "film.mp4"
+        with av.open(path, "w", options={"movflags": "+faststart"}) as container:
+            for picture in pictures:
+                if stream is None:
+                    height, width = picture.shape[:2]
+                    assert height % 2 == width % 2 == 0, "chroma is halved"
+                    stream: Any = container.add_stream(
+                        "libx264", rate=Fraction(rate).limit_denominator(1001), options=_CODEC
+                    )
+                    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                content = np.ascontiguousarray(picture)
+                frame = av.VideoFrame.from_ndarray(content, format="rgb24")
+                container.mux(stream.encode(frame))
+            assert stream is not None, "a film needs a picture"
+            container.mux(stream.encode())
+        return path.read_bytes()
 
 
 def annotated(

@@ -1,7 +1,7 @@
 """Assignment of the curves of a run to plots and tabs, for both data and layout."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -158,11 +158,8 @@ def person_plots(run: RunRecording) -> list[Plot]:
         title = "Followed fraction of the push [-]"
         plots.append(Plot(title=title, curves=(share,), range=(-0.05, 1.05)))
     if run.hindered:
-        # A line at a height of its own for each reason, where it acts.
-        rows = [np.where(on, k + 1.0, np.nan) for k, on in enumerate(run.hindered.values())]
-        reasons = several("person/hindered", run.hindered, np.column_stack(rows), width=4.0)
-        extent, title = (0.0, len(rows) + 1.0), "Reasons for not following, or only in part"
-        plots.append(Plot(title=title, curves=(reasons,), range=extent, legend=True))
+        title = "Reasons for not following, or only in part"
+        plots.append(_rows("person/hindered", title, run.hindered))
     moved, turned = run.position_deviation, run.rotation_deviation
     turning = "Deviation of the end effector, rotation [deg]"
     for path, values, unit, colour, title in (
@@ -253,17 +250,19 @@ def _safety(run: RunRecording) -> Tab:
             title = "Joint velocities, as fractions of their limits [-]"
             plots.append(_within("safety/velocity", title, names, fractions))
     if run.safety:
-        # A row of its own for each guard, with marks where it acted.
-        acted = [np.nan_to_num(np.asarray(on, dtype=float)) > 0 for on in run.safety.values()]
-        rows = [np.where(on, k + 1.0, np.nan) for k, on in enumerate(acted)]
-        guards = [name.replace("_", " ") for name in run.safety]
-        marks = several("safety/acted", guards, np.column_stack(rows), width=4.0)
-        marks = replace(marks, marks=True)
-        title = "Interventions of the safety filter"
         plots.append(
-            Plot(title=title, curves=(marks,), range=(0.0, len(rows) + 1.0), legend=True)
+            _rows("safety/acted", "Interventions of the safety filter", run.safety, marks=True)
         )
     return Tab(title="Safety", plots=tuple(plots))
+
+
+def _rows(path: str, title: str, active: Mapping[str, np.ndarray], marks: bool = False) -> Plot:
+    """Plot with a row for each name, which has a line or marks where its value is positive."""
+    acted = [np.nan_to_num(np.asarray(on, dtype=float)) > 0 for on in active.values()]
+    rows = np.column_stack([np.where(on, k, np.nan) for k, on in enumerate(acted, start=1)])
+    names = [name.replace("_", " ") for name in active]
+    curves = replace(several(path, names, rows, width=4.0), marks=marks)
+    return Plot(title=title, curves=(curves,), range=(0.0, len(acted) + 1.0), legend=True)
 
 
 def _within(

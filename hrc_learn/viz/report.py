@@ -15,7 +15,7 @@ import shlex
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -78,6 +78,25 @@ class Measurement:
         """Name and unit as one word: the key of the value in JSON files."""
         words = re.findall(r"\w+", self.name.lower())
         return "_".join([*words, *([self.unit] if self.unit else [])])
+
+
+type Row = tuple[str, str, float, str, float | None, float]
+"""Key of a value, its name, factor to its unit, unit, largest one that passes, resolution."""
+
+
+def measured(rows: Iterable[Row], values: Mapping[str, float | int]) -> list[Measurement]:
+    """Measurements of the rows whose values are there; values without a unit are counts."""
+    return [
+        Measurement(
+            name=name,
+            value=factor * values[key] if unit else round(values[key]),
+            unit=unit,
+            target=target,
+            resolution=resolution,
+        )
+        for key, name, factor, unit, target, resolution in rows
+        if key in values
+    ]
 
 
 @dataclass(frozen=True)
@@ -416,17 +435,15 @@ _ROWS = 8
 
 def show_measurements(
     table: Sequence[Measurement],
-    everything: bool = False,
     *,
     title: str = "Measured",
     more: int = 0,
     elsewhere: str = "the report",
 ) -> None:
-    """Print measured values with their targets.
+    """Print measured values with their targets: the missed, and the first of the others.
 
     Args:
         table: The values.
-        everything: Print all values, not only the missed and the first of the others.
         title: Title of the table.
         more: Number of further values that are not in the table.
         elsewhere: Place of the values that are not shown.
@@ -438,7 +455,7 @@ def show_measurements(
     # As text: brackets in the name of a folder are no markup.
     shown = Table("measured", "value", "target", "", title=Text(title))
     marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
-    first, others = (tuple(table), ()) if everything else leading(table, _ROWS)
+    first, others = leading(table, _ROWS)
     for m in first:
         shown.add_row(m.name, m.shown, m.bound, marks[m.ok])
     if left := more + len(others):

@@ -153,14 +153,14 @@ class RunStream:
         for body in run.bodies:
             send_poses(self._stream, time, body, at)
         self._send_path(run, ends)
-        if run.worker_nearest is not None:
-            red = [palette.rgba(palette.LIMIT)]
-            line = rr.LineStrips3D.from_fields(radii=[0.004], colors=red)
-            self._send_pairs("world/worker_distance", line, time, run.worker_nearest, at)
-        if run.push is not None:
-            orange = [palette.rgba(palette.PERSON)]
-            arrow = rr.Arrows3D.from_fields(radii=[0.012], colors=orange)
-            self._send_pairs("world/push", arrow, time, run.push, at)
+        for name, pairs, colour, radius in (
+            ("worker_distance", run.worker_nearest, palette.LIMIT, 0.004),
+            ("push", run.push, palette.PERSON, 0.012),
+        ):
+            if pairs is not None:
+                look = rr.Arrows3D.from_fields(radii=[radius], colors=[palette.rgba(colour)])
+                self._still.send(f"world/{name}", look)
+                self._send_arrows(f"world/{name}", time[at], pairs[at])
         if run.active_region is not None:
             self._send_region(run, run.active_region, first)
         if run.camera is not None:
@@ -201,22 +201,17 @@ class RunStream:
         counts = known.astype(int)
         self._stream.send_columns(path, seconds(run.time[at]), columns.partition(counts))
 
-    def _send_pairs(
+    def _send_arrows(
         self,
         path: str,
-        look: rr.AsComponents,
-        time: Float[np.ndarray, " time"],
-        pairs: Float[np.ndarray, "time 2 3"],
-        at: Int[np.ndarray, " chosen"],
+        time: Float[np.ndarray, " samples"],
+        pairs: Float[np.ndarray, "samples 2 3"],
     ) -> None:
-        """Send lines or arrows between pairs of points, where these are known."""
-        self._still.send(path, look)
-        known = np.isfinite(pairs[at]).all(axis=(1, 2))
-        start, end = pairs[at][known].swapaxes(0, 1)
+        """Send arrows between pairs of points, where these are known."""
+        known = np.isfinite(pairs).all(axis=(1, 2))
+        start, end = pairs[known].swapaxes(0, 1)
         columns = rr.Arrows3D.columns(origins=start, vectors=end - start)
-        if isinstance(look, rr.LineStrips3D):
-            columns = rr.LineStrips3D.columns(strips=list(pairs[at][known]))
-        self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
+        self._stream.send_columns(path, seconds(time), columns.partition(known.astype(int)))
 
     def _send_phases(self, run: RunRecording) -> None:
         new = (*run.phases[self._phases :], *run.remarks[self._remarks :])

@@ -129,7 +129,7 @@ def test_a_preview_writes_a_mapping_that_can_be_corrected(tmp_path):
     map_file.write_text(json.dumps({"colums": {}}))
     status, _, error = hrc("import", path, "--dry-run", "--mapping", map_file)
     assert status == 2
-    assert "map.json: there is no field 'colums' in a mapping file" in error
+    assert "map.json: colums: no such setting; did you mean columns?" in error
 
 
 @pytest.mark.simulation

@@ -148,8 +148,8 @@ def test_each_hindrance_has_its_own_row():
     shown = curves(run_tabs(run))
     np.testing.assert_array_equal(shown["person/followed"].values[:, 0], run.followed)
     reasons = shown["person/hindered"]
-    assert reasons.names == ("joint_limit", "person")
-    for k, name in enumerate(reasons.names):
+    assert reasons.names == ("joint limit", "person")
+    for k, name in enumerate(run.hindered):
         drawn = np.isfinite(reasons.values[:, k])
         np.testing.assert_array_equal(drawn, run.hindered[name])
         assert (reasons.values[drawn, k] == k + 1).all()

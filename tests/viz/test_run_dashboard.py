@@ -107,20 +107,24 @@ def test_the_region_of_the_controller_is_drawn_where_it_changes(tmp_path):
     assert any("region drawn" in text for (text,) in rrd.column("phases", "TextLog:text"))
 
 
-def test_a_line_joins_worker_and_robot_where_they_are_nearest(tmp_path):
+def test_an_arrow_joins_worker_and_robot_where_they_are_nearest(tmp_path):
     nearest = sample_run().worker_nearest.copy()
     nearest[:50] = np.nan
     path = tmp_path / "run.rrd"
     record_run(path, sample_run(worker_nearest=nearest))
     rrd = Rrd(path)
     time = rrd.time("world/worker_distance")
-    lines = rrd.column("world/worker_distance", "LineStrips3D:strips")
+    starts, arrows = (
+        rrd.column("world/worker_distance", f"Arrows3D:{part}")
+        for part in ("origins", "vectors")
+    )
     at = np.searchsorted(sample_run().time, time - 1e-9)
     assert any(at < 50)
-    for k, strips in zip(at, lines, strict=True):
-        assert len(strips) == (k >= 50)
-        for strip in strips:
-            np.testing.assert_allclose(strip, nearest[k], atol=1e-6)
+    for k, start, arrow in zip(at, starts, arrows, strict=True):
+        assert len(start) == len(arrow) == (k >= 50)
+        if len(start):
+            ends = np.array([start[0], np.add(start[0], arrow[0])])
+            np.testing.assert_allclose(ends, nearest[k], atol=1e-6)
 
 
 def test_an_arrow_shows_a_push_while_it_lasts(run, rrd):
