@@ -273,7 +273,15 @@ def write_episode(
     """
     texts, indices = tasks
     number, features = episode_number(path), header.features
-    found = {**values, **index_columns(header.fps, number, frames_before, indices)}
+    frame = np.arange(len(indices))
+    found = {
+        **values,
+        "timestamp": frame / header.fps,
+        "frame_index": frame,
+        "episode_index": np.full_like(frame, number),
+        "index": frame + frames_before,
+        "task_index": indices,
+    }
     shapes = {key: features[key]["shape"] for key in features if key in found}
     own = episode_statistics({k: found[k].reshape(-1, *shape) for k, shape in shapes.items()})
     described = EpisodeDescription(
@@ -359,24 +367,3 @@ def _to_arrow(values: np.ndarray, dtype: str, shape: Sequence[int]) -> pa.Array:
                 flat = pa.ListArray.from_arrays(pa.array(ends, pa.int32()), flat)
             return flat
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
-
-
-def index_columns(
-    fps: float, episode: int, first: int, task_index: Int64[np.ndarray, " _frames"]
-) -> dict[str, np.ndarray]:
-    """LeRobot's index columns of one episode.
-
-    Args:
-        fps: Frame rate [1/s].
-        episode: Episode index.
-        first: Index of its first frame within the dataset.
-        task_index: Task of each frame.
-    """
-    frame = np.arange(len(task_index))
-    return {
-        "timestamp": frame / fps,
-        "frame_index": frame,
-        "episode_index": np.full_like(frame, episode),
-        "index": frame + first,
-        "task_index": task_index,
-    }

@@ -141,11 +141,12 @@ def _check_content(
     report.run(consistency.column_ranges, features)
     report.run(structure_checks.statistics_fit, folder, features)
     report.run(consistency.lengths, [profile.entry for profile in profiles])
-    commands = consistency.command_profiles(folder, columns, profiles)
-    if commands is not None:
-        report.run(consistency.velocity_commands, commands)
-        report.run(consistency.command_tracking, commands)
-        report.run(consistency.command_offsets, commands, features)
+    commanded = [profile for profile in profiles if "command_position" in profile.tracking]
+    if commanded:
+        command, state = (columns.selections[f"{who}_position"] for who in ("command", "joint"))
+        report.run(consistency.velocity_commands, command, commanded, folder.fps)
+        report.run(consistency.command_tracking, command, commanded)
+        report.run(consistency.command_offsets, command, state, commanded, features)
     for feature in features:
         report.run(consistency.sizes, feature)
         for check in CONSISTENCY_CHECKS:

@@ -1,16 +1,14 @@
 """Checks of one episode against the others: sizes, rests, noise, columns and commands."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.issues import Issue, warning
-from hrc_learn.demos.read.columns import ColumnMapping
-from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
     FOLLOWS,
@@ -267,55 +265,18 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
     return np.char.startswith(roles, "quaternion") | (vectors & near_half_turn)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CommandProfiles:
-    """Relation of commands and states in all episodes that have commands."""
+def command_tracking(
+    command: ColumnSelection, profiles: Sequence[EpisodeProfile]
+) -> Iterator[Issue]:
+    """Delays, signs and pairs of commands and states that agree between episodes.
 
-    key: str
-    """Feature of the commands."""
-    names: tuple[str, ...]
-    """Joint of each component."""
-    states: tuple[tuple[str, int], ...]
-    """Column of the state of each component."""
-    fps: float
-    """Frame rate [1/s]."""
-    entries: list[EpisodeEntry]
-    trackings: list[Tracking]
-    """Commands against joint positions, one an episode."""
-    rates: list[Tracking]
-    """Commands against joint rates, of the episodes where positions do not follow at once."""
-
-    @cached_property
-    def fit(self) -> Float64[np.ndarray, " components"]:
-        """Usual R squared of each component."""
-        return _median([tracking.fit for tracking in self.trackings])
-
-
-def command_profiles(
-    folder: DatasetFolder,
-    mapping: ColumnMapping,
-    profiles: Sequence[EpisodeProfile],
-) -> CommandProfiles | None:
-    """Tracking of the commands in all episodes; None without commands."""
-    known = [p for p in profiles if "command_position" in p.tracking]
-    if not known:
-        return None
-    command = mapping.selections["command_position"]
-    return CommandProfiles(
-        key=command.columns[0][0],
-        names=command.labels,
-        states=mapping.selections["joint_position"].columns,
-        fps=folder.fps,
-        entries=[p.entry for p in known],
-        trackings=[p.tracking["command_position"] for p in known],
-        rates=[p.tracking["rates"] for p in known if "rates" in p.tracking],
-    )
-
-
-def command_tracking(commands: CommandProfiles) -> Iterator[Issue]:
-    """Delays, signs and pairs of commands and states that agree between episodes."""
-    trackings, place = commands.trackings, {"key": commands.key, "components": commands.names}
-    follow = commands.fit > FOLLOWS
+    Args:
+        command: Columns of the commands.
+        profiles: Profiles of the episodes that have commands.
+    """
+    trackings = [profile.tracking["command_position"] for profile in profiles]
+    place = {"key": command.columns[0][0], "components": command.labels}
+    follow = _median([tracking.fit for tracking in trackings]) > FOLLOWS
     if not follow.any():
         return
     usual_slope = _median([t.slope for t in trackings])
@@ -326,9 +287,9 @@ def command_tracking(commands: CommandProfiles) -> Iterator[Issue]:
             f"the state moves {-delay:.0f} frames before its command in most episodes: actions "
             f"and states are shifted against each other"
         )
-        yield warning(message=text, key=commands.key)
+        yield warning(message=text, key=place["key"])
     agreement = (np.abs(delays - delay) <= 2).mean()
-    for entry, tracking in zip(commands.entries, trackings, strict=True):
+    for profile, tracking in zip(profiles, trackings, strict=True):
         shift = tracking.delay - delay
         # The own delay must explain far more of the motion than the usual one.
         better = gain_over(tracking, round(delay)) > 0.8
@@ -338,23 +299,33 @@ def command_tracking(commands: CommandProfiles) -> Iterator[Issue]:
                 f"the state comes {tracking.delay} frames after its command, in the other "
                 f"episodes {delay:.0f}: actions were shifted against states"
             )
-            yield entry.fault(text, severity=abs(shift), **place)
+            yield profile.entry.fault(text, severity=abs(shift), **place)
         elif len(trackings) >= FEWEST:
-            found = _component_tracking(tracking, usual_slope, follow, commands.names)
+            found = _component_tracking(tracking, usual_slope, follow, command.labels)
             for text, level in found:
-                yield entry.fault(text, level=level, **place)
+                yield profile.entry.fault(text, level=level, **place)
 
 
 def command_offsets(
-    commands: CommandProfiles, features: Sequence[FeatureProfiles]
+    command: ColumnSelection,
+    state: ColumnSelection,
+    profiles: Sequence[EpisodeProfile],
+    features: Sequence[FeatureProfiles],
 ) -> Iterator[Issue]:
     """Constant distances between command and state at rest, and episodes where they changed.
 
     A leader and a follower that were calibrated differently are such a distance apart.
+
+    Args:
+        command: Columns of the commands.
+        state: Columns of the states that follow them.
+        profiles: Profiles of the episodes that have commands.
+        features: Profiles of all features.
     """
+    place = {"key": command.columns[0][0]}
     spans = {feature.key: feature.median("span") for feature in features}
-    offsets = np.stack([tracking.offset for tracking in commands.trackings])
-    for own, name, (key, index) in zip(offsets.T, commands.names, commands.states, strict=True):
+    offsets = np.stack([profile.tracking["command_position"].offset for profile in profiles])
+    for own, name, (key, index) in zip(offsets.T, command.labels, state.columns, strict=True):
         found = np.flatnonzero(np.isfinite(own))
         # Hands that hold an object, and flags, do not reach their command.
         if not len(found) or key not in spans or is_hand(name):
@@ -366,32 +337,43 @@ def command_offsets(
                 f"{name} rests {usual:.4g} from its command (action minus state) in "
                 f"{len(found)} episodes: leader and follower were calibrated differently?"
             )
-            yield warning(message=text, key=commands.key)
-        for place in found[off > least] if len(found) >= FEWEST else ():
+            yield warning(message=text, **place)
+        for number in found[off > least] if len(found) >= FEWEST else ():
             text = (
-                f"{name} rests {own[place]:.4g} from its command, in the other episodes "
+                f"{name} rests {own[number]:.4g} from its command, in the other episodes "
                 f"{usual:.4g}: its calibration changed?"
             )
-            yield commands.entries[place].warning(text, key=commands.key)
+            yield profiles[number].entry.warning(text, **place)
 
 
-def velocity_commands(commands: CommandProfiles) -> Iterator[Issue]:
-    """Commands that are named like positions but are velocities."""
-    rates, key = commands.rates, commands.key
+def velocity_commands(
+    command: ColumnSelection, profiles: Sequence[EpisodeProfile], fps: float
+) -> Iterator[Issue]:
+    """Commands that are named like positions but are velocities.
+
+    Args:
+        command: Columns of the commands.
+        profiles: Profiles of the episodes that have commands.
+        fps: Frame rate [1/s].
+    """
+    positions, rates = (
+        [p.tracking[name] for p in profiles if name in p.tracking]
+        for name in ("command_position", "rates")
+    )
     if not rates:
         return
     rate_delay, position_delay = (
-        abs(float(np.median([t.delay for t in group]))) / commands.fps
-        for group in (rates, commands.trackings)
+        abs(float(np.median([t.delay for t in group]))) / fps for group in (rates, positions)
     )
     # If both readings fit a smooth motion, the one without a long delay is meant.
     prompt = rate_delay <= PROMPT < position_delay
     fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
+    position_fit, key = _median([t.fit for t in positions]), command.columns[0][0]
     # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
     speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
-    speeds &= (commands.fit < _LOST) | (prompt & (commands.fit < fit))
+    speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
     if speeds.sum() > len(speeds) / 2:
-        names = listed(commands.names, range(len(commands.names)))
+        names = listed(command.labels, range(len(command.labels)))
         text = (
             f"is taken for positions, but follows the velocity of the state with slope "
             f"{float(np.median(slope[speeds])):.2f}: {names}; declare it "
