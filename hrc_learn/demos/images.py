@@ -11,20 +11,12 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from hrc_learn.demos import videos
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH, open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
-from hrc_learn.demos.videos import (
-    CameraImages,
-    Image,
-    Segments,
-    VideoSegment,
-    decode,
-    decode_image,
-    encoded_samples,
-    read_segments,
-)
+from hrc_learn.demos.videos import CameraImages, Image, Segments, VideoSegment
 
 Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]
 """Camera -> RGB images, 0 to 255. In memory, the colours of a pixel are adjacent
@@ -62,7 +54,7 @@ class ImageReader:
         self._folder = path if isinstance(path, DatasetFolder) else open_folder(path)
         self._entries = {entry.index: entry for entry in self._folder.episodes}
         self.cameras = tuple(k for k, f in self._folder.features.items() if f.is_picture)
-        self._segments: dict[int, Segments] = read_segments(self._folder, missing=True)
+        self._segments: dict[int, Segments] = videos.read_segments(self._folder, missing=True)
 
     def available(self, episode: int) -> tuple[str, ...]:
         """Cameras whose images of an episode exist."""
@@ -164,7 +156,7 @@ class ImageReader:
             file = None if segment is None else segment.file
             raise DatasetError("its video is missing", file=file, **place)
         missing = dict.fromkeys(wanted)
-        for frame, image in decode(segment, self._folder.fps, size, wanted):
+        for frame, image in videos.decode(segment, self._folder.fps, size, wanted):
             del missing[frame]
             yield frame, image
         for frame in missing:
@@ -198,7 +190,7 @@ class ImageReader:
         for frame in wanted:
             try:
                 content = column[frame - wanted[0]].as_py()["bytes"]
-                yield frame, decode_image(content, size)
+                yield frame, videos.decode_image(content, size)
             except (DatasetError, KeyError, TypeError) as error:
                 text = "holds an image that cannot be decoded"
                 raise entry.error(text, frame=frame, key=camera) from error
@@ -227,7 +219,7 @@ def camera_images(
         name = camera.removeprefix("observation.images.")
         segment = reader.segment(demo.episode, camera)
         try:
-            encoded = None if segment is None else encoded_samples(segment)
+            encoded = None if segment is None else videos.encoded_samples(segment)
             yield name, encoded or thumbnails(reader, demo, camera)
         except DatasetError as error:
             yield name, error

@@ -13,27 +13,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
-from hrc_learn.store._folder import (
-    MADE_BY,
-    MANIFEST,
-    RESULTS,
-    SUFFIX,
-    Kind,
-    carry_over,
-    delete,
-    delete_entries,
-    entries,
-    holder,
-    is_at,
-    naming,
-    owned_entries,
-    sign,
-    sync_file,
-    sync_folder,
-    sync_tree,
-    try_lock,
-    write_manifest,
-)
+from hrc_learn.store import _folder as disk
+from hrc_learn.store._folder import MADE_BY, MANIFEST, RESULTS, SUFFIX, Kind
 from hrc_learn.store._reading import json_text, read_json
 
 _LOCK, _NEW, _OLD, _OWNED = "lock", "new", "old", "owned.json"
@@ -80,10 +61,10 @@ class Claim:
         self._sync = not any(_is_workspace(parent.name) for parent in self.target.parents)
         self._old = self.workspace / _OLD
         self._owned = self.workspace / _OWNED
-        with naming(self.target):
+        with disk.naming(self.target):
             self._lock = self._acquire(wait)
             try:
-                sign(self._lock)
+                disk.sign(self._lock)
                 self.mended = self.clear()
             except BaseException:
                 with contextlib.suppress(OSError):
@@ -127,13 +108,13 @@ class Claim:
             return
         if not overwrite:
             raise InTheWayError(f"{path} exists: choose another folder, or allow overwriting")
-        owned = owned_entries(path, kind)
+        owned = disk.owned_entries(path, kind)
         if owned is None:
             raise InTheWayError(
                 f"{path} is no {kind.name} of hrc_learn (one has a {MANIFEST}), so it is not "
                 f"ours to overwrite: choose another folder"
             )
-        others = sorted(entries(path) - owned)
+        others = sorted(disk.entries(path) - owned)
         if others and not (foreign or kind.files):
             more = f" and {len(others) - 1} more" if len(others) > 1 else ""
             raise InTheWayError(
@@ -144,10 +125,10 @@ class Claim:
     def commit_file(self, part: Path) -> None:
         """Move a finished file from the workspace to the target."""
         if self._sync:
-            sync_file(part)
+            disk.sync_file(part)
         os.replace(part, self.target)
         if self._sync:
-            sync_folder(self.target.parent)
+            disk.sync_folder(self.target.parent)
 
     def commit(self, kind: Kind, overwrite: bool = False, source: str = "") -> None:
         """Move the finished folder `new` to the target.
@@ -170,14 +151,15 @@ class Claim:
             error.add_note(f"The new content is in {self.set_aside(self.new, 'new')}.")
             raise
         replaces = os.path.lexists(self.target)
-        write_manifest(self.new, kind, source)
+        disk.write_manifest(self.new, kind, source)
         if replaces:
-            owned = owned_entries(self.target, kind) or set()
+            owned = disk.owned_entries(self.target, kind) or set()
             if kind.files:  # after the manifest: carried files stay foreign
-                owned |= carry_over(entries(self.target) - owned, self.target, self.new)
+                foreign = disk.entries(self.target) - owned
+                owned |= disk.carry_over(foreign, self.target, self.new)
             self._owned.write_text(json_text(sorted(owned)), encoding="utf-8")
         if self._sync:
-            sync_tree(self.workspace)
+            disk.sync_tree(self.workspace)
         if replaces:
             self.rename(self.target, self._old)
         try:
@@ -205,7 +187,7 @@ class Claim:
                 done.append(f"{name}: finished an interrupted replacement")
         if os.path.lexists(self._old):
             with contextlib.suppress(OSError, ValueError):  # without a list nothing is ours
-                delete_entries(self._old, map(str, read_json(self._owned, list)))
+                disk.delete_entries(self._old, map(str, read_json(self._owned, list)))
             if os.path.lexists(self._old):
                 kept = self.set_aside(self._old, "kept")
                 warnings.warn(f"{kept} holds the foreign files of {name}", stacklevel=2)
@@ -214,7 +196,7 @@ class Claim:
                 done.append(f"{name}: removed the replaced folder")
         rest = [place for place in self.workspace.iterdir() if place.name != _LOCK]
         for place in rest:
-            delete(place)
+            disk.delete(place)
         if any(place.name == _NEW for place in rest):
             done.append(f"{name}: removed unfinished content")
         return done
@@ -223,8 +205,8 @@ class Claim:
         """Rename between the workspace and its parent folder, and sync both to disk."""
         os.rename(source, target)
         if self._sync:
-            sync_folder(self.target.parent)
-            sync_folder(self.workspace)
+            disk.sync_folder(self.target.parent)
+            disk.sync_folder(self.workspace)
 
     def set_aside(self, place: Path, word: str) -> Path:
         """Give an entry of the workspace a visible name next to the target."""
@@ -244,14 +226,14 @@ class Claim:
             except FileNotFoundError:
                 continue  # the last writer has just removed the workspace
             try:
-                if not try_lock(file):
+                if not disk.try_lock(file):
                     if not wait:
                         raise BusyError(
-                            f"{self.target} is being written by {holder(path)}: wait until "
-                            f"that ends, or choose another place"
+                            f"{self.target} is being written by {disk.holder(path)}: wait "
+                            f"until that ends, or choose another place"
                         )
                     time.sleep(_POLL)
-                elif is_at(file, path):
+                elif disk.is_at(file, path):
                     return file
             except BaseException:
                 file.close()
@@ -352,7 +334,7 @@ def new_file(path: str | os.PathLike[str] | Claim) -> Iterator[Path]:
         InTheWayError: There is a folder of that name.
     """
     if not isinstance(path, Claim) and _is_device(path):
-        with naming(path):
+        with disk.naming(path):
             yield Path(path)  # such as /dev/stdout, which cannot be replaced
         return
     with _claimed(path) as claim:
@@ -452,11 +434,11 @@ def write_json(path: str | Path, content: object) -> None:
 def _claimed(path: str | os.PathLike[str] | Claim) -> Iterator[Claim]:
     """A new claim for the duration of the context, or the given one, which stays held."""
     if not isinstance(path, Claim):
-        with naming(path), Claim(path) as claim:
+        with disk.naming(path), Claim(path) as claim:
             yield claim
         return
     try:
-        with naming(path.target):
+        with disk.naming(path.target):
             yield path
     finally:
         path.clear()
