@@ -85,12 +85,12 @@ def test_files_of_other_origin_are_carried_over_if_it_can_be_extended(
 @pytest.mark.parametrize("made", ["", "extra", "extra/own"])
 def test_foreign_folders_are_carried_over_whatever_the_new_folder_has(tmp_path, made):
     """Also out of a folder that we wrote once and no longer write."""
-    out, plain = tmp_path / "out", Kind(name="plain")
+    out, plain = tmp_path / "out", Kind(name="plain", files=("part",))
     with replacing(out, plain) as folder:
         (folder / "extra").mkdir(parents=True)
     (out / "extra" / "own" / "empty").mkdir(parents=True)
     (out / "extra" / "own" / "mine").write_text("years")
-    with replacing(out, plain, overwrite=True, others="keep") as folder:
+    with replacing(out, plain, overwrite=True) as folder:
         (folder / made).mkdir(parents=True)
     assert contents(tmp_path) == {"out/extra/own/mine": "years"}
     assert (out / "extra" / "own" / "empty").is_dir()
