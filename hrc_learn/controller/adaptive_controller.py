@@ -313,6 +313,7 @@ class AdaptiveController(nn.Module):
         sound = timed & is_number(torch.cat(numbers, dim=-1)).all(-1)
         v, safety, report = self._filtered(state.safety, given, motion, stop, stale | ~sound)
         pose_drift = self._next_drift(state.pose_drift, motion, v, dt, sound, safety)
+        moved = torch.linalg.vecdot(J, v.unsqueeze(-2))
         command = Command(
             joint_velocity=v,
             twist=motion.twist,
@@ -325,7 +326,7 @@ class AdaptiveController(nn.Module):
             weight_norm=torch.linalg.vector_norm(state.estimator.weight, dim=(-2, -1)),
             vision_level=blending.level,
             potential=feedback.potential,
-            potential_rate=law.potential_rate(feedback.s, J, v),
+            potential_rate=torch.linalg.vecdot(feedback.s, moved),
             safety=report,
         )
         if goals.posture is not None:

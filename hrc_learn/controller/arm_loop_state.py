@@ -21,6 +21,9 @@ from hrc_learn.geometry import Pose
 from hrc_learn.protocols import Hindrance
 from hrc_learn.pytree import pytree, static
 
+# Distance by which joints must come nearer not to be stuck [rad]: 1 s of the slowest returns.
+_NEARER = 0.05
+
 
 @dataclass(frozen=True, kw_only=True)
 class ArmLoopConfig(YieldingConfig):
@@ -156,6 +159,25 @@ class PathState:
             held=zero,
             direct_return=DirectReturn.none(joint_position),
         )
+
+    def waiting(
+        self, off: Tensor, counts: Tensor, stuck_after: float, dt: float
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """`waited` and `nearest`, one step later.
+
+        Time in which the path advances is subtracted: a path that stops and starts under
+        repeated pushes is stuck only if it rests for more than half of the time.
+
+        Args:
+            off: Distance of the joints from the path now [rad].
+            counts: False for steps in which the arm is pushed or slowed down by people.
+            stuck_after: Waiting time from which on coming nearer does not count any more [s].
+            dt: Control step [s].
+        """
+        nearer = counts & (off < self.nearest - _NEARER) & (self.waited <= stuck_after)
+        longer = (self.waited + (1.0 - 2.0 * self.rate.clamp(min=0)) * dt).clamp(min=0)
+        waited = torch.where(nearer, 0.0, torch.where(counts, longer, self.waited))
+        return waited, torch.where(nearer | ~counts, off, self.nearest)
 
     @property
     def finished(self) -> Bool[Tensor, "*batch"]:

@@ -5,7 +5,7 @@ All are pytrees of tensors, so a step compiles, exports and maps over batches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -139,16 +139,11 @@ def _index(kind: str) -> int:
     return INTERVENTIONS.index(kind)
 
 
-type ToolRegion = OrientationRegion | AxisRegion | None
-"""Controlled part of the tool's orientation: all of it, its z axis, or nothing."""
-
-_TOOL_REGIONS: dict[TaskSpace, Callable[[Tensor], ToolRegion]] = {
-    "pose": lambda goal: OrientationRegion(goal=goal),
-    "nearest pose": lambda goal: OrientationRegion(goal=goal),
-    "position+axis": lambda goal: AxisRegion(goal=goal),
-    "position": lambda goal: None,
+_TOOL_REGIONS = {
+    "pose": OrientationRegion,
+    "nearest pose": OrientationRegion,
+    "position+axis": AxisRegion,
 }
-
 HALF_SIZE = (0.12, 0.12, 0.08)
 """Half edges of a box that is large enough for the camera to find the marker [m]."""
 # Width and height of the images of the paper's camera [px].
@@ -166,7 +161,7 @@ class Goals:
 
     position: PositionRegion
     """Box for the tool centre point."""
-    orientation: ToolRegion
+    orientation: OrientationRegion | AxisRegion | None
     """Cone for the tool orientation. An `AxisRegion` leaves rotation about its axis free, None
     all rotation: for tasks, and arms, with fewer than six degrees of freedom."""
     vision: VisionRegion
@@ -218,7 +213,7 @@ class Goals:
             target = centre.new_tensor(image_size) / 2
         return cls(
             position=PositionRegion(centre=centre, half_size=centre.new_tensor(half_size)),
-            orientation=_TOOL_REGIONS[task](orientation),
+            orientation=None if task == "position" else _TOOL_REGIONS[task](goal=orientation),
             vision=VisionRegion.inside_image(target, image_size),
             vision_enabled=torch.tensor(enabled, device=centre.device),
         )
@@ -362,8 +357,9 @@ class Command:
     """Sum of the task-space potentials P_v + P_t + P_o: the part of the Lyapunov function
     that does not depend on the true weights."""
     potential_rate: Float[Tensor, "*batch"]
-    """Rate of the potential, predicted with the estimated image Jacobian [1/s]; not positive
-    while no limit or person changes the motion (`feedback.potential_rate`)."""
+    """s^T J u, the rate of the potential predicted with the estimated image Jacobian [1/s]; not
+    positive while no limit or person turns the motion against the task. A measured potential
+    that falls more slowly shows an error of the image Jacobian."""
     safety: SafetyReport
     """Interventions of the safety filter."""
 

@@ -8,7 +8,7 @@ when the path waits for them, and how they return. All of them are batched and s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -42,8 +42,6 @@ _NEAR_AGAIN = 1.4
 # Distances from the path [rad]: joints nearer than the first find back whatever the alignment,
 # which counts in full from the second on.
 _NEARBY = 0.3, 0.5
-# Distance by which joints must come nearer not to be stuck [rad]: 1 s of the slowest returns.
-_NEARER = 0.05
 # Tolerated distance of the end effector from its path [m], and the time by which servos lag
 # [s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
@@ -158,38 +156,6 @@ def push_fraction(
     """
     fade = (alignment - POORLY_ALIGNED) / (WELL_ALIGNED - POORLY_ALIGNED)
     return torch.where(torch.linalg.vecdot(push, null_error) > 0, 1.0, fade.clamp(0.0, 1.0))
-
-
-def waiting_time(
-    waited: Float[Tensor, "*batch"],
-    nearest: Float[Tensor, "*batch"],
-    distance: Float[Tensor, "*batch"],
-    rate: Float[Tensor, "*batch"],
-    counts: Bool[Tensor, "*batch"],
-    stuck_after: float,
-    dt: float,
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Waiting time of a path without progress of the joints, one step later [s].
-
-    Time in which the path advances is subtracted: a path that stops and starts under repeated
-    pushes is stuck only if it rests for more than half of the time.
-
-    Args:
-        waited: Waiting time one step before [s].
-        nearest: Distance of the joints from the path when they last had come nearer [rad].
-        distance: Distance now [rad].
-        rate: Rate of the path, -1 to 1.
-        counts: False for steps in which the arm is pushed or slowed down by people.
-        stuck_after: Waiting time from which on coming nearer does not count any more [s].
-        dt: Control step [s].
-
-    Returns:
-        `waited` and `nearest`, one step later.
-    """
-    nearer = counts & (distance < nearest - _NEARER) & (waited <= stuck_after)
-    longer = (waited + (1.0 - 2.0 * rate.clamp(min=0)) * dt).clamp(min=0)
-    waited = torch.where(nearer, 0.0, torch.where(counts, longer, waited))
-    return waited, torch.where(nearer | ~counts, distance, nearest)
 
 
 def nears_singularity(
@@ -324,10 +290,6 @@ class DirectReturn:
             active=clear.any(0),
             blocked=~clear.any(0),
         )
-
-    def later(self, duration: Float[Tensor, "*batch"]) -> DirectReturn:
-        """The return some time later [s], where it is under way."""
-        return replace(self, time=torch.where(self.active, self.time + duration, self.time))
 
     def joint_position(self) -> Float[Tensor, "*batch n"]:
         """Joint positions to track now [rad]."""

@@ -281,7 +281,6 @@ def kept_clear(
     null: Float[Tensor, "*batch n"],
     clearance: Clearance,
     margin: float,
-    look_ahead: float = LOOK_AHEAD,
 ) -> ClearMotion:
     """Reduce a null-space velocity until the arm keeps its clearance.
 
@@ -293,16 +292,15 @@ def kept_clear(
             that are compared.
         margin: Clearance to keep [m]. Where the task alone leaves less, the null space does
             not reduce it further.
-        look_ahead: Time constant with which the motion comes to rest at the margin [s].
     """
-    ahead = joint_position + look_ahead * (task + _fractions_of(null))
+    ahead = joint_position + LOOK_AHEAD * (task + _fractions_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
     blocked = without < torch.clamp(now, max=margin)
     if bool((every >= margin).all()):
         return ClearMotion(null, blocked, now)
     closing = without - every[2:]
     spare = without - margin
-    sliding = look_ahead * _SLIDING_SPEED * (1.0 + spare / _DEEPEST).clamp(0.0, 1.0)
+    sliding = LOOK_AHEAD * _SLIDING_SPEED * (1.0 + spare / _DEEPEST).clamp(0.0, 1.0)
     allowed = spare.clamp(min=0.0) + sliding
     # Closing grows with the fraction of the motion: scale it down in proportion.
     fractions = _FRACTIONS[1:].to(closing).reshape(-1, *(1 for _ in now.shape))

@@ -230,30 +230,23 @@ class PathLaw:
         if not bool(moves.any()):
             return path
         pushed, zero = state.pushed, torch.zeros_like(path.rate)
-        waited, nearest = joint_path.waiting_time(
-            path.waited,
-            path.nearest,
-            (path.goal - q).norm(dim=-1),
-            path.rate,
-            ~pushed & state.pace.at_full_speed,
-            self.config.back_after,
-            dt,
-        )
+        off, counts = (path.goal - q).norm(dim=-1), ~pushed & state.pace.at_full_speed
+        waited, nearest = path.waiting(off, counts, self.config.back_after, dt)
         waited = torch.where(state.aside, waited, 0.0)
         held = torch.where((path.rate <= 0) & pushed, path.held + dt, 0.0)
         # Joints that found no way back here do so where they left the path.
         backs = (waited > self.config.back_after) & (path.progress > 0)
-        ratio = apply_where(
+
+        def astray(part: tuple[Any, ...]) -> tuple[Tensor, Tensor]:
+            here, there, twist, *motion = part
+            ratio = joint_path.deviation_ratio(here.twist_to(there), twist)
+            return ratio, joint_path.nears_singularity(self.chain, *motion)
+
+        ratio, singular = apply_where(
             state.aside,
-            lambda part: joint_path.deviation_ratio(part[0].twist_to(part[1]), part[2]),
-            (reading.pose, path.pose, path.twist),
-            zero,
-        )
-        singular = apply_where(
-            state.aside,
-            lambda part: joint_path.nears_singularity(self.chain, *part),
-            (q, state.safety.velocity),
-            torch.zeros_like(state.aside),
+            astray,
+            (reading.pose, path.pose, path.twist, q, state.safety.velocity),
+            (zero, torch.zeros_like(state.aside)),
         )
         stops = ~backs & state.aside & (state.lost | path.narrow_ahead | singular)
         ratio = torch.where(path.blocked | stops, torch.inf, ratio)
@@ -286,6 +279,8 @@ class PathLaw:
                 *self._path_limitations(state, reading, path, target, off),
                 *tracked.limitations(),
             )
+        later = direct.time + config.dt * state.pace.speed_override
+        later = torch.where(direct.active, later, direct.time)
         path = replace(
             path,
             followed=~direct.active,
@@ -294,7 +289,7 @@ class PathLaw:
             twist=twist,
             blocked=off.aside & tracked.blocked,
             narrow_ahead=target.narrow_ahead,
-            direct_return=direct.later(config.dt * state.pace.speed_override),
+            direct_return=replace(direct, time=later),
         )
         state = replace(
             state, return_velocity=off.back, aside=off.aside, lost=off.lost, path=path

@@ -574,20 +574,6 @@ def _excess_rate(
     return (speed / allowed).clamp(min=1)
 
 
-def potential_rate(
-    s: Float[Tensor, "*batch 6"],
-    jacobian: Float[Tensor, "*batch 6 n"],
-    joint_velocity: Float[Tensor, "*batch n"],
-) -> Float[Tensor, "*batch"]:
-    """Rate of the potential P_v + P_c predicted by the estimated image Jacobian [1/s].
-
-    A measured potential that falls more slowly shows an error of the image Jacobian. A positive
-    rate shows a motion that a limit or a person has turned against the task.
-    """
-    twist = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))
-    return torch.linalg.vecdot(s, twist)
-
-
 def validated_position(
     observation: Observation, expected: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -32,9 +32,7 @@ class WantedVelocity:
     """Far end of a load in the frame of the tool centre point [m]; None: no load."""
 
 
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class FilteredVelocity:
+class FilteredVelocity(NamedTuple):
     """Command of a velocity step."""
 
     joint_velocity: Float[Tensor, "*batch n"]
@@ -43,9 +41,7 @@ class FilteredVelocity:
     """Interventions of the safety filter."""
 
 
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class VelocityStepState:
+class VelocityStepState(NamedTuple):
     """State of a velocity step."""
 
     safety: SafetyState

@@ -153,7 +153,7 @@ class ComplementaryMotion:
         if self.posture is None or self.joints is None:
             self.posture = self.joints = self._wished()[0]
             moving = torch.from_numpy(np.array(state.joint_velocity, dtype=float))
-            self._state = self._following(moving)
+            self._state = self._loop.initial_state(self.joints, joint_velocity=moving)
             before = self.posture - self._dt * moving
         else:
             before = self.posture
@@ -164,17 +164,13 @@ class ComplementaryMotion:
         else:
             self._go_on(1.0)
             self.joints, self.posture = self._wished()[0], self._wished()[0]
-            self._state = self._following((self.posture - before) / self._dt)
+            velocity = (self.posture - before) / self._dt
+            self._state = self._loop.initial_state(self.joints, joint_velocity=velocity)
         posture, width = self._wished()
         self.offset_velocity = (self.joints - posture - offset) / self._dt
         self.posture = posture
         self._human.tell(self._feedback.told(state, pushed=pushed))
         return self.joints.numpy(), width
-
-    def _following(self, velocity: Float[Tensor, " joints"]) -> ArmLoopState:
-        """State of a loop on the policy's posture, which moves at a velocity [rad/s]."""
-        assert self.joints is not None  # set by the first step
-        return self._loop.initial_state(self.joints, joint_velocity=velocity)
 
     def _take(self, wish: Float[Tensor, " joints"], width: float) -> None:
         """Add a posture of the policy."""

@@ -312,13 +312,19 @@ class Grasping:
         Without such a posture the arm goes home first. The positions of objects on the table
         are unknown so far, so the path avoids the whole region of the objects.
         """
-        postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
-        here, clearance = self._cell.joints, self._size * _PLATE_CLEARANCE
-        for posture in postures:
+        posture = self._via(self._size * _PLATE_CLEARANCE)
+        if posture is None:
+            self.go_home()
+            posture = self._workplace.hover_postures()[0]
+        return posture
+
+    def _via(self, clearance: float | None) -> Float[Tensor, " joints"] | None:
+        """The first posture above the table with free paths from here and to home."""
+        here, home = self._cell.joints, self._workplace.home_joints()
+        for posture in self._workplace.hover_postures():
             if self._free(here, posture, clearance) and self._free(posture, home):
                 return posture
-        self.go_home()
-        return postures[0]
+        return None
 
     def refusal(self, pose: Pose) -> str:
         """Reason why the end effector cannot go to a pose from here; empty if it can.
@@ -396,15 +402,11 @@ class Grasping:
         """
         self._cell.begin_phase("home")
         here, home = self._cell.joints, self._workplace.home_joints()
-        postures = self._workplace.hover_postures()
         # With clearance if any path has it, else without.
         for clearance in (self._size * _PLATE_CLEARANCE, None):
             if self._free(here, home, clearance):
                 break
-            reachable = (
-                q for q in postures if self._free(here, q, clearance) and self._free(q, home)
-            )
-            if (via := next(reachable, None)) is not None:
+            if (via := self._via(clearance)) is not None:
                 self._cell.follow_path(joint_plan(self._cell, here, via).path)
                 break
         self.move_joints(home)

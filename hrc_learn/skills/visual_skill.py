@@ -75,7 +75,7 @@ class MarkerAngle:
             differences.append(_heading(poses[k].orientation) - seen)
         # The mean of angles modulo half turns is half the mean of their doubles.
         offset = float(np.angle(np.exp(2j * np.array(differences)).mean())) / 2
-        off = np.array([_wrapped(d - offset) for d in differences])
+        off = (np.array(differences) - offset + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2
         return cls(offset=offset, spread=float(np.sqrt((off**2).mean())))
 
     def turn(
@@ -127,11 +127,6 @@ def _heading(orientation: Float[Tensor, "4"]) -> float:
     """Heading of a tool's x axis in the horizontal plane [rad]."""
     x, y, _ = quaternion.to_matrix(orientation)[:, 0].tolist()
     return math.atan2(y, x)
-
-
-def _wrapped(angle: float) -> float:
-    """An angle modulo half turns, within a quarter turn of zero [rad]."""
-    return float((angle + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,12 @@
 """Rules for joints that a push has taken off their path."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.controller.arm_loop_state import PathState
 from hrc_learn.controller.joint_path import (
     DirectReturn,
     JointPaths,
@@ -11,7 +14,6 @@ from hrc_learn.controller.joint_path import (
     nears_singularity,
     push_fraction,
     return_alignment,
-    waiting_time,
 )
 from hrc_learn.controller.null_space_motion import YieldingConfig
 from hrc_learn.kinematics import panda
@@ -84,13 +86,13 @@ def test_an_arm_nears_a_singularity_by_the_time_that_its_path_has_stopped(
 def test_a_path_waits_for_joints_as_long_as_they_come_nearer():
     """2 s without 0.05 rad of way; half as long again after time in which it went on."""
     one, dt = torch.ones((), dtype=torch.float64), 0.01
+    still = PathState.none(Q, panda.forward(Q))
 
     def steps(offs, waited=0.0, nearest=torch.inf, rate=0.0, counts=True):
         waited, nearest = waited * one, nearest * one
         for off in offs:
-            waited, nearest = waiting_time(
-                waited, nearest, off * one, rate * one, torch.tensor(counts), 2.0, dt
-            )
+            path = replace(still, waited=waited, nearest=nearest, rate=rate * one)
+            waited, nearest = path.waiting(off * one, torch.tensor(counts), 2.0, dt)
         return float(waited)
 
     slowly, stuck = np.linspace(2.0, 1.0, 600), np.full(100, 1.5)
@@ -101,7 +103,8 @@ def test_a_path_waits_for_joints_as_long_as_they_come_nearer():
     assert steps(stuck[:50], waited=1.0, nearest=1.5, rate=-1.0) == pytest.approx(1.5)
     # Not while somebody pushes, who may push it farther: that is where it comes back from.
     assert steps(stuck, waited=1.0, counts=False) == pytest.approx(1.0)
-    _, nearest = waiting_time(one, 0.5 * one, 2.5 * one, one, torch.tensor(False), 2.0, dt)
+    pushed = replace(still, waited=one, nearest=0.5 * one)
+    _, nearest = pushed.waiting(2.5 * one, torch.tensor(False), 2.0, dt)
     assert steps(np.linspace(2.5, 1.0, 600), nearest=float(nearest)) < 0.5
     # A path that is gone back is gone back to where the joints are on it again.
     assert steps(slowly, waited=2.5, nearest=2.0) > 8.0
