@@ -31,7 +31,6 @@ from hrc_learn.controller.arm_loop_state import (
     FollowPath,
     Limitation,
     PathState,
-    SendCommand,
     TrackPose,
     WantedMotion,
 )
@@ -176,8 +175,8 @@ class ArmLoop:
 
         Arguments and results are those of `step`; the state is that of `observe`.
         """
-        if isinstance(request, SendCommand):
-            return self._send(state, reading, request.command)
+        if isinstance(request, Command):
+            return self._send(state, reading, request)
         if isinstance(request, FollowPath):
             wanted, state = self._law.follow(state, reading, request)
         elif isinstance(request, TrackPose):

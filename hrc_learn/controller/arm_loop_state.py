@@ -18,6 +18,7 @@ from hrc_learn.controller.joint_path import DirectReturn, JointPaths
 from hrc_learn.controller.null_space_motion import YieldingConfig
 from hrc_learn.controller.task_pace import TaskPace, WayMakingConfig
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import Hindrance
 from hrc_learn.pytree import pytree, static
 
@@ -53,8 +54,7 @@ class ArmLoopConfig(YieldingConfig):
     both; None: a person's push."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.speed <= 1:
-            raise ValueError(f"speed must be in (0, 1], but is {self.speed}.")
+        check_settings(self, fraction=["speed"])
 
 
 @pytree
@@ -237,13 +237,8 @@ class MoveJoints:
     """Joint velocity [rad/s]."""
 
 
-class SendCommand(NamedTuple):
-    """Request to send a command of the adaptive controller, which has its own safety filter."""
-
-    command: Command
-
-
-type ArmRequest = FollowPath | TrackPose | MoveJoints | SendCommand
+type ArmRequest = FollowPath | TrackPose | MoveJoints | Command
+"""Request of a task; a command of the adaptive controller has passed its own safety filter."""
 
 
 class Limitation(NamedTuple):

@@ -387,12 +387,10 @@ def constrained_velocity(
     return u.to(dtype), report
 
 
-def _unit_cost_directions(
-    jacobian: Float[Tensor, "*batch m n"],
-    task: Float[Tensor, "*batch n"],
-    config: ConstraintConfig,
-) -> Float[Tensor, "*batch directions n"]:
-    """Joint velocities of one unit of cost each: m off the path, one along it, null space."""
+def _unit_cost_directions(jacobian: Tensor, task: Tensor, config: ConstraintConfig) -> Tensor:
+    """Joint velocities of one unit of cost each (directions, n): m off the path, one along it,
+    null space.
+    """
     m = jacobian.shape[-2]
     basis = orthonormal_basis(jacobian).mT
     null, path = basis[..., m:, :], task.unsqueeze(-2)
@@ -403,14 +401,10 @@ def _unit_cost_directions(
 
 
 def _limit_rows(
-    basis: Float[Tensor, "*batch directions n"],
-    gradient: Float[Tensor, "*batch pairs n"] | None,
-    m: int,
-    config: ConstraintConfig,
-) -> Float[Tensor, "*batch unknowns limits"]:
-    """Columns of `least_change`: limits of the joints, of the task, of the distances.
-
-    The last unknown is the common excess of the distances.
+    basis: Tensor, gradient: Tensor | None, m: int, config: ConstraintConfig
+) -> Tensor:
+    """Columns of `least_change` (unknowns, limits): limits of the joints, of the task, of the
+    distances. The last unknown is the common excess of the distances.
     """
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
     slower = torch.zeros_like(joints[..., :1])

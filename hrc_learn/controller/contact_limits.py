@@ -96,10 +96,8 @@ class ContactConfig:
     """Mass of an object in the gripper, at the tool centre point [kg]."""
 
     def __post_init__(self) -> None:
-        masses = "rotor_inertia", "load"
-        check_settings(self, positive=("area", "padding", "used"), not_negative=masses)
-        if self.used > 1:
-            raise ValueError(f"used must be at most 1, but is {self.used}")
+        surface, masses = ("area", "padding"), ("rotor_inertia", "load")
+        check_settings(self, positive=surface, not_negative=masses, fraction=["used"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,9 +78,8 @@ class SafetyConfig:
             positive=("rate", "tcp_speed"),
             not_negative=("margin", "delay"),
             below_one=("velocity_margin", "jitter"),
+            fraction=["braking"],
         )
-        if not 0 < self.braking <= 1:
-            raise ValueError(f"braking must be in (0, 1], but is {self.braking}")
 
     @property
     def longest_step(self) -> float:

@@ -277,14 +277,11 @@ class SafetyFilter(nn.Module):
                 "distances are kept by SafetyConfig.constraints, which is None: set it to a "
                 "ConstraintConfig"
             )
-        if jacobian is None and self.config.constraints is not None:
+        constrained = self.config.constraints is not None
+        if jacobian is None and (constrained or human_distance is not None):
             raise ValueError(
-                "constraints find the null space by the Jacobian of the tool: pass jacobian"
-            )
-        if jacobian is None and human_distance is not None:
-            raise ValueError(
-                "human_distance limits the speed of the tool, which needs its Jacobian: pass "
-                "jacobian as well"
+                "constraints find the null space, and human_distance limits the speed of the "
+                "tool, by its Jacobian: pass jacobian as well"
             )
 
     def _validated(

@@ -51,6 +51,7 @@ def check_settings(
     positive: Iterable[str] = (),
     not_negative: Iterable[str] = (),
     below_one: Iterable[str] = (),
+    fraction: Iterable[str] = (),
 ) -> None:
     """Check that settings are in their ranges; NaN is in none.
 
@@ -59,6 +60,7 @@ def check_settings(
         positive: Names of those that must be positive.
         not_negative: Names of those that must be zero or positive.
         below_one: Names of those that must be in [0, 1).
+        fraction: Names of those that must be in (0, 1].
 
     Raises:
         ValueError: A setting is not in its range.
@@ -67,6 +69,7 @@ def check_settings(
         (positive, "must be positive", lambda x: x > 0),
         (not_negative, "must not be negative", lambda x: x >= 0),
         (below_one, "must be in [0, 1)", lambda x: 0 <= x < 1),
+        (fraction, "must be in (0, 1]", lambda x: 0 < x <= 1),
     )
     for names, rule, holds in rules:
         for name in names:

@@ -19,7 +19,6 @@ from hrc_learn.controller.arm_loop_state import (
     ArmRequest,
     FollowPath,
     MoveJoints,
-    SendCommand,
     TrackPose,
 )
 from hrc_learn.controller.joint_path import JointPaths, changed_rate, deviation_ratio
@@ -275,7 +274,7 @@ class WorkCell:
             explained: Tell the person what the safety filter takes from a push.
             columns: Columns of the controller for the log.
         """
-        self._act(SendCommand(command), explained=explained, region=region, columns=columns)
+        self._act(command, explained=explained, region=region, columns=columns)
 
     def track_pose(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
         """One step of tracking a moving pose; the null space yields to the person.

@@ -102,7 +102,7 @@ class TestTheLaw:
             rate = (J @ J.mT @ command.xi_x).norm() / (10**2 + 30**2) ** 0.5
             assert rate <= 4.1
 
-    def test_goals_and_target_come_with_the_observation(self):
+    def test_goals_come_with_the_observation(self):
         elsewhere = self.controller.goals.moved_to(CENTRE + 0.3).with_vision(False)
         command, _ = self.controller.step(self.state, observe(self.q, goals=elsewhere))
         expected = elsewhere.position.gradient(panda.forward(self.q).position)
@@ -110,7 +110,9 @@ class TestTheLaw:
         assert (command.xi_x == 0).all()
         assert command.vision_level == 0
         target = torch.tensor([900.0, 300.0], dtype=DOUBLE)
-        command, _ = self.controller.step(self.state, observe(self.q, target=target))
+        vision = replace(self.controller.goals.vision, target=target)
+        aimed = replace(self.controller.goals, vision=vision)
+        command, _ = self.controller.step(self.state, observe(self.q, goals=aimed))
         assert (command.xi_x * (700 - target) > 0).all()
 
     def test_the_module_is_not_changed_by_a_step(self):

@@ -144,17 +144,17 @@ def test_a_person_moves_the_elbow_and_not_the_tool():
 def test_what_is_nan_for_a_while_spoils_no_state():
     """Estimators keep what they learned, the arm comes back to its target; an arm for each
     field that may be NaN."""
-    broken = ("target", "image_joint_position", "joint_position")
+    broken = ("image_joint_position", "joint_position")
     rng = sampling.generator(17)
     camera = overhead_camera()
-    target = target_in(camera, rng=rng)[0].expand(3, 2)
+    target = target_in(camera, rng=rng)[0]
     estimator = CompositeEstimator(network(camera.image_jacobian(Pose(CENTRE, DOWN))))
-    controller = AdaptiveController(panda, estimator, Goals.at(CENTRE, DOWN, target[0]))
-    q = POSTURE.expand(3, 7)
+    controller = AdaptiveController(panda, estimator, Goals.at(CENTRE, DOWN, target))
+    q = POSTURE.expand(2, 7)
     state = controller.initial_state(q)
     for k in range(300):
         feature, visible = camera.project(panda.forward(q))
-        fields = {"target": target, "image_joint_position": q, "joint_position": q}
+        fields = {"image_joint_position": q, "joint_position": q}
         if 100 <= k < 140:
             for arm, name in enumerate(broken):
                 fields[name] = fields[name].clone()
