@@ -72,11 +72,6 @@ class PickPlaceJob(GraspJob):
     span: tuple[float, float] = (0.0, 0.0)
     """Start and end [s]."""
 
-    @property
-    def delivered(self) -> bool:
-        """True if the object was released at its shelf, as far as the robot can sense it."""
-        return self.release is not None and not self.failure
-
 
 type Phase = Callable[[PickPlaceJob], Phase | None]
 """Phase of a job, which returns the next one; None: the job is over."""
