@@ -10,7 +10,7 @@ from bare_arm import bare
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm, ArmChoice, LinkCapsule, panda
-from hrc_learn.sim import ArmModelConfig, World
+from hrc_learn.sim import ArmModelConfig, SceneConfig, World
 from hrc_learn.sim.arm_model import add_arm, whole_arm
 from hrc_learn.sim.recorded_world import DrawnWorld
 from hrc_learn.sim.workplace import Workplace
@@ -53,6 +53,32 @@ def test_a_joint_that_slides_slides_in_mujoco_too():
         tool = data.site("tcp")
         np.testing.assert_allclose(tool.xpos, T[:3, 3], atol=1e-9)
         np.testing.assert_allclose(tool.xmat.reshape(3, 3), T[:3, :3], atol=1e-9)
+
+
+def test_a_small_hand_is_a_small_copy_of_the_franka_hand():
+    large, small = (
+        World(SceneConfig(arm=ArmModelConfig(robot=bare().with_hand(size))))
+        for size in (1.0, 0.7)
+    )
+    for name in ("finger_left", "finger_right", "finger_left_pad", "finger_right_pad"):
+        one, other = large.model.geom(name), small.model.geom(name)
+        np.testing.assert_allclose(other.size, 0.7 * one.size)
+        np.testing.assert_allclose(other.pos, 0.7 * one.pos)
+    for name in ("finger_left", "finger_right"):
+        one, other = large.model, small.model
+        np.testing.assert_allclose(other.body(name).pos, 0.7 * one.body(name).pos)
+        np.testing.assert_allclose(
+            other.actuator(name).forcerange, 0.7 * one.actuator(name).forcerange
+        )
+    widths = []
+    for world in (large, small):
+        world.arm.move(1.0)
+        world.advance(1.0)
+        widths.append(world.arm.read().gripper_width)
+        world.reset(world.arm.robot.ready.numpy(), gripper_width=1.0)
+        assert world.arm.read().gripper_width == pytest.approx(widths[-1], abs=1e-3)
+    # The Franka hand opens by 80 mm.
+    assert widths == pytest.approx([0.08, 0.056], abs=1e-3)
 
 
 def test_it_holds_its_posture_and_follows_a_velocity(robot):
