@@ -9,7 +9,7 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.geometry import minimum_jerk
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.kinematics.registry import arm
 from hrc_learn.learning import fit_primitives
 from hrc_learn.learning.fitted_model import FittedModel, Target, arm_for
@@ -133,6 +133,19 @@ def test_what_is_too_fast_takes_longer_and_says_why(models):
     assert 0.9 * 0.3 < beyond("panda", motion.joints) <= 1 + 1e-6
     # Its spring pulls it towards a distant goal: 1.2 rad take 4.4 s at 7.5 rad/s^2.
     assert 0.5 < motion.time[-1] < 6.0
+
+
+def test_a_goal_out_of_reach_is_refused_with_a_place_on_the_way_to_it(models):
+    goal = 4 * np.array(GOALS["panda"])
+    with pytest.raises(UnreachableError, match="does not reach the path") as refused:
+        moved(models["panda"], "panda", at(goal))
+    found = re.search(r"\((.*)\) m", str(refused.value))
+    assert found is not None
+    place = torch.tensor([float(x) for x in found[1].split(",")]).double()
+    # The motion leaves its reach on the way, neither at its start nor only at its goal.
+    start = panda.forward(panda.ready).position
+    way = float((place - start).norm())
+    assert 0.1 < way < 0.8 * float((torch.from_numpy(goal) - start).norm())
 
 
 def test_a_path_without_an_arm_is_the_models_own(models):
