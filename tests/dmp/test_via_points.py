@@ -64,6 +64,16 @@ def test_within_a_window_all_else_is_unchanged():
     assert bent.rollout(time=[1.5]).position[0, 0].item() == pytest.approx(0.9, abs=1e-10)
 
 
+def test_a_window_ends_where_the_motion_ends():
+    dmp = JointDMP.fit(*arm_motion(n_joints=2))
+    for wide, same in (((0.9, 10.0), (0.9, 3.0)), ((-1.0, 2.1), (0.0, 2.1))):
+        one, other = (
+            dmp.condition([1.5], [[0.9, NAN]], within=within).rollout(time=DENSE).position
+            for within in (wide, same)
+        )
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
+
+
 def flat(n_basis):
     """Nothing but the change is left of its motion."""
     return JointDMP.fit(DENSE, torch.zeros_like(DENSE), n_basis=n_basis)
