@@ -113,7 +113,7 @@ def test_hostile_streams_keep_all_limits(arm, constraints):
 def test_streams_that_know_of_no_tightening_break_it():
     """The check finds what it is there to find."""
     flat = replace(fr3.limits, velocity_offset=None, deceleration=None)
-    config = StreamConfig(count=24, ticks=600)
+    config = StreamConfig(count=24, ticks=300)
     sent = hostile_streams(config, SafetyFilter(flat))
     watch = LimitMonitor(fr3.limits, torch.zeros(24, 7, dtype=torch.float64), config.dt)
     broken = torch.stack(

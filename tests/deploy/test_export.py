@@ -101,6 +101,14 @@ class TestCompiled:
         assert compiled.stat().st_mtime_ns == built
         assert list(compiled.parents[1].iterdir()) == [compiled.parent]
 
+    def test_it_is_kept_in_the_cache_of_the_user(
+        self, observed, compiled, tmp_path, monkeypatch
+    ):
+        (tmp_path / "hrc_learn").symlink_to(compiled.parents[1])
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        name = compiled.relative_to(compiled.parents[1])
+        assert export_step(*observed) == tmp_path / "hrc_learn" / name
+
     def test_it_opens_within_a_tenth_of_a_second(self, observed, compiled):
         seconds = []
         for _ in range(5):
