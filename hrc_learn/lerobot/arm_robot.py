@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from lerobot.robots import Robot, RobotConfig
-from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+from lerobot.utils.errors import DeviceNotConnectedError
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
@@ -61,30 +62,25 @@ class Device:
     def configure(self) -> None:
         """Nothing to do."""
 
+    @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
         """Open the device.
 
         Raises:
             DeviceAlreadyConnectedError: It is open already.
         """
-        if self._connected:
-            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
         self._open()
         self._connected = True
 
+    @check_if_not_connected
     def disconnect(self) -> None:
         """Close the device.
 
         Raises:
             DeviceNotConnectedError: It is not open.
         """
-        self._need_connection()
         self._connected = False
         self._close()
-
-    def _need_connection(self) -> None:
-        if not self._connected:
-            raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
 
     @abstractmethod
     def _open(self) -> None:
@@ -281,8 +277,8 @@ class ArmRobot(Device, Robot):
             self._invite(self._person_config)
         connected_robots().append(self)
 
+    @check_if_not_connected
     def disconnect(self) -> None:
-        self._need_connection()
         self._loop.end()
         connected_robots().remove(self)
         if self.complement is not None:
@@ -290,8 +286,8 @@ class ArmRobot(Device, Robot):
             self._person.close()
         super().disconnect()
 
+    @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:
-        self._need_connection()
         state, names = self.arm.read(), self._names
         self._state = state
         values = self.values.observed(state, names, self._rotation)
@@ -306,8 +302,8 @@ class ArmRobot(Device, Robot):
                 values |= zip(self.person_names, map(float, values_of_person), strict=True)
         return values
 
+    @check_if_not_connected
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        self._need_connection()
         self._judge()
         where, width = self.values.target_of(action)
         joints = self.servo.joints_at(where) if isinstance(where, Pose) else where
@@ -356,9 +352,9 @@ class ArmRobot(Device, Robot):
         """The simulated world that it is in; None for a real one."""
         return None
 
+    @check_if_not_connected
     def read_state(self) -> ArmState:
         """Latest reading of the arm, for teleoperators."""
-        self._need_connection()
         return self._seen(self.arm.read())
 
     def clearance(

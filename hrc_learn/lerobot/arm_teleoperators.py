@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+from lerobot.utils.decorators import check_if_not_connected
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.kinematics import Arm, panda
@@ -145,8 +146,8 @@ class ArmExpert(ArmTeleoperator):
     config_class = ArmExpertConfig
     name = "arm_expert"
 
+    @check_if_not_connected
     def get_action(self) -> dict[str, float]:
-        self._need_connection()
         robot = self._find()
         if not isinstance(robot, MujocoArmRobot):
             raise ValueError(
@@ -201,8 +202,8 @@ class ArmPage(ArmTeleoperator):
         super()._close()
         self._shown.close()
 
+    @check_if_not_connected
     def get_action(self) -> dict[str, float]:
-        self._need_connection()
         robot = self._find()
         if robot.work_arm is not self._arm:
             self._shown.close()

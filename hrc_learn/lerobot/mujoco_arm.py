@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 from lerobot.robots import RobotConfig
+from lerobot.utils.decorators import check_if_not_connected
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
@@ -218,8 +219,8 @@ class MujocoArmRobot(ArmRobot):
     def _close(self) -> None:
         self.cameras = {}
 
+    @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:
-        self._need_connection()
         self._begin_anew_in_time()
         values = super().get_observation()
         if self.config.pixels:
@@ -256,8 +257,8 @@ class MujocoArmRobot(ArmRobot):
             self.begin(self.run.seed + 1)
             self._began = now
 
+    @check_if_not_connected
     def disconnect(self) -> None:
-        self._need_connection()
         if self.config.episode_time and self.run.commands:
             self._warn_of_half_an_episode()
         super().disconnect()

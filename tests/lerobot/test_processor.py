@@ -161,19 +161,13 @@ def test_two_robots_of_one_checkpoint_do_not_see_each_other(checkpoint):
     torch.testing.assert_close(move_second(-here), -here)
 
 
-def test_a_step_that_is_gone_is_no_longer_asked():
+def test_a_step_takes_the_watch_built_before_it_if_it_still_exists():
     watch = WatchStateStep()
-    smooth = SmoothActionsStep(**SETTINGS)
-    assert smooth.watch is watch
+    assert SmoothActionsStep(**SETTINGS).watch is watch
+    assert SmoothActionsStep(**SETTINGS).watch is None
+    watch = WatchStateStep()
     del watch
     gc.collect()
-    assert smooth.watch is None
-
-
-def test_steps_find_each_other_built_in_either_order():
-    smooth = SmoothActionsStep(**SETTINGS)
-    watch = WatchStateStep()
-    assert smooth.watch is watch
     assert SmoothActionsStep(**SETTINGS).watch is None
 
 

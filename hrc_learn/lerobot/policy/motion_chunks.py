@@ -276,19 +276,6 @@ class MotionChunk:
     """Values of the columns that jump."""
     actions: Float[Tensor, "B samples A"]
 
-    def after(self, steps: Int[Tensor, "B"]) -> "MotionChunk":
-        """Remainder after a number of actions; stands still beyond the end."""
-        samples = self.states.shape[1]
-        index = steps[:, None] + torch.arange(samples, device=steps.device)
-        over = index > samples - 1
-        index = index.clamp(max=samples - 1)
-        row = torch.arange(len(steps), device=steps.device)[:, None]
-        states = self.states[row, index].clone()
-        states[:, :, 1:] = torch.where(over[..., None, None], 0.0, states[:, :, 1:])
-        return MotionChunk(
-            states=states, stepped=self.stepped[row, index], actions=self.actions[row, index]
-        )
-
 
 class ContinuedMotion:
     """Motion executed across chunks, C2 for any plan.
@@ -315,12 +302,20 @@ class ContinuedMotion:
         """Forget the motion that is under way."""
         self.chunk = None
 
-    def after(self, steps: int) -> MotionChunk | None:
-        """Remainder after a number of actions of the last chunk."""
+    def after(self, steps: int | Int[Tensor, "B"]) -> MotionChunk | None:
+        """Remainder of the last chunk after some actions; it stands still beyond the end."""
         if self.chunk is None:
             return None
         states = self.chunk.states
-        return self.chunk.after(torch.full((len(states),), steps, device=states.device))
+        row = torch.arange(len(states), device=states.device)[:, None]
+        ahead = torch.arange(self.decoder.samples, device=states.device)
+        index = ahead + torch.as_tensor(steps, device=states.device).reshape(-1, 1)
+        over = index > self.decoder.samples - 1
+        index = index.clamp(max=self.decoder.samples - 1)
+        states = states[row, index].clone()
+        states[:, :, 1:] = torch.where(over[..., None, None], 0.0, states[:, :, 1:])
+        stepped, actions = self.chunk.stepped[row, index], self.chunk.actions[row, index]
+        return MotionChunk(states=states, stepped=stepped, actions=actions)
 
     def nearest(self, position: Float[Tensor, "B D"]) -> MotionChunk | None:
         """Remainder from the action of the last chunk that is nearest to a position.
@@ -330,7 +325,7 @@ class ContinuedMotion:
         if self.chunk is None:
             return None
         off = self.chunk.states[:, 1:, 0] - position[:, None]
-        return self.chunk.after(off.square().sum(-1).argmin(1) + 1)
+        return self.after(off.square().sum(-1).argmin(1) + 1)
 
     def left_over(self, actions: Float[Tensor, "*one n A"]) -> MotionChunk | None:
         """Continuation of the last chunk from the first of its actions that are left over.

@@ -85,7 +85,7 @@ class WatchStateStep(ProcessorStep):
 
     # LeRobot builds a policy's processors from two files, first the one with this step, and
     # gives neither to the other. So the next step to be built that smooths takes the newest,
-    # once: steps that are built for another robot later do not.
+    # if it still exists, once: steps that are built for another robot later do not.
     _newest: ClassVar[weakref.ref[Any] | None] = None
 
     def __post_init__(self) -> None:
@@ -127,6 +127,7 @@ class SmoothActionsStep(ProcessorStep):
 
     Attributes:
         limits: Limits of the actions.
+        watch: Step that reports the robot's state, built before; None: there is none.
         changes: Report of changes since the last reset.
     """
 
@@ -140,19 +141,11 @@ class SmoothActionsStep(ProcessorStep):
         self.limits = parse_json(text, ActionLimits, "limits of smooth actions")
         self._filter = self.limits.motion_filter(1.0 / self.limits.fps)
         self._columns = np.array(self.limits.state_columns)
-        self._watch: weakref.ref[WatchStateStep] | None = None
-        _ = self.watch
+        self.watch = WatchStateStep.take_newest()
         self.changes = Changes(self.limits.names)
         self._state: MotionState | None = None
         self._chunk: np.ndarray | None = None
         weakref.finalize(self, _log, self.changes)
-
-    @property
-    def watch(self) -> WatchStateStep | None:
-        """The step that reports the robot's state; None: there is none."""
-        if self._watch is None and (step := WatchStateStep.take_newest()) is not None:
-            self._watch = weakref.ref(step)
-        return None if self._watch is None else self._watch()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         action = transition.get(TransitionKey.ACTION)
