@@ -212,8 +212,6 @@ def smooth(args: Smooth) -> None:
         return
     if args.dataset is None:
         raise ValueError("give --dataset: the limits are those of its demonstrators.")
-    if not args.scale > 0:
-        raise ValueError(f"--scale must be positive, got {args.scale}")
     limits = gathered_limits(
         args.dataset,
         scale=args.scale,

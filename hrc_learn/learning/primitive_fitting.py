@@ -1,7 +1,7 @@
 """Movement primitives of demonstrations by channel: each one, their mean, or a streamed fit."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -115,13 +115,9 @@ class Motions:
             joint_unit=demos.joint_unit,
         )
 
-    def available(self) -> tuple[str, ...]:
-        """Channels whose columns were recorded."""
-        return tuple(
-            channel
-            for channel, columns in CHANNELS.items()
-            if all(getattr(self.demos, column) is not None for column in columns)
-        )
+    def missing(self, channel: str) -> list[str]:
+        """Columns of a channel that were not recorded."""
+        return [name for name in CHANNELS[channel] if getattr(self.demos, name) is None]
 
     def column(self, name: str) -> Tensor:
         """Column of all demonstrations, (demos, frames, components)."""
@@ -143,7 +139,7 @@ class Motions:
         """Fit one primitive to each demonstration.
 
         Args:
-            channel: One of `available()`.
+            channel: Channel whose columns were recorded.
             n_basis: Number of basis functions.
             options: Fields of `FitOptions`.
         """
@@ -161,8 +157,7 @@ class Motions:
 
     def require(self, channel: str) -> None:
         """Raise ValueError unless the columns of a channel were recorded."""
-        missing = [name for name in CHANNELS[channel] if getattr(self.demos, name) is None]
-        if missing:
+        if missing := self.missing(channel):
             raise ValueError(
                 f"{self.source}: the demonstrations have no {' and no '.join(missing)}, which "
                 f"channel {channel!r} needs. hrc check lists the columns."
@@ -220,7 +215,7 @@ def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
         motions.require(channel)
     if wanted:
         return tuple(wanted)
-    available = motions.available()
+    available = [channel for channel in CHANNELS if not motions.missing(channel)]
     if not available:
         raise ValueError(
             f"{motions.source}: the demonstrations hold neither joint positions nor "
@@ -244,8 +239,6 @@ class FittedPrimitives:
     """Number of basis functions."""
     selection: BasisSelection | None = None
     """Selection of the number of basis functions; None if it was given."""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the fit."""
 
     def save(self, folder: Path, each: bool = False) -> None:
         """Write the mean primitives to `folder/CHANNEL`.
@@ -316,7 +309,6 @@ def fit_primitives(
         common={channel: mean_primitive(cast(Any, each[channel])) for channel in channels},
         n_basis=n_basis,
         selection=selection,
-        options=options,
     )
 
 

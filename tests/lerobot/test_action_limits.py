@@ -265,5 +265,5 @@ def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
     for arguments in ({"dataset": dataset}, {"limits": file, "remove": True}):
         with pytest.raises(ValueError, match="give --checkpoint"):
             smooth(Smooth(**arguments))
-    with pytest.raises(ValueError, match="--scale must be positive"):
+    with pytest.raises(ValueError, match="scale must be positive"):
         smooth(Smooth(dataset=dataset, limits=file, scale=0.0))

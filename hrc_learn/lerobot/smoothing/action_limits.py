@@ -75,21 +75,15 @@ class ActionLimits:
 
     def positions(self) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, " D"]]:
         """Lowest and highest positions; infinite where there is no limit."""
-        low = [-math.inf if x is None else x for x in self.lower]
-        high = [math.inf if x is None else x for x in self.upper]
-        return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+        low, high = (np.array(ends, dtype=np.float64) for ends in (self.lower, self.upper))
+        return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
     def motion_filter(self, dt: float) -> MotionFilter:
         """Filter that keeps positions, dt [s] apart, within these limits."""
         lower, upper = self.positions()
-        return MotionFilter(
-            dt,
-            velocity=np.array(self.velocity, dtype=np.float64),
-            acceleration=np.array(self.acceleration, dtype=np.float64),
-            jerk=np.array(self.jerk, dtype=np.float64),
-            lower=lower,
-            upper=upper,
-        )
+        rates = ("velocity", "acceleration", "jerk")
+        limits = {name: np.array(getattr(self, name), dtype=np.float64) for name in rates}
+        return MotionFilter(dt, lower=lower, upper=upper, **limits)
 
     def within(
         self, ranges: Mapping[str, Range], velocities: Mapping[str, float] | None = None
