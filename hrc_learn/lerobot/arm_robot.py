@@ -22,7 +22,7 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.lerobot.arm_values import DOWN, GRIPPER, HAND, ActionSpace, ArmValues
-from hrc_learn.lerobot.person import Person, PersonConfig
+from hrc_learn.lerobot.person import PersonConfig, RobotPage, open_device
 from hrc_learn.protocols import Arm, ArmState
 from hrc_learn.teleoperation.demonstration_recorder import RecordingQuality, pressed
 
@@ -231,6 +231,7 @@ class ArmRobot(Device, Robot):
     """
 
     complement: ComplementaryMotion | None = None
+    _page: RobotPage | None = None
 
     def __init__(self, config: ArmRobotConfig, work_arm: ArmModel):
         super().__init__(config)
@@ -281,9 +282,10 @@ class ArmRobot(Device, Robot):
     def disconnect(self) -> None:
         self._loop.end()
         connected_robots().remove(self)
-        if self.complement is not None:
-            self.complement = None
-            self._person.close()
+        self.complement = None
+        if self._page is not None:
+            self._page.close()
+            self._page = None
         super().disconnect()
 
     @check_if_not_connected
@@ -368,11 +370,11 @@ class ArmRobot(Device, Robot):
         from hrc_learn.controller.null_space_motion import YieldingConfig, guided_elbow_speed
         from hrc_learn.skills.complementary_motion import ComplementaryMotion
 
-        self._person = Person(config, self.work_arm)
+        human, self._page = open_device(config, self.work_arm)
         elbow_speed = guided_elbow_speed(self.servo.config.safety.tcp_speed)
         self.complement = ComplementaryMotion(
             self.work_arm.chain,
-            self._person,
+            human,
             self.dt,
             self.servo.limits,
             YieldingConfig(after_push=config.after_push, elbow_speed=elbow_speed),
@@ -393,7 +395,8 @@ class ArmRobot(Device, Robot):
             if isinstance(where, Pose) and complement.posture is not None:
                 joints = joints_near(self.work_arm.chain, where, complement.posture).numpy()
             joints, width = complement.next(self.arm.read(), joints, width)
-        self._person.show(self.arm, self.world)
+        if self._page is not None:
+            self._page.show(self.arm, self.world)
         return joints, width
 
     def _seen(self, state: ArmState) -> ArmState:

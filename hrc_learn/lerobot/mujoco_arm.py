@@ -19,7 +19,7 @@ from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
 from hrc_learn.lerobot.arm_values import DOWN, MARKER, OBJECT, PIXELS
-from hrc_learn.lerobot.person import PersonConfig
+from hrc_learn.lerobot.person import PersonConfig, scripted_person
 from hrc_learn.protocols import Arm
 from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
 
@@ -191,7 +191,12 @@ class MujocoArmRobot(ArmRobot):
 
     def _invite(self, config: PersonConfig) -> None:
         super()._invite(config)
-        self._person.begin(self.run.seed)
+        self._pull_from(self.run.seed)
+
+    def _pull_from(self, seed: int) -> None:
+        """Let a scripted person pull as drawn from a seed."""
+        if self.complement is not None and self.config.person.kind == "scripted":
+            self.complement.human = scripted_person(self.work_arm.chain, seed)
 
     def _open(self) -> None:
         from hrc_learn.sim import CameraChange, Imperfections
@@ -284,7 +289,7 @@ class MujocoArmRobot(ArmRobot):
         self._looked = 0.0
         if self.complement is not None:
             self.complement.restart()
-            self._person.begin(seed)
+        self._pull_from(seed)
         self.initial_configurations += 1
         self._rotation = DOWN
 

@@ -11,7 +11,7 @@ import numpy as np
 from hrc_learn.controller.contact_limits import PersonMode
 from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import Arm as Driver
-from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
+from hrc_learn.protocols import Human
 
 if TYPE_CHECKING:
     from hrc_learn.sim import World
@@ -124,63 +124,36 @@ class RobotPage:
         self._served.close()
 
 
-class Person(Human):
-    """Reads the device of a person, shows them the arm, and gives the device back."""
+def open_device(config: PersonConfig, arm: Arm) -> tuple[Human, RobotPage | None]:
+    """Input device of a person, and the page that shows them the arm, if it is one.
 
-    def __init__(self, config: PersonConfig, work_arm: Arm):
-        """Open the device.
+    Args:
+        config: Kind of the device, and address of the page.
+        arm: The arm whose body is guided.
 
-        Args:
-            config: Input device of the person.
-            work_arm: The arm whose body is guided.
+    Raises:
+        ValueError: There is no such device.
+    """
+    from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
+    from hrc_learn.teleoperation.hand_guiding import LinkGuide
+    from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
 
-        Raises:
-            ValueError: There is none.
-        """
-        self._page: RobotPage | None = None
-        self._work_arm, self._chain = work_arm, work_arm.chain
-        self._human = self._opened(config)
+    chain = arm.chain
+    match config.kind:
+        case "page":
+            note = "A policy commands the end effector. Pull a link or a knob."
+            page = RobotPage(arm, config.host, config.port, note, guides=False)
+            return page.page.human, page
+        case "gamepad":
+            return LinkGuide(Gamepad.open(chain), chain), None
+        case "keyboard":
+            return LinkGuide(TerminalKeyboard.open(chain), chain), None
+        case _:
+            return ScriptedPerturbation(chain, ()), None
 
-    def _opened(self, config: PersonConfig) -> Human:
-        from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
-        from hrc_learn.teleoperation.hand_guiding import LinkGuide
-        from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
 
-        match config.kind:
-            case "page":
-                note = "A policy commands the end effector. Pull a link or a knob."
-                self._page = RobotPage(
-                    self._work_arm, config.host, config.port, note, guides=False
-                )
-                return self._page.page.human
-            case "gamepad":
-                return LinkGuide(Gamepad.open(self._chain), self._chain)
-            case "keyboard":
-                return LinkGuide(TerminalKeyboard.open(self._chain), self._chain)
-            case _:
-                return ScriptedPerturbation(self._chain, ())
+def scripted_person(chain: SerialChain, seed: int) -> Human:
+    """Scripted person that pulls the elbow as drawn from a seed."""
+    from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
 
-    def begin(self, seed: int) -> None:
-        """The simulation begins anew: a scripted person pulls as the seed has it."""
-        from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
-
-        if isinstance(self._human, ScriptedPerturbation):
-            self._human = ScriptedPerturbation(self._chain, scripted_pulls(seed))
-
-    def read(self, state: ArmState) -> HumanInput:
-        """Input of the person."""
-        return self._human.read(state)
-
-    def tell(self, feedback: Feedback) -> None:
-        """Tell the person at their device."""
-        self._human.tell(feedback)
-
-    def show(self, driver: Driver, world: World | None) -> None:
-        """Show the arm on the person's page, as in `RobotPage.show`."""
-        if self._page is not None:
-            self._page.show(driver, world)
-
-    def close(self) -> None:
-        """Give the device back."""
-        if self._page is not None:
-            self._page.close()
+    return ScriptedPerturbation(chain, scripted_pulls(seed))

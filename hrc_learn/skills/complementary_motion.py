@@ -56,6 +56,7 @@ class ComplementaryMotion:
     and goes on from there.
 
     Attributes:
+        human: Person that pushes the arm.
         posture: Joint positions of the policy now [rad]; None before the first step.
         joints: Joint positions commanded instead [rad].
         offset_velocity: Rate of change of their difference [rad/s].
@@ -84,7 +85,7 @@ class ComplementaryMotion:
             clearance: Distance of the arm from itself and its surroundings; None: a push can
                 move it anywhere within its limits.
         """
-        self._chain, self._human, self._dt = chain, human, dt
+        self._chain, self.human, self._dt = chain, human, dt
         self._steps = max(1, math.ceil(dt / _STEP - 1e-9))
         config = config or YieldingConfig()
         yielding = {f.name: getattr(config, f.name) for f in fields(YieldingConfig)}
@@ -146,7 +147,7 @@ class ComplementaryMotion:
         Returns:
             Joint positions [rad] and opening of the gripper [m].
         """
-        effort = self._human.read(state).effort(len(state.joint_position))
+        effort = self.human.read(state).effort(len(state.joint_position))
         push = torch.from_numpy(np.array(effort, dtype=float))
         pushed = bool(push.any())
         self._take(torch.from_numpy(np.array(wish, dtype=float)), width)
@@ -169,7 +170,7 @@ class ComplementaryMotion:
         posture, width = self._wished()
         self.offset_velocity = (self.joints - posture - offset) / self._dt
         self.posture = posture
-        self._human.tell(self._feedback.told(state, pushed=pushed))
+        self.human.tell(self._feedback.told(state, pushed=pushed))
         return self.joints.numpy(), width
 
     def _take(self, wish: Float[Tensor, " joints"], width: float) -> None:

@@ -15,6 +15,7 @@ from hrc_learn.lerobot.episode_recording import add_frame, new_dataset
 from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
 from hrc_learn.lerobot.policy.policy_base import read_episodes
+from hrc_learn.protocols import HumanInput
 from hrc_learn.teleoperation import ScriptedForce
 
 pytestmark = pytest.mark.simulation
@@ -157,11 +158,10 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         FrankaPandaConfig(person=PersonConfig(kind="scripted"), **settings)
 
     class Device(person.Human):
-        def __init__(self, config, work_arm):
-            self.closed = False
+        closed = False
 
         def read(self, state):
-            return person.HumanInput(nullspace_input=np.array([4.0, 0, -4, 0, 3, 0, 0]))
+            return HumanInput(nullspace_input=np.array([4.0, 0, -4, 0, 3, 0, 0]))
 
         def show(self, driver, world):
             self.shown = driver
@@ -169,12 +169,14 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         def close(self):
             self.closed = True
 
-    monkeypatch.setattr("hrc_learn.lerobot.arm_robot.Person", Device)
+    device = Device()  # and its page
+    opened = lambda config, arm: (device, device)  # noqa: E731
+    monkeypatch.setattr("hrc_learn.lerobot.arm_robot.open_device", opened)
     with served_franka(
         tmp_path, person=PersonConfig(kind="gamepad"), fps=FPS, dynamics=1.0
     ) as served:
         robot = served.robot
-        device, start = robot._person, served.read().joint_position
+        start = served.read().joint_position
         with shapes_unchecked():
             served.drive(dict(zip(JOINTS, start.tolist(), strict=True)), 20)
         read = torch.from_numpy(np.stack([start, served.read().joint_position]))
