@@ -43,7 +43,7 @@ COMMANDS: dict[str, Command] = {
     "demo": Command("experiment_commands.demo", arguments.Demo),
     "run": Command("experiment_commands.run", arguments.Run, ("experiment",)),
     "record": Command("record_command.record", arguments.Record, ("demonstration",)),
-    "import": Command("conversion_commands.import_recordings", arguments.Import, ("files",)),
+    "import": Command("dataset_commands.import_recordings", arguments.Import, ("files",)),
     "show": Command("dashboard_commands.show", arguments.Show, ("dataset",)),
     "check": Command("dataset_commands.check", arguments.Check, ("dataset",)),
     "repair": Command("dataset_commands.repair", arguments.Repair, ("dataset", "out")),

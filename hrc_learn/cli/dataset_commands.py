@@ -1,16 +1,18 @@
-"""`hrc check`, `repair`, `merge`, `curate`, `push`: datasets' quality and upload."""
+"""`hrc import`, `check`, `repair`, `merge`, `curate`, `push`: making and mending datasets."""
 
 import sys
 import webbrowser
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import track
 
-from hrc_learn.cli._run import configuration, has_screen, one_line, write_values
-from hrc_learn.cli.arguments import Check, Curate, Merge, Push, Repair
+from hrc_learn.cli._run import configuration, has_screen, one_line, updated, write_values
+from hrc_learn.cli.arguments import Check, Curate, Import, Merge, Push, Repair
 from hrc_learn.demos import (
     RepairOptions,
     check_dataset,
@@ -33,13 +35,74 @@ from hrc_learn.demos.quality.repair import (
 from hrc_learn.demos.read.contract import Contract, keep_contract
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
+from hrc_learn.demos.recording_import import plan_import, write_plan
+from hrc_learn.demos.recording_names import ImportOptions
 from hrc_learn.jacobian import camera_placements
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
-from hrc_learn.store import new_folder, write_json
+from hrc_learn.store import new_folder, read_json, read_toml, write_json, write_text
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 _RANKED_LINES = 20
 """Episodes of a ranking that fit on a screen."""
+
+
+def import_recordings(args: Import) -> None:
+    """Show what the recordings hold, and convert them."""
+    if not args.files:
+        raise ValueError("name at least one recording to import")
+    if args.out is None and not args.dry_run:
+        raise ValueError("name the folder of the new dataset (--out), or give --dry-run")
+    template = args.dry_run and args.mapping is not None and not args.mapping.exists()
+    options = _import_options(args, None if template else args.mapping)
+    plan = plan_import(args.files, options, _words(args.columns))
+    for line in plan.lines(args.actions):
+        print(line)
+    for warning in plan.meaning.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if template and args.mapping is not None:
+        write_text(args.mapping, plan.template())
+        print(f"{args.mapping}: a mapping file that says the same; edit it")
+    if args.dry_run or args.out is None:
+        write_values(args.json, plan.counts())
+        return
+    summary = write_plan(plan, args.out, args.robot_type, args.actions)
+    print(
+        f"{args.out}: {summary['episodes']} demonstrations, {summary['frames']} frames, "
+        f"{summary['seconds']:.1f} s"
+    )
+    write_values(args.json, summary)
+
+
+def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
+    """Options of the command line, which come before those of the mapping file."""
+    said = ImportOptions()
+    if mapping is not None:
+        read = read_toml if mapping.suffix == ".toml" else read_json
+        said = updated(said, read(mapping), f"{mapping}: ")
+    turn = _words(args.orientation)
+    columns = {
+        "joint_position": _words(args.joints),
+        "command_position": _words(args.command),
+        "gripper": _words(args.gripper),
+        "position": _words(args.position),
+        f"quaternion_{args.quaternion_order}": turn,
+    }
+    given = {name: words for name, words in columns.items() if words}
+    return replace(
+        said,
+        columns=said.columns | given,
+        units=said.units | args.units,
+        time=args.time or said.time,
+        joint_names=tuple(_words(args.joint_names)) or said.joint_names,
+        duration=args.duration or said.duration,
+        fps=args.fps or said.fps,
+        task=said.task if args.task is None else args.task,
+    )
+
+
+def _words(values: Sequence[str]) -> list[str]:
+    """Words that are separated by spaces or commas."""
+    return [word for value in values for word in value.split(",") if word]
 
 
 def check(args: Check) -> int:

@@ -21,7 +21,7 @@ from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.experiments.surroundings import unmarked_for, workplace_for
 from hrc_learn.kinematics import ArmChoice
-from hrc_learn.log import LoggedSteps, RunRecording
+from hrc_learn.log import RunRecording
 from hrc_learn.sim import Imperfections
 from hrc_learn.sim.unmarked_scene import UnmarkedLook
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
@@ -104,10 +104,6 @@ class CollaborationExperiment(CollaborationScenario):
             observer=observer,
         )
 
-    def failure(self, run: CollaborationRun) -> str:
-        """Reasons of the robot for objects that it did not deliver."""
-        return run.failure
-
     def metrics(self) -> Sequence[Metric[CollaborationRun]]:
         """Metrics of contacts, errors and the influence of the person."""
         fit = read_json(self.placing / "metrics.json", _FitMetrics, "fit again")
@@ -126,10 +122,6 @@ class CollaborationExperiment(CollaborationScenario):
             demonstration=self._demonstration(),
         )
         return {"run": recording}
-
-    def log(self, run: CollaborationRun) -> LoggedSteps:
-        """Log of the whole job."""
-        return run.cell.log
 
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]

@@ -12,6 +12,7 @@ from hrc_learn.experiments.simulated_cell import (
     SIMULATED,
     UNOBSERVED,
     ArmAccess,
+    CellRun,
     Observer,
     plan_checker,
     simulated_cell,
@@ -31,7 +32,6 @@ from hrc_learn.sim import (
     CameraKind,
     ChangingCamera,
     Imperfections,
-    MotionLog,
     OcclusionInterval,
     ScriptedOcclusion,
     WorkerConfig,
@@ -115,15 +115,10 @@ class CollaborationScenario:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollaborationRun:
+class CollaborationRun(CellRun):
     """One run of the whole job, successful or not."""
 
     workplace: Workplace
-    world: World
-    """World in the state that the run left."""
-    cell: WorkCell
-    motion: MotionLog
-    """Poses of everything that moved."""
     picks: tuple[PickPlaceJob, ...]
     """Result for each object, in order."""
     cameras: tuple[tuple[float, CameraModel], ...]
@@ -163,14 +158,6 @@ class CollaborationRun:
             },
             furniture=self.workplace.scene.boxes(),
         )
-
-    @property
-    def failure(self) -> str:
-        """Reasons of the robot for objects that it did not deliver; empty if there are none."""
-        failures = [pick.failure for pick in self.picks if pick.failure]
-        if left := len(self.workplace.scene.objects) - len(self.picks):
-            failures.append(f"{left} objects were not started")
-        return "; ".join(failures)
 
 
 def simulate_collaboration(
@@ -264,7 +251,11 @@ def simulate_collaboration(
             cell, workplace, aiming, placing, plan_checker(world), config, stage.receiving(cell)
         )
         picks = task.run(list(zip(items, shelves, strict=True)), change_camera)
+    failures = [pick.failure for pick in picks if pick.failure]
+    if left := len(items) - len(picks):
+        failures.append(f"{left} objects were not started")
     return CollaborationRun(
+        failure="; ".join(failures),
         workplace=workplace,
         world=world,
         cell=cell,

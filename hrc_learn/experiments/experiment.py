@@ -63,7 +63,22 @@ class Study:
 
 
 @runtime_checkable
-class Experiment[Run](Protocol):
+class ExperimentRun(Protocol):
+    """Result of one run, such as a `CellRun`."""
+
+    @property
+    def failure(self) -> str:
+        """Reason of the task to give up; empty if it did not. Metrics are evaluated apart."""
+        ...
+
+    @property
+    def log(self) -> LoggedSteps:
+        """All columns of the control loop."""
+        ...
+
+
+@runtime_checkable
+class Experiment[Run: ExperimentRun](Protocol):
     """Methods that an experiment supplies; `Run` is the result of one run."""
 
     title: ClassVar[str]
@@ -75,20 +90,12 @@ class Experiment[Run](Protocol):
         """Draw a scenario from the seed and carry it out once."""
         ...
 
-    def failure(self, run: Run) -> str:
-        """Reason of the task to give up; empty if it did not. Metrics are evaluated apart."""
-        ...
-
     def metrics(self) -> Sequence[Metric[Run]]:
         """Metrics of a run, in the order of the report's table."""
         ...
 
     def recordings(self, run: Run) -> Mapping[str, RunRecording]:
         """Recordings to look at, by the name of the file."""
-        ...
-
-    def log(self, run: Run) -> LoggedSteps:
-        """All columns of the control loop."""
         ...
 
     def sections(self, run: Run, recordings: Mapping[str, RunRecording]) -> Sequence[Section]:
@@ -109,11 +116,11 @@ class RepeatedRun:
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Run once and measure."""
         run = self.experiment.run(seed)
-        found = evaluate(self.experiment.metrics(), run, self.experiment.failure(run))
+        found = evaluate(self.experiment.metrics(), run, run.failure)
         return {**found.values, "failure": found.failure}
 
 
-def evaluate_all[Run](
+def evaluate_all[Run: ExperimentRun](
     experiment: Experiment[Run], run: Run, seed: int, trials: Sequence[Trial]
 ) -> Evaluation:
     """Evaluate a run and its trials.
@@ -121,7 +128,7 @@ def evaluate_all[Run](
     Without trials the run itself counts as the only one, so that the keys of the values do not
     depend on the number of trials. Totals over all trials replace the counts of the single run.
     """
-    total = evaluate(experiment.metrics(), run, experiment.failure(run))
+    total = evaluate(experiment.metrics(), run, run.failure)
     single = Trial(seed=seed, values=total.values, failure=total.failure)
     values = Summary.of(trials or [single]).figures()
     if trials:
@@ -152,7 +159,7 @@ class RunOptions:
     """File for the measured values."""
 
 
-def run_experiment[Run](
+def run_experiment[Run: ExperimentRun](
     experiment: Experiment[Run], options: RunOptions, *, command: str = ""
 ) -> int:
     """Run an experiment and its trials, write and print the results.
@@ -214,11 +221,11 @@ def run_experiment[Run](
     return 0 if results.ok else 1
 
 
-def _write_recordings[Run](
+def _write_recordings[Run: ExperimentRun](
     folder: Path, experiment: Experiment[Run], run: Run, make_film: bool
 ) -> tuple[Film | None, Sequence[Section]]:
     """Write log and recordings; returns the film, if asked for, and sections of the report."""
-    experiment.log(run).save(folder / "log.npz")
+    run.log.save(folder / "log.npz")
     recordings = experiment.recordings(run)
     for name, recording in recordings.items():
         record_run(folder / f"{name}.rrd", recording)

@@ -35,7 +35,7 @@ from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian
 from hrc_learn.kinematics import ArmChoice, gripper_down
-from hrc_learn.log import LoggedSteps, RunRecording
+from hrc_learn.log import RunRecording
 from hrc_learn.sim import CameraKind, Imperfections, Touch
 from hrc_learn.sim.unmarked_scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
@@ -304,10 +304,6 @@ class GraspingExperiment:
             observer=observer,
         )
 
-    def failure(self, run: GraspingRun) -> str:
-        """Reason of the task to give up."""
-        return run.failure
-
     def metrics(self) -> Sequence[Metric[GraspingRun]]:
         """Metrics of the grasp."""
         return grasping_metrics()
@@ -316,10 +312,6 @@ class GraspingExperiment:
         """Recording of the grasp."""
         region = region_of_vision(run.scene.workplace, self.config.servo)
         return {"run": record("Grasping", run.cell, run.world, run.motion, region=region)}
-
-    def log(self, run: GraspingRun) -> LoggedSteps:
-        """Log of the grasp."""
-        return run.cell.log
 
     def sections(
         self, run: GraspingRun, recordings: Mapping[str, RunRecording]

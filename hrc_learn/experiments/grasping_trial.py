@@ -12,20 +12,21 @@ from hrc_learn.experiments.simulated_cell import (
     SIMULATED,
     UNOBSERVED,
     ArmAccess,
+    CellRun,
     Observer,
     plan_checker,
     simulated_cell,
 )
 from hrc_learn.geometry import quaternion
 from hrc_learn.protocols import Human
-from hrc_learn.sim import CameraKind, Imperfections, MotionLog, ObjectConfig, World, open_camera
+from hrc_learn.sim import CameraKind, Imperfections, ObjectConfig, World, open_camera
 from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspJob
 from hrc_learn.skills.marker_sensor import MarkerSensor, feature_sensor
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.vision import CameraModel
@@ -120,19 +121,13 @@ class GraspingScene:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GraspingRun:
+class GraspingRun(CellRun):
     """One grasp, successful or not."""
 
     scene: GraspingScene
-    world: World
-    """World in the state that the run left."""
-    cell: WorkCell
-    motion: MotionLog
     item: ObjectConfig
     result: GraspJob | None
     """Record of the task; None if it failed."""
-    failure: str = ""
-    """Reason of a failure; empty after a success."""
 
 
 def simulate_grasp(

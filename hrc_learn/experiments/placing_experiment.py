@@ -36,7 +36,7 @@ from hrc_learn.experiments.run_recorder import record
 from hrc_learn.experiments.run_report import placing_joints_figure, placing_paths_figure
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.kinematics import ArmChoice
-from hrc_learn.log import LoggedSteps, RunRecording
+from hrc_learn.log import RunRecording
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, PlanningSpace
@@ -142,10 +142,6 @@ class PlacingExperiment:
             correction=correction,
         )
 
-    def failure(self, run: PlacingRun) -> str:
-        """Empty: the task itself never gives up."""
-        return ""
-
     def metrics(self) -> Sequence[Metric[PlacingRun]]:
         """Metrics of the reproduction and of both planning spaces."""
         return run_metrics(self._shelves)
@@ -167,10 +163,6 @@ class PlacingExperiment:
             # Neither a camera nor a person takes part.
             recordings[name] = replace(recording, camera=None, nullspace_input=None)
         return recordings
-
-    def log(self, run: PlacingRun) -> LoggedSteps:
-        """Log of the reproduction."""
-        return run.reproduction.cell.log
 
     def sections(
         self, run: PlacingRun, recordings: Mapping[str, RunRecording]

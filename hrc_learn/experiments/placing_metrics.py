@@ -14,6 +14,7 @@ from hrc_learn.experiments.placing_trial import SPACES, SimulatedPlacing, demons
 from hrc_learn.experiments.run_measures import limit_violations, place_angle
 from hrc_learn.experiments.run_recorder import demonstrated_joints
 from hrc_learn.experiments.trials import Trial
+from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import Touch
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlanningSpace
@@ -121,11 +122,18 @@ class PlacingRun:
     """Placings from the start of the demonstration, by space and shelf."""
     outcomes: Mapping[PlanningSpace, Mapping[str, PlacingOutcome]]
     """Outcomes by space, then by shelf."""
+    failure: str = ""
+    """Empty: the task itself never gives up."""
 
     @property
     def reproduction(self) -> SimulatedPlacing:
         """Demonstrated motion, reproduced in joint space as in the paper."""
         return self.placings["joint", self.demonstrated_shelf]
+
+    @property
+    def log(self) -> LoggedSteps:
+        """Log of the reproduction."""
+        return self.reproduction.log
 
 
 type ByShelf = Mapping[str, PlacingOutcome]

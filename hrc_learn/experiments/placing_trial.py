@@ -18,16 +18,17 @@ from hrc_learn.experiments.simulated_cell import (
     SIMULATED,
     UNOBSERVED,
     ArmAccess,
+    CellRun,
     Observer,
     simulated_cell,
 )
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.sim import MotionLog, Touch, World
+from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import place_along
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}
@@ -43,17 +44,16 @@ _DRAWS = 100
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SimulatedPlacing:
-    """One placing, from the start of the transfer to the end of the retreat."""
+class SimulatedPlacing(CellRun):
+    """One placing, from the start of the transfer to the end of the retreat.
+
+    Later placings may have reused its world.
+    """
 
     goal: Pose
     """True pose at which the end effector should release the object."""
     plan: Plan
     """Plan to the measured pose at the goal."""
-    world: World
-    """World of the placing; later placings may have reused it."""
-    cell: WorkCell
-    motion: MotionLog
     object_pose: Float[np.ndarray, "4 4"]
     """Final pose of the object."""
     contacts: tuple[Touch, ...]

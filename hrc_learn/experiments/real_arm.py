@@ -22,6 +22,7 @@ from hrc_learn.experiments.experiment import Experiment
 from hrc_learn.experiments.grasping_experiment import GraspingExperiment
 from hrc_learn.experiments.placing_experiment import PlacingExperiment
 from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.simulated_cell import CellRun
 from hrc_learn.experiments.surroundings import workplace_for
 from hrc_learn.hardware import (
     ArmProcess,
@@ -161,15 +162,8 @@ a failure, or an empty string."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArmRun:
-    """Result of a task on a real arm."""
-
-    cell: WorkCell
-    believed: World
-    """World of the assumed surroundings, with the arm in its last posture."""
-    motion: MotionLog
-    failure: str
-    """Reason of a failure, as the robot sees it; empty after a success."""
+class ArmRun(CellRun):
+    """Result of a task on a real arm; its world is that of the assumed surroundings."""
 
     def save(self, folder: Path, title: str, configuration: dict[str, Any]) -> None:
         """Write `run.rrd`, `log.npz`, `result.json` and `configuration.json`.
@@ -188,7 +182,7 @@ class ArmRun:
         }
         with new_folder(folder, configuration, overwrite=True) as part:
             log.save(part / "log.npz")
-            record_run(part / "run.rrd", record(title, self.cell, self.believed, self.motion))
+            record_run(part / "run.rrd", record(title, self.cell, self.world, self.motion))
             write_json(part / "result.json", result)
 
 
@@ -314,7 +308,7 @@ def run_on_arm(
             failure = task(cell, check)
         except (TaskFailedError, CameraError) as error:
             failure = str(error)
-    return ArmRun(cell=cell, believed=believed, motion=motion, failure=failure)
+    return ArmRun(cell=cell, world=believed, motion=motion, failure=failure)
 
 
 def _held(cell: WorkCell, workplace: Workplace) -> str | None:

@@ -39,7 +39,7 @@ from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
-from hrc_learn.viz.film import CameraInset, Picture, annotated, draw_run, film_mp4
+from hrc_learn.viz.film import Picture, annotated, camera_inset, draw_run, film_mp4
 from hrc_learn.viz.report import Film
 
 # Joint, counted from 1, whose frame is at the elbow of an arm with seven joints: the person
@@ -245,7 +245,7 @@ def frames(recording: RunRecording) -> Iterator[Picture]:
     speed = (end - begin) / shown if shown else 1.0
     inset = None
     if recording.camera is not None and recording.camera.images:
-        inset = CameraInset(recording.camera, WIDTH)
+        inset = camera_inset(recording.camera, WIDTH)
     with _painter(recording, camera) as paint:
         for time in np.linspace(begin, end, max(2, round(shown * RATE))):
             step = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
@@ -255,7 +255,7 @@ def frames(recording: RunRecording) -> Iterator[Picture]:
                 caption(recording, float(time)),
                 f"{time - begin:.0f} s" + (f"   {speed:.1f} ×" if speed > 1.05 else ""),
                 labels,
-                None if inset is None else inset.at(step, float(time)),
+                None if inset is None else inset(step, float(time)),
             )
 
 

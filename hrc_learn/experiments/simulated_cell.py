@@ -17,6 +17,7 @@ from hrc_learn.controller.null_space_motion import Clearance
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
 from hrc_learn.hardware.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.kinematics import Arm
+from hrc_learn.log import LoggedSteps
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import Imperfections, MotionLog, World
 from hrc_learn.skills.marker_sensor import FeatureSensor, LatencyConfig
@@ -132,6 +133,24 @@ class Observer:
 
 
 UNOBSERVED = Observer()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CellRun:
+    """One run of a work cell, successful or not."""
+
+    world: World
+    """World in the state that the run left."""
+    cell: WorkCell
+    motion: MotionLog
+    """Poses of everything that moved."""
+    failure: str = ""
+    """Reason of the robot to give up; empty if it did not. Metrics are evaluated apart."""
+
+    @property
+    def log(self) -> LoggedSteps:
+        """All columns of the control loop."""
+        return self.cell.log
 
 
 @contextmanager

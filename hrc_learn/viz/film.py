@@ -1,6 +1,6 @@
 """Films of runs: captions on the pictures, drawings without OpenGL, and the MP4 file."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -104,47 +104,34 @@ def annotated(
     return np.asarray(image)
 
 
-class CameraInset:
-    """Camera image of a run at each step, with the marker and its target."""
+def camera_inset(camera: CameraRecording, width: int) -> Callable[[int, float], Picture]:
+    """Function of a step and its time [s]: the camera's image with the marker and its target.
 
-    def __init__(self, camera: CameraRecording, width: int):
-        """Scale the images.
+    Args:
+        camera: Recording with images.
+        width: Width of the pictures of the film [px].
+    """
+    scale = _INSET * width / camera.model.width
+    size = round(_INSET * width), round(scale * camera.model.height)
+    images = [Image.fromarray(image).resize(size) for image in camera.images]
 
-        Args:
-            camera: Recording with images.
-            width: Width of the pictures of the film [px].
-        """
-        self._camera = camera
-        self._scale = _INSET * width / camera.model.width
-        size = round(_INSET * width), round(self._scale * camera.model.height)
-        self._images = [Image.fromarray(image).resize(size) for image in camera.images]
-
-    def at(self, step: int, time: float) -> Picture:
-        """Image at a step.
-
-        Args:
-            step: Step of the run.
-            time: Time of that step [s].
-        """
-        last = int(np.searchsorted(self._camera.image_time, time, side="right")) - 1
-        image = self._images[max(last, 0)].copy()
+    def at(step: int, time: float) -> Picture:
+        last = int(np.searchsorted(camera.image_time, time, side="right")) - 1
+        image = images[max(last, 0)].copy()
         draw = ImageDraw.Draw(image, "RGBA")
         for pixel, colour in (
-            (self._camera.target[step], palette.GREEN),
-            (self._camera.feature[step], palette.VERMILION),
+            (camera.target[step], palette.GREEN),
+            (camera.feature[step], palette.VERMILION),
         ):
             if np.isfinite(pixel).all():
-                u, v = (self._scale * pixel).tolist()
+                u, v = (scale * pixel).tolist()
                 draw.ellipse((u - 5, v - 5, u + 5, v + 5), outline=colour, width=3)
         draw.rectangle((0, image.height - 18, image.width, image.height), fill=_SHADE)
-        draw.text(
-            (5, image.height - 9),
-            "marker red, target green",
-            font=_font(10),
-            fill="white",
-            anchor="lm",
-        )
+        text, place = "marker red, target green", (5, image.height - 9)
+        draw.text(place, text, font=_font(10), fill="white", anchor="lm")
         return np.asarray(image)
+
+    return at
 
 
 @cache

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.viz import palette
@@ -162,7 +162,8 @@ class RunStream:
                 self._still.send(f"world/{name}", look)
                 self._send_arrows(f"world/{name}", time[at], pairs[at])
         if run.active_region is not None:
-            self._send_region(run, run.active_region, first)
+            drawn = np.zeros(len(time), bool) if run.drawn is None else run.drawn
+            self._send_region(time[at], run.active_region[at], drawn[at])
         if run.camera is not None:
             self._camera.send_overlays(time, run.camera, at, ends)
         # Plots of the overview show curves of other tabs.
@@ -180,26 +181,21 @@ class RunStream:
         self._stream.send_columns(path, seconds(run.time[ends]), columns)
 
     def _send_region(
-        self, run: RunRecording, region: Float[np.ndarray, "time 6"], first: int
+        self,
+        time: Float[np.ndarray, " samples"],
+        region: Float[np.ndarray, "samples 6"],
+        drawn: Bool[np.ndarray, " samples"],
     ) -> None:
-        """Send changes of the controller's region, with another colour for drawn ones."""
-        drawn = np.zeros(len(region)) if run.drawn is None else run.drawn
-        state = np.column_stack([region, drawn])
-        same = (state[1:] == state[:-1]) | (np.isnan(state[1:]) & np.isnan(state[:-1]))
-        changed = np.flatnonzero(np.append(True, ~same.all(axis=1)))
-        at = changed[changed >= first]
-        if not len(at):
-            return
-        path, known = "world/active_region", np.isfinite(region[at]).all(axis=1)
+        """Send the controller's region, with another colour for drawn ones."""
+        path, known = "world/active_region", np.isfinite(region).all(axis=1)
         self._still.send(path, rr.Boxes3D.from_fields(radii=[0.002]))
-        shown = at[known]
-        colours = [palette.rgba(palette.PERSON if d else palette.TARGET) for d in drawn[shown]]
+        colours = [palette.rgba(palette.PERSON if d else palette.TARGET) for d in drawn[known]]
         columns = rr.Boxes3D.columns(
-            centers=region[shown, :3], half_sizes=region[shown, 3:], colors=colours
+            centers=region[known, :3], half_sizes=region[known, 3:], colors=colours
         )
         # A step without a region removes the box.
         counts = known.astype(int)
-        self._stream.send_columns(path, seconds(run.time[at]), columns.partition(counts))
+        self._stream.send_columns(path, seconds(time), columns.partition(counts))
 
     def _send_arrows(
         self,

@@ -29,6 +29,13 @@ from hrc_learn.viz.report import Picture, Section, read_report
 class Throw:
     landed: float
     """[m]"""
+    failure: str = ""
+
+    @property
+    def log(self) -> LoggedSteps:
+        log = StepLog()
+        log.append(landed=self.landed)
+        return log
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +53,8 @@ class ThrowExperiment:
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> Throw:
         observer.tell("throwing")
-        return Throw(self.target + self.spread * np.random.default_rng(seed).standard_normal())
-
-    def failure(self, run: Throw) -> str:
-        return "the ball was dropped" if self.gives_up else ""
+        error = self.spread * np.random.default_rng(seed).standard_normal()
+        return Throw(self.target + error, "the ball was dropped" if self.gives_up else "")
 
     def metrics(self) -> Sequence[Metric[Throw]]:
         return [
@@ -67,11 +72,6 @@ class ThrowExperiment:
 
     def recordings(self, run: Throw) -> Mapping[str, RunRecording]:
         return {"run": sample_run()}
-
-    def log(self, run: Throw) -> LoggedSteps:
-        log = StepLog()
-        log.append(landed=run.landed)
-        return log
 
     def sections(self, run: Throw, recordings: Mapping[str, RunRecording]) -> Sequence[Section]:
         grey = np.full((4, 4, 3), 128, np.uint8)

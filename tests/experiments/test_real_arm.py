@@ -63,7 +63,7 @@ def test_a_task_is_done_and_what_the_robot_can_tell_is_kept(tmp_path):
     assert phases == ["up"]
     np.testing.assert_allclose(there[:3, 3] - start[:3, 3], [0.0, 0.0, 0.03], atol=2e-3)
     # The world that is believed has followed it.
-    np.testing.assert_allclose(run.believed.arm.tcp_pose(), there, atol=2e-3)
+    np.testing.assert_allclose(run.world.arm.tcp_pose(), there, atol=2e-3)
     assert len(run.motion) == len(run.cell.log)
 
     run.save(tmp_path / "run", "a task", {"ip": site.ip})
@@ -105,7 +105,7 @@ def test_plans_are_checked_with_what_is_in_the_hand(monkeypatch):
     with arm_at_home() as (_, site):
         run = run_on_arm(site, WORKPLACE, task)
     assert checked == [None, item.name]
-    in_hand = run.believed.object_pose(item.name)[:3, 3] - run.believed.arm.tcp_pose()[:3, 3]
+    in_hand = run.world.object_pose(item.name)[:3, 3] - run.world.arm.tcp_pose()[:3, 3]
     np.testing.assert_allclose(in_hand, 0.0, atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from hrc_learn.geometry import Body, Box, Capsule
 from hrc_learn.geometry.shapes import Line
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
-from hrc_learn.viz.film import CameraInset, annotated, draw_run, film_mp4
+from hrc_learn.viz.film import annotated, camera_inset, draw_run, film_mp4
 
 
 @pytest.fixture
@@ -64,9 +64,9 @@ def test_the_inset_shows_the_last_image_with_marker_and_target():
     run = sample_run()
     recorded = run.camera
     assert recorded is not None
-    inset = CameraInset(recorded, 4 * recorded.model.width)
+    inset = camera_inset(recorded, 4 * recorded.model.width)
     step = int(np.flatnonzero(np.isfinite(recorded.feature - recorded.target).all(-1))[0])
-    shown = inset.at(step, float(run.time[step]))
+    shown = inset(step, float(run.time[step]))
     for points, colour in (
         (recorded.feature, palette.VERMILION),
         (recorded.target, palette.GREEN),
