@@ -173,6 +173,8 @@ class CameraModel:
         import cv2
 
         p, still, lens = self.to_camera(point), np.zeros(3), np.array(self.distortion)
+        if not p.size:  # OpenCV returns nothing
+            return np.zeros((*p.shape[:-1], 2, 6))
         # The derivative over a shift of all points is that over each point.
         _, slope = cv2.projectPoints(p.reshape(-1, 3), still, still, self.matrix, lens)
         J_point = slope[:, 3:6].reshape(*p.shape[:-1], 2, 3) @ self.pose[:3, :3].T

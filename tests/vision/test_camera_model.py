@@ -104,6 +104,10 @@ def test_image_jacobian_is_the_derivative_of_the_projection():
     np.testing.assert_allclose(model.image_jacobian(points, origins), numeric, atol=2e-4)
 
 
+def test_no_points_have_no_image_jacobians():
+    assert CameraModel().image_jacobian(np.zeros((0, 3))).shape == (0, 2, 6)
+
+
 def test_rotation_about_the_point_itself_moves_nothing():
     model = camera()
     point = points_in_view(model, 1)[0]
