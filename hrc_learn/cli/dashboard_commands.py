@@ -109,7 +109,7 @@ def _stream(args: Show) -> int:
 def _shown(args: Show) -> "ShownDataset":
     """Demonstrations of a dataset, as they are shown."""
     from hrc_learn.demos import DatasetError, Demonstration, open_demos
-    from hrc_learn.demos.dataset_arm import arm_of_dataset
+    from hrc_learn.demos.dataset_views import arm_of_dataset
     from hrc_learn.demos.images import ImageReader, camera_images
     from hrc_learn.demos.videos import CameraImages
     from hrc_learn.learning.demonstration_dashboard import ShownDataset

@@ -16,7 +16,7 @@ from rich.progress import Progress
 from hrc_learn.cli._run import with_settings, write_values
 from hrc_learn.cli.arguments import Multiply
 from hrc_learn.demos import open_demos
-from hrc_learn.demos.dataset_arm import arm_of_dataset
+from hrc_learn.demos.dataset_views import arm_of_dataset
 from hrc_learn.demos.issues import aligned
 from hrc_learn.experiments.motion_judge import Judge, JudgeConfig, Replay, Trial, judging
 from hrc_learn.geometry import Pose, quaternion

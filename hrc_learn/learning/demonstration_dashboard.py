@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
-from hrc_learn.demos.charts import demonstration_charts, own_unit
-from hrc_learn.demos.dataset_arm import DatasetArm
+from hrc_learn.demos.dataset_views import DatasetArm, demonstration_charts, own_unit
 from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.demos.videos import CameraImages
 from hrc_learn.kinematics.drawing import arm_bodies

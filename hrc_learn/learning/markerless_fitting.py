@@ -22,7 +22,7 @@ from matplotlib.image import imsave
 from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
-from hrc_learn.demos.dataset_arm import arm_of_dataset
+from hrc_learn.demos.dataset_views import arm_of_dataset
 from hrc_learn.demos.image_features import camera_key
 from hrc_learn.demos.images import ImageReader
 from hrc_learn.geometry import Pose, quaternion

@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DemonstrationSource
 from hrc_learn.demos import recorded_episode as recorded
-from hrc_learn.demos.dataset_arm import DatasetArm
 from hrc_learn.demos.dataset_assembly import begin, discard, finish
+from hrc_learn.demos.dataset_views import DatasetArm
 from hrc_learn.demos.read.columns import column_places
 from hrc_learn.demos.read.contract import Sidecar, read_sidecar
 from hrc_learn.demos.read.dataset_folder import staging_folder

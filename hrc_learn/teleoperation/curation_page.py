@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
-from hrc_learn.demos.charts import Chart, demonstration_charts
+from hrc_learn.demos.dataset_views import Chart, demonstration_charts
 from hrc_learn.demos.images import ImageReader, jpeg, thumbnail_size
 from hrc_learn.demos.issues import plain_text
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking

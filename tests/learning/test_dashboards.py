@@ -9,7 +9,7 @@ from rrd_reading import Rrd
 from sample_runs import LIMITS, NAMES
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
-from hrc_learn.demos.dataset_arm import DatasetArm
+from hrc_learn.demos.dataset_views import DatasetArm
 from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.demos.videos import CameraImages
 from hrc_learn.geometry import quaternion

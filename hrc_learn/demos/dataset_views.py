@@ -1,20 +1,21 @@
-"""The arm that recorded a dataset: which registered arm or file, and where its joints are."""
+"""A dataset as dashboards and pages show it: its arm, and curves in its own units."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.demos.read.source import DemonstrationSource
-from hrc_learn.demos.read.units import UnitDecision
+from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.kinematics import Arm, ArmChoice
 from hrc_learn.kinematics.registry import arm_of_robot
 
@@ -114,3 +115,60 @@ def _columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
 def _plain(name: str) -> str:
     """A joint's name without case, separators and the word for its position."""
     return re.sub("[^a-z0-9]", "", re.sub(r"[._ ](pos|position|q)$", "", name.lower()))
+
+
+_MOTIONS = {"measured": "joint_position", "commanded": "command_position"}
+
+
+class Chart(NamedTuple):
+    """Curves over time of one quantity."""
+
+    key: str
+    """Short name, such as joint_0."""
+    title: str
+    unit: str
+    """Unit of the values; empty if they have none."""
+    lines: Mapping[str, Float[np.ndarray, " frames"]]
+    """Values by the name of the curve."""
+
+
+def own_unit(units: Mapping[str, UnitDecision], role: str, column: int) -> tuple[str, float]:
+    """Unit of a column in the dataset, and the factor from it to the reader's unit."""
+    decision = units.get(role)
+    if decision is None:
+        return ("m" if role == "gripper" else "rad"), 1.0
+    unit = decision.unit_of(column)
+    return unit, unit_factor(role, unit)
+
+
+def demonstration_charts(
+    demo: Demonstration, units: Mapping[str, UnitDecision]
+) -> Iterator[Chart]:
+    """Charts of the joints, the gripper, the tool, the image feature and the person's effort.
+
+    Args:
+        demo: The demonstration.
+        units: Units in the dataset by quantity.
+    """
+    for k, joint in enumerate(demo.joint_names):
+        lines = {
+            name: values[:, k] / own_unit(units, role, k)[1]
+            for name, role in _MOTIONS.items()
+            if (values := getattr(demo, role)) is not None
+        }
+        if lines:
+            yield Chart(f"joint_{k}", joint, own_unit(units, "joint_position", k)[0], lines)
+    if demo.gripper is not None:
+        unit, factor = own_unit(units, "gripper", 0)
+        lines = {"opening": demo.gripper.reshape(len(demo)) / factor}
+        yield Chart("gripper", "Gripper", unit.replace("1", ""), lines)
+    feature = demo.feature
+    if feature is not None and demo.feature_visible is not None:
+        feature = np.where(demo.feature_visible[:, None], feature, np.nan)
+    for key, title, unit, names, values in (
+        ("position", "Tool centre point", "m", "xyz", demo.position),
+        ("feature", "Feature in the image", "px", ("u (right)", "v (down)"), feature),
+        ("effort", "Effort of the person", "N m", demo.joint_names, demo.human_effort),
+    ):
+        if values is not None:
+            yield Chart(key, title, unit, dict(zip(names, values.T, strict=True)))

@@ -7,7 +7,7 @@ import pytest
 from lerobot_folders import joint_path, write_folder
 
 from hrc_learn.demos import DatasetError, open_demos
-from hrc_learn.demos.dataset_arm import arm_of_dataset
+from hrc_learn.demos.dataset_views import arm_of_dataset
 from hrc_learn.demos.read.dataset_files import INFO_PATH
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.registry import arm_of_robot
