@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrc_learn import store
+from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read import metadata
 from hrc_learn.demos.read.contract import Sidecar, read_sidecar
@@ -28,13 +29,6 @@ from hrc_learn.demos.read.dataset_folder import (
     open_folder,
     recovery_advice,
     staging_folder,
-)
-from hrc_learn.demos.recorded_episode import (
-    EpisodeDescription,
-    RecordingHeader,
-    episode_number,
-    read_episode,
-    staged_paths,
 )
 from hrc_learn.demos.videos import Segments, VideoSegment, video_path
 
@@ -62,14 +56,15 @@ def assemble(
             with the episodes, which are linked where possible.
         tasks: Task texts that already have an index, in order of the index.
     """
-    header = read_episode(paths[0])[0].header
+    header = recorded.read_episode(paths[0])[0].header
     for folder in ("meta/episodes/chunk-000", "data"):
         (target / folder).mkdir(parents=True)
     cameras = [key for key, f in header.features.items() if f["dtype"] == "video"]
     listed = _EpisodeList(target, link_videos=videos is None)
     sidecar = header.sidecar
+    tables: list[pa.Table] = []
     if earlier is not None:
-        _carry_over(earlier, listed, cameras)
+        tables.append(_carry_over(earlier, listed, cameras))
         # The longer dataset keeps the details and the contract of the earlier one.
         before = read_sidecar(earlier)
         details = before.details | sidecar.details
@@ -78,15 +73,19 @@ def assemble(
     if videos is None:
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
     segments = iter(videos)
-    for file, group in enumerate(_by_size(paths), start=listed.data_files):
-        path = target / metadata.place(metadata.DATA_PATH, file)
-        for staged, frames in _write_frames(path, header, group):
-            listed.add(staged, frames, file, next(segments))
-    _write_metadata(target, header, listed, sidecar)
+
+    def rows() -> Iterator[dict]:
+        for file, group in enumerate(_by_size(paths), start=listed.data_files):
+            path = target / metadata.place(metadata.DATA_PATH, file)
+            for staged, frames in _write_frames(path, header, group):
+                yield listed.row(staged, frames, file, next(segments))
+
+    tables += map(_table_of, itertools.batched(rows(), _PACKED))
+    _write_metadata(target, header, listed, _concatenated(tables), sidecar)
 
 
 class _EpisodeList:
-    """Growing list of episodes, one row of `meta/episodes` each.
+    """Counts of a growing dataset, and the row of each episode in `meta/episodes`.
 
     Attributes:
         target: Folder of the new dataset.
@@ -104,17 +103,11 @@ class _EpisodeList:
         self.videos: dict[str, int] = {}
         self._link = link_videos
         self._placed: dict[str, dict[Path, int]] = {}
-        self._tables: list[pa.Table] = []
-        self._rows: list[dict] = []
 
-    def carry(self, table: pa.Table) -> None:
-        """Begin with the list of an earlier dataset."""
-        self._tables.append(table)
-        self.episodes += len(table)
-        self.frames = table.column("dataset_to_index")[-1].as_py()
-
-    def add(self, staged: EpisodeDescription, length: int, file: int, videos: Segments) -> None:
-        """Append an episode of a data file, and place its videos."""
+    def row(
+        self, staged: recorded.EpisodeDescription, length: int, file: int, videos: Segments
+    ) -> dict:
+        """Row of the next episode, of a data file; its videos are placed."""
         self.tasks |= dict.fromkeys(staged.tasks)
         row = {
             "episode_index": self.episodes,
@@ -131,11 +124,9 @@ class _EpisodeList:
             row |= {f"stats/{key}/{name}": values for name, values in statistics.items()}
         if staged.provenance:
             row["provenance"] = staged.provenance
-        self._rows.append(row)
         self.episodes += 1
         self.frames += length
-        if len(self._rows) == _PACKED:
-            self._pack()
+        return row
 
     def _place_video(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
         """Place the video file of a segment; a file shared by episodes is placed once."""
@@ -152,21 +143,6 @@ class _EpisodeList:
             f"videos/{key}/to_timestamp": segment.stop,
         }
 
-    def _pack(self) -> None:
-        self._tables.append(_table_of(self._rows))
-        self._rows = []
-
-    def table(self) -> pa.Table:
-        """All rows."""
-        if self._rows:
-            self._pack()
-        table = _concatenated(self._tables)
-        places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
-        table = table.drop_columns([name for name in places if name in table.column_names])
-        for name in places:  # the list is one file
-            table = table.append_column(name, pa.array(np.zeros(len(table), np.int64)))
-        return table
-
 
 def _table_of(rows: Sequence[dict]) -> pa.Table:
     """Table with the columns of all rows."""
@@ -175,11 +151,16 @@ def _table_of(rows: Sequence[dict]) -> pa.Table:
 
 
 def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
-    """One table of all rows; tables may differ in their columns."""
+    """One list of all episodes; tables may differ in their columns."""
     try:
-        return pa.concat_tables(tables, promote_options="permissive")
+        table = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException:  # the same values in lists of another type
-        return _table_of([row for table in tables for row in table.to_pylist()])
+        table = _table_of([row for table in tables for row in table.to_pylist()])
+    places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
+    table = table.drop_columns([name for name in places if name in table.column_names])
+    for name in places:  # the list is one file
+        table = table.append_column(name, pa.array(np.zeros(len(table), np.int64)))
+    return table
 
 
 def _count_files(table: pa.Table, kind: str) -> int:
@@ -189,13 +170,13 @@ def _count_files(table: pa.Table, kind: str) -> int:
 
 
 def _write_frames(
-    path: Path, header: RecordingHeader, group: Sequence[Path]
-) -> Iterator[tuple[EpisodeDescription, int]]:
+    path: Path, header: recorded.RecordingHeader, group: Sequence[Path]
+) -> Iterator[tuple[recorded.EpisodeDescription, int]]:
     """Write a data file, one row group per episode; each episode and its number of frames."""
     path.parent.mkdir(exist_ok=True)
-    schema = metadata.data_schema(read_episode(group[0])[1].schema, header.features)
+    schema = metadata.data_schema(recorded.read_episode(group[0])[1].schema, header.features)
     with pq.ParquetWriter(path, schema, write_page_checksum=True) as writer:
-        for staged, table in map(read_episode, group):
+        for staged, table in map(recorded.read_episode, group):
             writer.write_table(table.cast(schema))
             yield staged, len(table)
 
@@ -213,9 +194,13 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _write_metadata(
-    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: Sidecar
+    target: Path,
+    header: recorded.RecordingHeader,
+    listed: _EpisodeList,
+    table: pa.Table,
+    sidecar: Sidecar,
 ) -> None:
-    table, tasks = listed.table(), list(listed.tasks)
+    tasks = list(listed.tasks)
     metadata.write_tasks(target / "meta/tasks.parquet", tasks)
     write_parquet(table, target / metadata.EPISODES_PATH)
     content = metadata.info_content(
@@ -239,21 +224,27 @@ def _write_metadata(
         metadata.dump_json(target / metadata.SIDECAR_PATH, sidecar)
 
 
-def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> None:
-    """Link the data and videos of a dataset into the new one, and continue its lists."""
+def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> pa.Table:
+    """Link the data and videos of a dataset into the new one, and continue its counts.
+
+    Returns:
+        Its list of episodes.
+    """
     folder = open_folder(earlier)
     for file in (*earlier.glob("data/*/*.parquet"), *earlier.glob("videos/**/*.mp4")):
         _put(file, listed.target / file.relative_to(earlier), link=True)
     tables = [read_table(open_parquet(earlier, n), n) for n in episode_lists(earlier)]
     table = _concatenated(tables).sort_by("episode_index")
-    listed.carry(table)
+    listed.episodes = len(table)
+    listed.frames = table.column("dataset_to_index")[-1].as_py()
     listed.tasks |= dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks))
     listed.data_files = _count_files(table, "data")
     listed.videos = {key: _count_files(table, f"videos/{key}") for key in cameras}
+    return table
 
 
 def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments:
-    number = episode_number(path)
+    number = recorded.episode_number(path)
     seconds = pq.read_metadata(path).num_rows / fps
     return {
         key: VideoSegment(file=video_path(path.parent, key, number), start=0.0, stop=seconds)
@@ -349,7 +340,7 @@ def finish(root: Path, claim: store.Claim) -> None:
                 f"{root} already exists: remove {staging} if both hold the same recording, or "
                 f"move {root} away to make a dataset of the recording"
             )
-        paths = staged_paths(staging, episodes or 0)
+        paths = recorded.staged_paths(staging, episodes or 0)
         with store.replacing(
             claim,
             store.DATASET,

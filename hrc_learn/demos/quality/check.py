@@ -22,7 +22,8 @@ from hrc_learn.demos.read.profiles import (
     EpisodeProfile,
     FeatureProfiles,
     feature_profiles,
-    profile_episode,
+    profile_columns,
+    track_quantities,
 )
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES
 from hrc_learn.demos.read.source import DemonstrationSource, OpenedDataset
@@ -109,7 +110,8 @@ def _first_pass(
         report.frames += entry.length
         is_sound = _is_sound(frames, columns)
         found = select_quantities(frames, columns.selections) if is_sound else {}
-        profiles.append(profile_episode(entry, frames, found, folder.fps))
+        profiled, tracking = profile_columns(frames), track_quantities(found, folder.fps)
+        profiles.append(EpisodeProfile(entry=entry, columns=profiled, tracking=tracking))
         if is_sound:
             sound.append(entry)
             report.run(episode_checks.quaternion_signs, entry, found)

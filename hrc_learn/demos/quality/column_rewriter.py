@@ -12,6 +12,7 @@ from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
+from hrc_learn.demos.read import metadata
 from hrc_learn.demos.read.contract import (
     SidecarColumn,
     fingerprint,
@@ -20,11 +21,6 @@ from hrc_learn.demos.read.contract import (
 )
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder, recorded_statistics
-from hrc_learn.demos.read.metadata import (
-    INDEX_FEATURES,
-    NUMERIC,
-    image_statistics,
-)
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.videos import (
@@ -37,7 +33,7 @@ from hrc_learn.demos.videos import (
 from hrc_learn.store import DATASET, replacing
 
 NO_TASK = "unnamed task"
-_IN_TABLES = ("video", *NUMERIC)
+_IN_TABLES = ("video", *metadata.NUMERIC)
 _STATISTICS_IMAGES = 20
 """Images of an episode that enter its statistics, as in LeRobot for short episodes."""
 _LARGEST_NOTE = 2**20
@@ -154,7 +150,7 @@ def new_header(
     return recorded.RecordingHeader(
         fps=float(fps or folder.fps),
         robot_type=folder.robot_type or "unknown",
-        features={**features, **INDEX_FEATURES},
+        features={**features, **metadata.INDEX_FEATURES},
         sidecar=replace(old, columns=columns, units=declared_units, contract=contract),
     )
 
@@ -286,4 +282,4 @@ class ColumnRewriter:
             some = [image_at(images, int(i), self._folder.fps) for i in chosen]
         else:
             some = [decode_image(images[int(i)].as_py()["bytes"]) for i in chosen]
-        return image_statistics(np.stack([subsampled(image) for image in some]))
+        return metadata.image_statistics(np.stack([subsampled(image) for image in some]))

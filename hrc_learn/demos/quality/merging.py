@@ -153,12 +153,8 @@ class _Merge:
         """Features of all datasets, as the first one declares them."""
         common = {}
         everywhere = dict.fromkeys(key for source in self.sources for key in source.features)
-        for key in everywhere:
-            if key in INDEX_KEYS:
-                continue
-            without = [
-                str(source.root) for source in self.sources if key not in source.features
-            ]
+        for key in (key for key in everywhere if key not in INDEX_KEYS):
+            without = [str(one.root) for one in self.sources if key not in one.features]
             if without and key in _ESSENTIAL:
                 raise DatasetError(f"has no {key}, as the others have", file=without[0])
             if without:

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped
 
 from hrc_learn.demos.issues import Issue
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.units import Quantities
 
@@ -120,17 +119,6 @@ def profile_columns(
         if np.isfinite(values).all():
             profiles[key] = _profile(values)
     return profiles
-
-
-def profile_episode(
-    entry: EpisodeEntry, frames: RawFrames, quantities: Quantities, fps: float
-) -> EpisodeProfile:
-    """Profile of an episode; without quantities, its tracking is empty."""
-    return EpisodeProfile(
-        entry=entry,
-        columns=profile_columns(frames),
-        tracking=track_quantities(quantities, fps),
-    )
 
 
 def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
