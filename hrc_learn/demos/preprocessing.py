@@ -237,7 +237,23 @@ def trim_rest(demo: Demonstration, keep: float | int = 0.1) -> Demonstration:
     Raises:
         ValueError: As in `resting`, or the arm never moves.
     """
-    moving = np.flatnonzero(~resting(demo))
+    return cut(demo, *motion_range(demo, resting(demo), keep))
+
+
+def motion_range(
+    demo: Demonstration, rest: Bool[np.ndarray, " frames"], keep: float | int = 0.1
+) -> tuple[int, int]:
+    """First frame and exclusive end of the motion, with some rest at either end.
+
+    Args:
+        demo: The demonstration.
+        rest: Mask of the frames at rest, as from `resting`.
+        keep: Rest left at either end [s].
+
+    Raises:
+        ValueError: The arm never moves.
+    """
+    moving = np.flatnonzero(~rest)
     if not len(moving):
         raise ValueError(f"episode {demo.episode}: the arm rests all the time")
     return _with_margin(demo, int(moving[0]), int(moving[-1]) + 1, keep)
@@ -257,7 +273,7 @@ def split_at_rest(
         ValueError: As in `resting`.
     """
     return [
-        _with_margin(demo, start, stop, keep)
+        cut(demo, *_with_margin(demo, start, stop, keep))
         for start, stop in _runs(~resting(demo))
         if demo.time[stop - 1] - demo.time[start] >= shortest
     ]
@@ -269,10 +285,10 @@ def _runs(flags: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def _with_margin(demo: Demonstration, start: int, stop: int, keep: float) -> Demonstration:
+def _with_margin(demo: Demonstration, start: int, stop: int, keep: float) -> tuple[int, int]:
     first = int(np.searchsorted(demo.time, demo.time[start] - keep))
     behind = int(np.searchsorted(demo.time, demo.time[stop - 1] + keep, side="right"))
-    return cut(demo, first, behind)
+    return first, behind
 
 
 _SMOOTH = ("joint_position", "joint_velocity", "position", "orientation")

@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.preprocessing import nearest_frames, regular_grid, trim_rest
+from hrc_learn.demos.preprocessing import motion_range, nearest_frames, regular_grid, resting
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
@@ -214,13 +214,11 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
     names = edit.columns.joint_names if role == "joint_position" else ()
     time, number = edit.time - edit.time[0], edit.entry.index
     try:
-        left = trim_rest(
-            Demonstration(time=time, joint_names=names, fps=1.0, episode=number, **moving)
-        )
+        demo = Demonstration(time=time, joint_names=names, fps=1.0, episode=number, **moving)
+        first, stop = motion_range(demo, resting(demo))
     except ValueError as error:
         raise edit.fault(str(error)) from error
-    first = int(np.searchsorted(time, left.start_time))
-    first, last = _while_all_rest(edit, first, first + len(left) - 1)
+    first, last = _while_all_rest(edit, first, stop - 1)
     wanted = np.zeros(len(edit), dtype=bool)
     wanted[first : last + 1] = True
     cut = f"{time[first]:.2f} s at the beginning, {time[-1] - time[last]:.2f} s at the end"

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import Issue, aligned
-from hrc_learn.demos.preprocessing import resting
+from hrc_learn.demos.preprocessing import motion_range, resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
 from hrc_learn.demos.read.dataset_folder import Progress, open_folder
@@ -192,12 +192,8 @@ def _measure(
     quality.measures["jerk"] = log_dimensionless_jerk(demo.time, motion)
     rest = resting(demo)
     quality.measures["idle"] = float(rest.mean())
-    moving = np.flatnonzero(~rest)
-    if len(moving):
-        # A tenth of a second of rest stays at either end of a proposed cut.
-        margin = round(0.1 * demo.fps)
-        quality.start = max(0, int(moving[0]) - margin)
-        quality.stop = min(len(demo), int(moving[-1]) + 1 + margin)
+    if not rest.all():
+        quality.start, quality.stop = motion_range(demo, rest)
     return shape
 
 
