@@ -10,6 +10,7 @@ from hrc_learn.controller.arm_loop_state import PathState
 from hrc_learn.controller.joint_path import (
     DirectReturn,
     JointPaths,
+    deviation_ratio,
     may_not_return,
     nears_singularity,
     push_fraction,
@@ -151,3 +152,12 @@ def test_a_direct_return_leads_to_another_sample_if_the_way_is_blocked():
     assert float(direct.progress) < 50
     way = torch.lerp(direct.start, direct.goal, fraction)
     assert clearance(way).min() > 0
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_deviations_and_speeds_count_along_each_axis_and_about_it(axis):
+    """A millimetre is tolerated at rest, and 60 ms of the speed; 0.1 m are a radian."""
+    unit = torch.eye(6, dtype=torch.float64)[axis] * (1.0 if axis < 3 else 10.0)
+    still = torch.zeros_like(unit)
+    assert deviation_ratio(0.002 * unit, still) == pytest.approx(2.0)
+    assert deviation_ratio(-0.002 * unit, 0.1 * unit) == pytest.approx(2.0 / 7.0)

@@ -213,6 +213,10 @@ def test_fractions_of_a_velocity_count_along_its_direction():
     v = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
     after = torch.tensor([[1.5, 2.0], [1.0, 0.0], [-1.0, 5.0]], dtype=torch.float64)
     torch.testing.assert_close(fraction_kept(v, after), v.new_tensor([0.5, 1.0, 0.0]))
+    # Slow motions count as fast ones do, down to the rest.
+    slow = 3e-7 * v
+    torch.testing.assert_close(fraction_kept(slow, slow / 2)[:2], v.new_tensor([0.5, 1.0]))
+    assert fraction_kept(slow[0], 0 * slow[0], rest=2e-6) == 1.0
 
 
 def test_a_push_with_a_tenth_in_the_null_space_counts_as_one():
