@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 
 import pytest
 from cakes import EXTENDED, KIND, cake, contents, fill
@@ -87,12 +88,14 @@ def test_foreign_folders_are_carried_over_whatever_the_new_folder_has(tmp_path, 
     """Also out of a folder that we wrote once and no longer write."""
     out, plain = tmp_path / "out", Kind(name="plain", files=("part",))
     with replacing(out, plain) as folder:
-        (folder / "extra").mkdir(parents=True)
+        (folder / "extra" / "ours").mkdir(parents=True)
     (out / "extra" / "own" / "empty").mkdir(parents=True)
     (out / "extra" / "own" / "mine").write_text("years")
+    (out / "extra" / "ours" / "mine").write_text("years")
     with replacing(out, plain, overwrite=True) as folder:
         (folder / made).mkdir(parents=True)
-    assert contents(tmp_path) == {"out/extra/own/mine": "years"}
+    mine = {"out/extra/own/mine": "years", "out/extra/ours/mine": "years"}
+    assert contents(tmp_path) == mine
     assert (out / "extra" / "own" / "empty").is_dir()
 
 
@@ -101,14 +104,21 @@ def test_a_foreign_file_whose_name_is_taken_is_kept_aside(tmp_path):
     fill(out, "old")
     (out / "notes").write_text("years")
 
-    def write() -> None:
+    def write(name: str = "notes") -> None:
         with replacing(out, EXTENDED, overwrite=True) as folder:
             folder.mkdir()
-            (folder / "notes").write_text("others")
+            (folder / name).write_text("their")
+            # Of one size and time: what it holds decides.
+            shutil.copystat(out / name, folder / name)
 
     with pytest.warns(UserWarning, match=r"out\.kept"):
         write()
-    assert contents(tmp_path) == {"out/notes": "others", "out.kept/notes": "years"}
+    assert contents(tmp_path) == {"out/notes": "their", "out.kept/notes": "years"}
+    (out / "thesis").write_text("weeks")
+    with pytest.warns(UserWarning, match=r"out\.kept-2"):
+        write("thesis")
+    kept = {"out.kept/notes": "years", "out.kept-2/thesis": "weeks"}
+    assert contents(tmp_path) == {"out/thesis": "their"} | kept
 
 
 def test_a_file_put_there_in_the_meantime_is_kept_aside(tmp_path):

@@ -115,9 +115,13 @@ def test_only_files_of_a_sensible_size_are_read(tmp_path):
     with pytest.raises(ValueError, match="is no file"):
         read_json(tmp_path / "pipe")
     with (tmp_path / "large.json").open("wb") as file:
-        file.truncate(2**40)
-    with pytest.raises(ValueError, match="larger than 64 MiB"):
+        file.truncate(64 * 2**20)
+    with pytest.raises(ValueError, match="not valid JSON"):
         read_json(tmp_path / "large.json")
+    for size in (64 * 2**20 + 1, 2**40):
+        os.truncate(tmp_path / "large.json", size)
+        with pytest.raises(ValueError, match="larger than 64 MiB"):
+            read_json(tmp_path / "large.json")
 
 
 def test_a_message_is_parsed_with_its_origin():

@@ -108,8 +108,11 @@ def test_who_reads_finds_the_old_or_the_new(tmp_path):
     out, missing = tmp_path / "out", 0
     fill(out, "old")
     for _ in cut_off(lambda: fill(out, "new", overwrite=True)):
-        missing += not out.exists()
+        before, there = set(tmp_path.rglob("*")), out.exists()
+        missing += not there
         store.settle(out / "layers" / "any")
+        # A reader leaves alone what a writer may still be doing.
+        assert not there or set(tmp_path.rglob("*")) == before
         assert (out / "result").read_text() in ("old", "new")
         fill(out, "old", overwrite=True)
     assert missing
