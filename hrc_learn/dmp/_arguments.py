@@ -90,7 +90,7 @@ def readable(*tensors: Tensor) -> bool:
     return True
 
 
-_transform_level = getattr(
+transform_level = getattr(
     torch._C._functorch,  # pyright: ignore[reportAttributeAccessIssue]
     "maybe_current_level",
     lambda: 0,
@@ -112,7 +112,7 @@ def fits_numpy(detached: Tensor, *others: Any) -> bool:
     """
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return False
-    if _transform_level() is not None or forward_ad._current_level >= 0:
+    if transform_level() is not None or forward_ad._current_level >= 0:
         return False
     dtype = detached.dtype
     if type(detached) not in (Tensor, nn.Parameter) or not detached.is_cpu:

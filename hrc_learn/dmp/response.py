@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import fits_numpy
+from hrc_learn.dmp._arguments import fits_numpy, transform_level
 from hrc_learn.dmp.dynamics import Basis, SpringDamper, approach_state, minimum_jerk_curve
 
 GAUSS_POINTS = 12
@@ -116,44 +116,24 @@ class PiecewisePolynomial:
 
 @dataclass(frozen=True, eq=False)
 class TimeGrid:
-    """A time grid with its response matrices, and what it takes to recognise it again."""
+    """A time grid with its response matrices."""
 
     s: Tensor
-    address: int
     version: int
-    """Version counter of the tensor; -1 if it has none."""
-    memory: np.ndarray | None
-    """View of the current values; None on another device than the CPU."""
+    """Version counter of the tensor, where its values cannot be read; see `holds`."""
     content: bytes
     """Values when the matrices were made."""
-    copy: Tensor
     matrices: tuple[Tensor, Tensor, Tensor]
     to_position: np.ndarray | None
     """The first of the matrices in NumPy; None on another device than the CPU."""
 
-    @classmethod
-    def of(cls, s: Tensor, matrices: tuple[Tensor, Tensor, Tensor]) -> "TimeGrid":
-        """Make an entry for times that nothing differentiates, maps or traces."""
-        memory = s.detach().numpy() if s.is_cpu else None
-        content = b"" if memory is None else memory.tobytes()
-        version = -1 if s.is_inference() else s._version
-        H = None if memory is None else matrices[0].numpy()
-        address, copy = s.data_ptr(), s.detach().clone()
-        return cls(s, address, version, memory, content, copy, matrices, H)
-
-    def equals(self, s: Tensor) -> bool:
-        """True if `s` holds the same times, in whatever tensor."""
-        same = self.copy.dtype == s.dtype and self.copy.device == s.device
-        return same and torch.equal(self.copy, s)
-
-    def is_unchanged(self, s: Tensor) -> bool:
-        """True if `s` is the same tensor and still holds the same times."""
-        if s is not self.s or s.data_ptr() != self.address:
-            return False
-        if self.memory is None:  # reading would wait for all work queued on the device
-            return self.version >= 0 and s._version == self.version
-        # Writes that bypass PyTorch, such as through `data`, do not raise the version.
-        return s.numel() == self.memory.size and self.memory.tobytes() == self.content
+    def holds(self, s: Tensor) -> bool:
+        """True if `s` has the same times. Nothing may trace it, or differentiate by it."""
+        # Reading another device would wait for its queue, and transforms refuse it.
+        if not s.is_cpu or transform_level() is not None:
+            return s is self.s and s._version == self.version
+        same = s.dtype == self.s.dtype and self.s.is_cpu
+        return same and s.numpy().tobytes() == self.content
 
 
 class Response:
@@ -207,25 +187,25 @@ class Response:
             s: Normalised times, all >= 0.
             dtype: dtype of the result.
         """
-        latest = self._latest
-        if latest is not None and latest.equals(s) and latest.matrices[0].dtype == dtype:
-            # The memory of a tensor inside a transform cannot be viewed.
-            if latest.s is not s and fits_numpy(s):
-                self._latest = TimeGrid.of(s, latest.matrices)
-            return latest.matrices
-        key = (s.detach().cpu().numpy().tobytes(), s.dtype, s.device, dtype)
-        if key not in self._matrices:
-            self._matrices[key] = self._transposed(s, dtype)
-            if len(self._matrices) > GRIDS_KEPT:
-                self._matrices.popitem(last=False)
-        self._matrices.move_to_end(key)
-        self._latest = TimeGrid.of(s, self._matrices[key])
-        return self._matrices[key]
+        latest = self.latest_grid(s)
+        if latest is None or latest.matrices[0].dtype != dtype:
+            content = s.detach().cpu().numpy().tobytes()
+            key = content, s.dtype, s.device, dtype
+            if key not in self._matrices:
+                self._matrices[key] = self._transposed(s, dtype)
+                if len(self._matrices) > GRIDS_KEPT:
+                    self._matrices.popitem(last=False)
+            self._matrices.move_to_end(key)
+            matrices = self._matrices[key]
+            version = -1 if s.is_inference() else s._version
+            H = matrices[0].numpy() if s.is_cpu else None
+            self._latest = latest = TimeGrid(s, version, content, matrices, H)
+        return latest.matrices
 
     def latest_grid(self, s: Tensor) -> TimeGrid | None:
-        """Entry of the last call of `matrices` if it was for this tensor, unchanged since."""
+        """Entry of the last call of `matrices` if it was for these times."""
         latest = self._latest
-        if latest is None or torch.compiler.is_compiling() or not latest.is_unchanged(s):
+        if latest is None or torch.compiler.is_compiling() or not latest.holds(s):
             return None
         return latest
 

@@ -131,7 +131,10 @@ class Trajectory(ArrayOutputs):
         X = self._coordinates
         if order:
             X = X / self.duration[..., None, None] ** order
-        shared = latest is not None or (s.ndim == 1 and not s.requires_grad and readable(s))
+        # Under a derivative transform, matrices made here could not be kept.
+        shared = latest is not None or (
+            s.ndim == 1 and not s.requires_grad and readable(s.detach())
+        )
         if order > 2 or not shared:
             return self._at_ragged_times(X, order)
         y = product(X, self._response.matrices(s, X.dtype)[order]).mT

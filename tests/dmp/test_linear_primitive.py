@@ -417,6 +417,20 @@ def test_transforms_see_through_rollouts_without_gradients():
     torch.testing.assert_close(tangent, moved)
 
 
+def test_the_first_rollout_may_be_inside_a_transform():
+    """Its grid has no matrices yet, and none can be made there."""
+    time, position = arm_motion(n_samples=61, n_joints=2)
+    dmp = JointDMP.fit(time, position, 9)
+    moved = dmp.with_coordinates(dmp.coordinates().detach(), timestamps=dmp.timestamps / 2)
+    tangent = torch.ones(2, dtype=torch.float64)
+
+    def end(goal):
+        return moved.rollout(goal=goal).position[-1]
+
+    _, change = torch.func.jvp(end, (dmp.goal,), (tangent,))
+    torch.testing.assert_close(change, (end(dmp.goal + 1) - end(dmp.goal)).detach())
+
+
 def test_swapped_parameters_are_those_that_move():
     dmp = fitted()
     other = {"weights": 0.5 * dmp.weights.detach(), "goal": dmp.goal + 0.1}
