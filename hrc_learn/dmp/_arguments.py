@@ -90,7 +90,7 @@ def readable(*tensors: Tensor) -> bool:
     return True
 
 
-transform_level = getattr(
+_transform_level = getattr(
     torch._C._functorch,  # pyright: ignore[reportAttributeAccessIssue]
     "maybe_current_level",
     lambda: 0,
@@ -99,6 +99,11 @@ transform_level = getattr(
 
 A PyTorch version without this function counts as always inside a transform.
 """
+
+
+def transforming() -> bool:
+    """True inside `torch.func` transforms and forward derivatives, which read no memory."""
+    return _transform_level() is not None or forward_ad._current_level >= 0
 
 
 def fits_numpy(detached: Tensor, *others: Any) -> bool:
@@ -112,7 +117,7 @@ def fits_numpy(detached: Tensor, *others: Any) -> bool:
     """
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return False
-    if transform_level() is not None or forward_ad._current_level >= 0:
+    if transforming():
         return False
     dtype = detached.dtype
     if type(detached) not in (Tensor, nn.Parameter) or not detached.is_cpu:

@@ -69,7 +69,6 @@ def step(
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
     scale: Callable[[Tensor], Tensor],
-    target: Float[Tensor, "*batch D"],
     goal_filter: float | None,
     push: Float[Tensor, "*#batch D"] | None,
     pace: Float[Tensor, "*batch"],
@@ -82,12 +81,11 @@ def step(
         response: Response of the primitive.
         weights: Weights of the unscaled forcing term.
         scale: Scaling of states (*batch, K, D) that the forcing term causes.
-        target: Commanded goal.
         goal_filter: Rate in dg/ds = -rate (g - target); None: the goal jumps to its target.
         push: Constant second derivative by s added to the motion.
         pace: Speed of the clock, stored for the velocity.
     """
-    spring, s = response.spring, state.s + ds
+    spring, s, target = response.spring, state.s + ds, state.target
     now = host_value(s)
     if isinstance(now, float):
         forced = torch.from_numpy(response.forced.at(now))
@@ -158,7 +156,6 @@ def numpy_step(
 def uncoupled_step(
     state: DMPState,
     dt: float,
-    target: Float[Tensor, "*batch D"],
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
 ) -> DMPState | None:
@@ -171,7 +168,7 @@ def uncoupled_step(
         batch, on another device or not in float64.
     """
     tensors = (
-        *(weights, state.position, state.rate, target, state.forced),
+        *(weights, state.position, state.rate, state.target, state.forced),
         *(state.s, state.duration, state.pace, state.displacement),
     )
     if weights.ndim != 2 or weights.dtype is not torch.float64:
@@ -191,14 +188,14 @@ def uncoupled_step(
     y = np.empty_like(before)
     y[0], y[1] = state.position.numpy(), state.rate.numpy()
     E = response.spring.propagator(ds).numpy()
-    y = numpy_step(E, y, before, after, target.numpy())
+    y = numpy_step(E, y, before, after, state.target.numpy())
     return DMPState(
         position=torch.from_numpy(y[0]),
         rate=torch.from_numpy(y[1]),
         start=state.start,
-        goal=target,
+        goal=state.target,
         displacement=state.displacement,
-        target=target,
+        target=state.target,
         duration=state.duration,
         pace=_FULL_PACE,
         s=torch.from_numpy(np.array(now)),

@@ -378,7 +378,6 @@ class LinearPrimitive(nn.Module):
         state: DMPState,
         dt: Scalars,
         *,
-        goal: Vectors | None = None,
         goal_filter: float | None = None,
         external_acceleration: Vectors | None = None,
         phase_stopping: Scalars | None = None,
@@ -392,18 +391,13 @@ class LinearPrimitive(nn.Module):
         if not isinstance(dt, float):
             dt = to_tensor(dt, torch.float64, state.duration.device)
         check_not_negative("dt", dt)
-        target = state.target
-        if goal is not None:
-            target = checked_vector("goal", goal, state.goal).expand_as(state.goal)
         if (
             isinstance(dt, float)
             and goal_filter is external_acceleration is None
             and phase_stopping is forcing_gain is None
             and self.scaling == "none"
         ):
-            fast = closed_loop_step.uncoupled_step(
-                state, dt, target, self.response, self.weights
-            )
+            fast = closed_loop_step.uncoupled_step(state, dt, self.response, self.weights)
             if fast is not None:
                 return fast
         # Duration of the motion at the pace of this step.
@@ -423,14 +417,13 @@ class LinearPrimitive(nn.Module):
                     f"{tuple(push.shape)}"
                 )
             push = push * state.duration[..., None] ** 2
-        attractor = target if goal_filter is None else state.goal
+        attractor = state.target if goal_filter is None else state.goal
         return closed_loop_step.step(
             state,
             self._normalised_step(dt, duration),
             response=self.response,
             weights=self.weights,
             scale=self._scaling_between(state.start, attractor, forcing_gain),
-            target=target,
             goal_filter=goal_filter,
             push=push,
             pace=pace,

@@ -192,12 +192,9 @@ class MotionComponents(nn.Module):
             low, high = low[..., 0, :], high[..., 0, :]
             turned = points[1].clamp(low, high) * (1 + TURN) - TURN * points[1]
             turned = turned.clamp(low, high)
-            points[2] = torch.where(
-                points[1] > high, torch.minimum(points[2], turned), points[2]
-            )
-            points[2] = torch.where(
-                points[1] < low, torch.maximum(points[2], turned), points[2]
-            )
+            most = torch.where(points[1] > high, turned, torch.inf)
+            least = torch.where(points[1] < low, turned, -torch.inf)
+            points[2] = points[2].clamp(least, most)
         return torch.stack(torch.broadcast_tensors(*points), -2), duration
 
     def _features(self, first: Tensor, velocity: Tensor | None) -> Float[Tensor, "*batch K"]:

@@ -40,8 +40,6 @@ from hrc_learn.dmp.trajectory import ContinuedTrajectory, output
 
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function at which the modes of a motion are computed."""
-COMPARED = 30
-"""Times at which motions are compared by their divergence."""
 ENCODING_NOISE = 1e-4
 """Noise of encoded samples relative to the amplitude: far below the differences of motions."""
 
@@ -453,7 +451,7 @@ class MotionDistribution:
         return mean, root.norm(dim=-1)
 
     def kl(
-        self, other: "MotionDistribution", time: Times | None = None, noise: float = 1e-3
+        self, other: "MotionDistribution", time: Times, noise: float = 1e-3
     ) -> Float[Tensor, "*batch"]:
         """KL divergence KL(self || other) of positions observed with noise.
 
@@ -461,14 +459,9 @@ class MotionDistribution:
 
         Args:
             other: Distribution of motions with as many columns.
-            time: [s], (T,); by default `COMPARED` times of the longest motion.
+            time: Times at which motions are compared [s], (T,).
             noise: Standard deviation of each position.
         """
-        if time is None:
-            head = self.head
-            last = head.longest + head.latest
-            first = 0.0 if self.state["since"] is None else to_tensor(self.state["since"]).max()
-            time = torch.linspace(float(first), last, COMPARED, dtype=torch.float64)
         return kl_divergence(self._observed(time, noise), other._observed(time, noise))
 
     def _observed(self, time: Times, noise: float) -> LowRankMultivariateNormal:

@@ -8,7 +8,7 @@ position, orientation error and body, and a moving goal is the frame in which jo
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import Any, ClassVar, NamedTuple, TypedDict, Unpack
+from typing import Any, ClassVar, TypedDict, Unpack
 
 import torch
 from jaxtyping import Float
@@ -40,14 +40,6 @@ REFIT_SAMPLES = 20
 """Samples per basis function when a motion is fitted again: more do not change the result."""
 
 
-class ColumnPoints(NamedTuple):
-    """Columns at the times of via points, (*batch, n, D); NaN leaves a value free."""
-
-    position: Tensor
-    velocity: Tensor
-    """Velocity, per second."""
-
-
 class EndOptions(TypedDict, total=False):
     """Ends that some kinds of primitive have."""
 
@@ -57,11 +49,6 @@ class EndOptions(TypedDict, total=False):
     """Body at the goal, (*batch, K); poses only."""
     end_velocity: Vectors | None
     """Velocity at the end [1/s], (*batch, D); moving goals only."""
-
-
-type Retargeted = tuple[DMPState, Any, Any]
-"""Columns, frame, and new goal in columns of a motion that received a new goal under way; the
-goal None keeps that of the columns."""
 
 
 class MotionPrimitive[Value, Path, State](nn.Module):
@@ -118,8 +105,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """Result of a rollout."""
         return columns
 
-    def _retarget(self, columns: DMPState, frame: Any, goal: Any, **options: Any) -> Retargeted:
-        """Columns and frame with a new goal, for the same value and velocity.
+    def _retarget(
+        self, columns: DMPState, frame: Any, goal: Any, **options: Any
+    ) -> tuple[DMPState, Any, Any]:
+        """Columns, frame and goal in columns for a new goal, with the same value and velocity.
 
         Args:
             columns: Current state.
@@ -129,16 +118,15 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """
         return columns, frame, goal
 
-    def _via(self, now: ColumnPoints, value: Any, velocity: Any) -> ColumnPoints:
-        """Via points as columns in the frame of the primitive; see `via_points`.
+    def _via(self, now: Tensor, value: Any, velocity: Any) -> tuple[Tensor, Tensor]:
+        """Via points as columns and their velocities in the frame of the primitive.
 
         Args:
-            now: Columns of the unchanged motion at these times.
+            now: Columns of the unchanged motion at these times, (*batch, n, D).
             value: Values from the caller; None or NaN leaves them free.
             velocity: Velocities from the caller, per second; None or NaN leaves them free.
         """
-        position = via_values(value, now.position)
-        return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
+        return via_values(value, now), via_values(velocity, now, "velocity")
 
     def _acceleration(self, columns: DMPState, frame: Any, coupling: Any) -> Any:
         """Second derivatives of the columns [1/s^2] for a coupling term."""
@@ -277,11 +265,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             forcing_gain: Factor on the forcing term, (*batch).
             goal_body: New goal of the body, (*batch, K); poses only.
         """
-        columns, frame, target = self._retargeted(state, goal, goal_body)
+        columns, frame = self._columns(self.retarget(state, goal, goal_body=goal_body))
         columns = self.motion.step_columns(
             columns,
             dt,
-            goal=target,
             goal_filter=goal_filter,
             external_acceleration=(
                 None if coupling is None else self._acceleration(columns, frame, coupling)
@@ -303,11 +290,13 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             goal: (*batch).
             goal_body: Goal of the body, (*batch, K); poses only.
         """
-        columns, frame, target = self._retargeted(state, goal, goal_body)
-        if target is not None:
-            target = checked_vector("goal", target, columns.target)
-            columns = replace(columns, target=target.expand_as(columns.target))
-        return self.state_of(columns, frame)
+        if goal is None and goal_body is None:
+            return state
+        columns, frame = self._columns(state)
+        given = self._given(goal_body=goal_body)
+        columns, frame, target = self._retarget(columns, frame, goal, **given)
+        target = checked_vector("goal", target, columns.target).expand_as(columns.target)
+        return self.state_of(replace(columns, target=target), frame)
 
     def condition[S: "MotionPrimitive"](
         self: S,
@@ -360,11 +349,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         motion = self.motion
         time = seconds(time, motion.start.device)
         duration = motion.duration.double()[..., None]
-        now = motion.rollout_columns(Boundary(), motion.duration, time.detach())
-        now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
-        via = self._via(now, value, velocity)
-        rate = via.velocity * duration[..., None]
-        return ViaPoints(s=time / duration, position=via.position, rate=rate)
+        now = motion.rollout_columns(Boundary(), motion.duration, time.detach()).position
+        position, per_s = self._via(now.detach().double(), value, velocity)
+        rate = per_s * duration[..., None]
+        return ViaPoints(s=time / duration, position=position, rate=rate)
 
     def with_boundary[S: "MotionPrimitive"](
         self: S,
@@ -446,14 +434,6 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         tau = self.motion.resolve_duration(duration, speed)
         columns, frame = self._boundary(given, tau, **self._given(**options))
         return columns, tau, frame
-
-    def _retargeted(
-        self, state: State, goal: Value | None, goal_body: Vectors | None
-    ) -> Retargeted:
-        columns, frame = self._columns(state)
-        if goal is None and goal_body is None:
-            return columns, frame, None
-        return self._retarget(columns, frame, goal, **self._given(goal_body=goal_body))
 
     def _given(self, **options: Any) -> dict[str, Any]:
         """Arguments that are not None.

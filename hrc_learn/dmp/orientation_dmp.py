@@ -26,12 +26,7 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
-from hrc_learn.dmp.motion_primitive import (
-    ColumnPoints,
-    Retargeted,
-    WrappedPrimitive,
-    via_values,
-)
+from hrc_learn.dmp.motion_primitive import WrappedPrimitive, via_values
 from hrc_learn.dmp.orientation_error import (
     fitted_error,
     reference_of,
@@ -265,7 +260,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         frame: Tensor,
         goal: Value | None,
         goal_body: Vectors | None = None,
-    ) -> Retargeted:
+    ) -> tuple[DMPState, Tensor, Tensor]:
         target, (P, B) = columns.target, self._others
         if goal is not None:
             position, rotation = self._parts("goal", goal)
@@ -311,17 +306,16 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         return push
 
     def _via(
-        self, now: ColumnPoints, value: Value | None, velocity: Points | None
-    ) -> ColumnPoints:
-        position, E, (P, B) = now.position, self.error_columns, self._others
+        self, now: Tensor, value: Value | None, velocity: Points | None
+    ) -> tuple[Tensor, Tensor]:
+        E, (P, B) = self.error_columns, self._others
         place, rotation = self._parts("value", value)
-        twist = via_values(velocity, now.velocity, "velocity", columns=E.stop)
-        error, rate = _via_errors(
-            self.reference, position[..., E], rotation, twist[..., P.stop :]
-        )
-        place, body = via_values(place, position[..., P]), via_values(None, position[..., B])
-        return ColumnPoints(
-            torch.cat([place, error, body], -1), torch.cat([twist[..., P], rate, body], -1)
+        twist = via_values(velocity, now, "velocity", columns=E.stop)
+        error, rate = _via_errors(self.reference, now[..., E], rotation, twist[..., P.stop :])
+        place, body = via_values(place, now[..., P]), via_values(None, now[..., B])
+        return (
+            torch.cat([place, error, body], -1),
+            torch.cat([twist[..., P], rate, body], -1),
         )
 
     @classmethod
@@ -422,7 +416,9 @@ def _formulated(name: Any) -> type[JointDMP]:
     return formulations[name]
 
 
-def _via_errors(reference: Tensor, error: Tensor, value: Any, velocity: Any) -> ColumnPoints:
+def _via_errors(
+    reference: Tensor, error: Tensor, value: Any, velocity: Any
+) -> tuple[Tensor, Tensor]:
     """Via points of an orientation as errors and their rates [rad/s]; NaN where free.
 
     Args:
@@ -440,7 +436,7 @@ def _via_errors(reference: Tensor, error: Tensor, value: Any, velocity: Any) -> 
     omega = via_values(velocity, error, "velocity")
     unknown = omega.isnan().any(-1, keepdim=True)
     rate = orientation_error.error_rate(torch.where(free, error, via), omega.nan_to_num())
-    return ColumnPoints(via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan))
+    return via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan)
 
 
 def _join(

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import fits_numpy, transform_level
+from hrc_learn.dmp._arguments import fits_numpy, transforming
 from hrc_learn.dmp.dynamics import Basis, SpringDamper, approach_state, minimum_jerk_curve
 
 GAUSS_POINTS = 12
@@ -130,7 +130,7 @@ class TimeGrid:
     def holds(self, s: Tensor) -> bool:
         """True if `s` has the same times. Nothing may trace it, or differentiate by it."""
         # Reading another device would wait for its queue, and transforms refuse it.
-        if not s.is_cpu or transform_level() is not None:
+        if not s.is_cpu or transforming():
             return s is self.s and s._version == self.version
         same = s.dtype == self.s.dtype and self.s.is_cpu
         return same and s.numpy().tobytes() == self.content

@@ -21,7 +21,7 @@ SEARCH_RANGE = 0.1
 HIGH_PEAK = 0.9
 """Height of a peak of the autocorrelation, relative to the highest, that counts as high."""
 GOLDEN = (5**0.5 - 1) / 2
-"""Fraction of an interval that a golden-section search keeps; it reuses one of two points."""
+"""Fraction of an interval that a golden-section search keeps."""
 SEARCH_RIDGE = 1e-6
 """Ridge during the search for a period: larger than that of the fit, for a smooth misfit."""
 PERIOD_ERROR = 1e-6
@@ -101,17 +101,12 @@ def find_period(
         x = _solve(response, s, y, SEARCH_RIDGE)
         return (response.state(s)[:, 0] @ x.mT - y).square().sum()
 
-    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    at_left, at_right = misfit(left), misfit(right)
     while high - low > PERIOD_ERROR * rough:
-        if at_left < at_right:
-            high, right, at_right = right, left, at_left
-            left = high - GOLDEN * (high - low)
-            at_left = misfit(left)
+        left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        if misfit(left) < misfit(right):
+            high = right
         else:
-            low, left, at_left = left, right, at_right
-            right = low + GOLDEN * (high - low)
-            at_right = misfit(right)
+            low = left
     return (low + high) / 2
 
 

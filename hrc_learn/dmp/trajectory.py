@@ -133,7 +133,7 @@ class Trajectory(ArrayOutputs):
             X = X / self.duration[..., None, None] ** order
         # Under a derivative transform, matrices made here could not be kept.
         shared = latest is not None or (
-            s.ndim == 1 and not s.requires_grad and readable(s.detach())
+            s.ndim == 1 and not s.requires_grad and readable(s, s.detach())
         )
         if order > 2 or not shared:
             return self._at_ragged_times(X, order)
