@@ -94,7 +94,6 @@ class ArmLoop:
         joint_position: Float[Tensor, "*batch n"],
         time: float = 0.0,
         joint_velocity: Float[Tensor, "*batch n"] | None = None,
-        joint_acceleration: Float[Tensor, "*batch n"] | None = None,
     ) -> ArmLoopState:
         """State of arms that follow no path.
 
@@ -102,15 +101,12 @@ class ArmLoop:
             joint_position: Joint positions [rad].
             time: Reading of the clock [s].
             joint_velocity: Measured joint velocities [rad/s]; None: at rest.
-            joint_acceleration: Joint accelerations [rad/s^2]; None: zero.
         """
         still = torch.zeros_like(joint_position)
         clock = still[..., 0] + time
         never = torch.zeros_like(clock, dtype=torch.bool)
         return ArmLoopState(
-            safety=self.safety.initial_state(
-                joint_position, joint_velocity, joint_acceleration
-            ),
+            safety=self.safety.initial_state(joint_position, joint_velocity),
             pace=TaskPace.begin(clock, self.config.speed),
             null_velocity=still,
             return_velocity=still,

@@ -174,7 +174,7 @@ def taught_correction(
             quaternion.multiply(measured.orientation, rotation),
         )
     encoders = torch.from_numpy(world.arm.read().joint_position)
-    return PlaceCorrection.of(world.arm.robot.chain.forward(encoders), place)
+    return PlaceCorrection(read=world.arm.robot.chain.forward(encoders), place=place)
 
 
 def random_start(

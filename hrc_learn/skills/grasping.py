@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -29,7 +28,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraConfig, CameraEstimator
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.marker_sensor import longest_occlusion
+from hrc_learn.skills.marker_sensor import SeenFeature, longest_occlusion
 from hrc_learn.skills.placing import GraspObject, Plan, Workplace
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
@@ -282,7 +281,6 @@ class Grasping:
                 f"detect: the camera does not see marker {item.marker.id} of {item.name!r}. "
                 "Move the object into the camera's view, and the arm out of it."
             )
-        pixel, angle = detected
         posture = self._posture()
         return ServoTarget(
             config=self._config.servo,
@@ -290,21 +288,21 @@ class Grasping:
             posture=posture,
             rest=posture if self._cell.config.after_push == "return" else None,
             visual=self._visual,
-            item=pixel,
-            angle=angle,
+            item=detected.pixel,
+            angle=detected.angle,
             turn_range=self._workplace.hover_turns,
         )
 
-    def _detect(self, item: GraspObject) -> tuple[Float[np.ndarray, "2"], float] | None:
-        """Pixel and direction of an object's marker; None if it is not detected in time."""
+    def _detect(self, item: GraspObject) -> SeenFeature | None:
+        """An object's marker in the image; None if it is not detected in time."""
         cell = self._cell
         cell.begin_phase("detect")
         deadline = cell.time + self._config.detection_timeout
-        while item.marker.id not in (seen := cell.wait_for_detection()).pixels:
+        while item.marker.id not in (seen := cell.wait_for_detection().features):
             if cell.time >= deadline:
                 return None
             cell.hold_pose(cell.config.detect_every * cell.config.dt)
-        return seen.pixels[item.marker.id], seen.angles[item.marker.id]
+        return seen[item.marker.id]
 
     def _posture(self) -> Float[Tensor, " joints"]:
         """Joint positions above the table with free paths from here and to home.

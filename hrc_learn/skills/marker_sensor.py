@@ -135,10 +135,8 @@ class MarkerObservation:
     """Time at which the image was taken [s]."""
     joints: Float[Tensor, " joints"] | None = None
     """Joint positions at that time [rad]."""
-    pixels: Mapping[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
-    """Centre of each marker in it, by number (u, v) [px]."""
-    angles: Mapping[int, float] = field(default_factory=dict)
-    """Direction of each marker in it, by number [rad]."""
+    features: Mapping[int, SeenFeature] = field(default_factory=dict)
+    """Markers in it, by number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,8 +211,7 @@ class DelayedDetection:
             MarkerObservation(
                 time=self._taken,
                 joints=self._joints_at(self._taken, time, joints),
-                pixels={id: seen.pixel for id, seen in found.items()},
-                angles={id: seen.angle for id, seen in found.items()},
+                features=found,
             )
         )
 

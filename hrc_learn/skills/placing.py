@@ -187,24 +187,18 @@ class PlaceCorrection:
     arm's repeatability remains.
     """
 
-    shift: Float[Tensor, "3"]
-    """Error of positions, base frame [m]."""
-    turn: Float[Tensor, "4"]
-    """Error of orientations, tool frame (w, x, y, z)."""
-
-    @classmethod
-    def of(cls, read: Pose, place: Pose) -> "PlaceCorrection":
-        """Correction from the pose read with the tool at a known place."""
-        back = quaternion.conjugate(place.orientation)
-        return cls(
-            shift=read.position - place.position,
-            turn=quaternion.multiply(back, read.orientation),
-        )
+    read: Pose
+    """Pose that the arm reads with its tool at the known place."""
+    place: Pose
+    """The known place."""
 
     def apply(self, place: Pose) -> Pose:
         """Pose that the arm reads with its tool at another place."""
-        turned = quaternion.multiply(place.orientation, self.turn)
-        return Pose(place.position + self.shift, turned)
+        shift = self.read.position - self.place.position
+        back = quaternion.conjugate(self.place.orientation)
+        turn = quaternion.multiply(back, self.read.orientation)
+        turned = quaternion.multiply(place.orientation, turn)
+        return Pose(place.position + shift, turned)
 
 
 @dataclass(frozen=True, kw_only=True)

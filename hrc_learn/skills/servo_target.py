@@ -370,7 +370,8 @@ class ServoTarget:
         move the gripper sideways.
         """
         camera = camera if self.kept_camera is None else self.kept_camera
-        height = pose.position[2].clamp(min=self.lowest)
+        lower_wall = float(self.above.position[2]) - self.config.half_size[2]
+        height = pose.position[2].clamp(min=lower_wall)
         return self.visual(
             camera, torch.from_numpy(self.item), self.demonstrated, height
         ).numpy()
@@ -389,11 +390,6 @@ class ServoTarget:
         offset = quaternion.rotate(self.tool_orientation, torch.from_numpy(self.visual.offset))
         height = float(self.above.position[2] + offset[2])
         return object_heading(camera, torch.from_numpy(self.item), self.angle, height)
-
-    @property
-    def lowest(self) -> float:
-        """Lower wall of the box [m]."""
-        return float(self.above.position[2]) - self.config.half_size[2]
 
     @property
     def demonstrated(self) -> Pose:

@@ -28,7 +28,7 @@ from hrc_learn.jacobian import CameraEstimator, CameraSpread
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
 from hrc_learn.protocols import HumanInput
 from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsState
-from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation
+from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation, SeenFeature
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import MarkerAngle
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
@@ -40,6 +40,7 @@ _PROBE_FRACTIONS = np.array([1.0, 0.75, 0.5])
 # camera may be turned in a wholly different way.
 _LOST = 0.03
 _NOT_SEEN = np.full(2, np.nan)
+_NOT_FOUND = SeenFeature(_NOT_SEEN, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -312,7 +313,7 @@ class ServoStep:
 
     def feature(self, reading: ServoReading) -> Float[np.ndarray, "2"]:
         """Pixel of the end effector's marker; NaN if it is not detected [px]."""
-        return reading.markers.pixels.get(self.marker, _NOT_SEEN)
+        return reading.markers.features.get(self.marker, _NOT_FOUND).pixel
 
     def _visible_feature(
         self, state: ServoState, reading: ServoReading

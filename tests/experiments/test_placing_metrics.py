@@ -122,7 +122,7 @@ def test_a_correction_shifts_and_turns_in_the_frame_of_the_tool():
     shift = torch.tensor([1e-3, -2e-3, 3e-3], dtype=torch.float64)
     read = Pose(place.position + shift, quaternion.multiply(place.orientation, turn))
     other = WORKPLACE.shelf("upper")
-    corrected = PlaceCorrection.of(read, place).apply(other)
+    corrected = PlaceCorrection(read=read, place=place).apply(other)
     torch.testing.assert_close(corrected.position - other.position, shift)
     back = quaternion.multiply(quaternion.conjugate(other.orientation), corrected.orientation)
     torch.testing.assert_close(back, turn)

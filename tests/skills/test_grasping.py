@@ -41,6 +41,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MissedGraspError, grasping
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping
+from hrc_learn.skills.marker_sensor import SeenFeature
 from hrc_learn.skills.placing import check_plan
 from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -319,7 +320,8 @@ def test_the_null_space_goes_back_to_the_posture_above_the_table(
     world.reset(WORKPLACE.home_joints().numpy())
     cell = unled_cell(world, after_push=after_push)
     task = Grasping(cell, WORKPLACE, skill)
-    monkeypatch.setattr(task, "_detect", lambda item: (np.array([700.0, 500.0]), 0.0))
+    seen = SeenFeature(np.array([700.0, 500.0]), 0.0)
+    monkeypatch.setattr(task, "_detect", lambda item: seen)
     target = task.locate(WORKPLACE.scene.objects[0])
     above = panda.forward(WORKPLACE.hover_joints())
     if after_push == "stay":

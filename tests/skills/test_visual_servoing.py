@@ -17,7 +17,7 @@ from hrc_learn.protocols import HumanInput
 from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MissedGraspError
-from hrc_learn.skills.marker_sensor import MarkerObservation
+from hrc_learn.skills.marker_sensor import MarkerObservation, SeenFeature
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, VisualTarget
 from hrc_learn.skills.visual_servoing import ServoReading, ServoStep, VisualServo
 from hrc_learn.vision.camera_model import IMAGE_SIZE
@@ -51,7 +51,7 @@ def law():
 
 
 def reading(pixel=None, *, time=1.0, image_joints=None, push=0.0):
-    pixels = {} if pixel is None else {MARKER: np.array(pixel)}
+    seen = {} if pixel is None else {MARKER: SeenFeature(np.array(pixel), 0.0)}
     joints = panda.ready + 0.2
     effort = np.zeros(7)
     effort[1] = push
@@ -60,7 +60,7 @@ def reading(pixel=None, *, time=1.0, image_joints=None, push=0.0):
         dt=0.01,
         joints=joints,
         pose=panda.forward(joints),
-        markers=MarkerObservation(time=time - 0.1, joints=image_joints, pixels=pixels),
+        markers=MarkerObservation(time=time - 0.1, joints=image_joints, features=seen),
         human=HumanInput(nullspace_input=effort),
         return_speed=0.4,
     )
@@ -253,7 +253,8 @@ class Cell:
 
     @property
     def observation(self):
-        return MarkerObservation(time=self.time, joints=panda.ready, pixels={MARKER: MIDDLE})
+        seen = {MARKER: SeenFeature(MIDDLE, 0.0)}
+        return MarkerObservation(time=self.time, joints=panda.ready, features=seen)
 
     def execute(self, *_args, **_columns):
         self.time += 0.02

@@ -75,7 +75,7 @@ def test_an_image_counts_for_when_it_was_taken_and_once(cell):
         if observation.joints is not None and observation.time > 0.4:
             seen.append(observation.time)
             assert arm.time - 0.05 - 0.07 - 0.04 - 1e-3 <= observation.time <= arm.time - 0.049
-            assert observation.pixels[7][0] == pytest.approx(observation.time, abs=2e-4)
+            assert observation.features[7].pixel[0] == pytest.approx(observation.time, abs=2e-4)
             # Where the joint was then: it turns at 0.2 rad/s.
             since = arm.q[0] - float(observation.joints[0])
             assert since == pytest.approx(0.2 * (arm.time - observation.time), abs=1e-6)
