@@ -51,7 +51,6 @@ from hrc_learn.controller.task_pace import (
     capped_scale,
     closes_in,
     null_space_input,
-    people_bind,
 )
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import null_projection
@@ -60,6 +59,8 @@ from hrc_learn.pytree import apply_where
 
 # Null-space input below which one that has ended is over [N m].
 _LEAST_INPUT = 0.05
+# Fraction of the task given up by the constraint layer that exceeds rounding.
+_SLOWED = 1e-3
 # Twist below which the task counts as resting (metres and radians mixed) [1/s].
 _AT_REST = 1e-3
 
@@ -297,16 +298,19 @@ class ArmLoop:
     def _slowed_by_people(
         self, reading: ArmReading, sent: Tensor, report: SafetyReport
     ) -> Tensor:
-        """True where people near the arm hold it back."""
-        slowed, people = torch.zeros_like(sent[..., 0], dtype=torch.bool), reading.people
-        if reading.stop is not None:
-            slowed = slowed | reading.stop
+        """True where people near the arm hold it back, or their distance is not known."""
+        slowed, people = reading.stop, reading.people
+        if slowed is None:
+            slowed = torch.zeros_like(sent[..., 0], dtype=torch.bool)
         if people is None:
             return slowed
         slowed = slowed | (people.speed_scale < 1)
-        if report.constraints is not None:
-            config = self.safety.config
-            slowed = slowed | people_bind(people.distances, sent, report.constraints, config)
+        if (layer := report.constraints) is not None:
+            # Limits of the arm itself do not count: a path would wait for them for ever.
+            given_up = (layer.slowed > _SLOWED) & closes_in(
+                people.distances, sent, self.safety.config
+            )
+            slowed = slowed | ~people.distances.known() | ~layer.solved | given_up
         return slowed
 
     def _explained(

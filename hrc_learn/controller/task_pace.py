@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.constraint_layer import ConstraintReport, Distances
+from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.interface import SafetyConfig
 from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
 from hrc_learn.geometry.numerics import check_settings, safe_norm
@@ -18,8 +18,6 @@ from hrc_learn.pytree import pytree, static
 
 # Step of a difference quotient along a motion [s].
 _STEP = 1e-4
-# Fraction of the task given up by the constraint layer that exceeds rounding.
-_SLOWED = 1e-3
 # Margin of the closing speed below which a distance counts as binding [m/s]: what the solver
 # leaves unused is rounding. And the scale below which the arm counts as blocked.
 _BINDING, _BLOCKED = 1e-3, 0.01
@@ -114,26 +112,6 @@ def capped_scale(
     )
     speed = torch.maximum(joints, tool)
     return (cap / speed.clamp(min=torch.finfo(q.dtype).tiny)).clamp(0, 1)
-
-
-def people_bind(
-    distances: Distances,
-    sent: Float[Tensor, "*batch n"],
-    report: ConstraintReport,
-    safety: SafetyConfig,
-) -> Bool[Tensor, "*batch"]:
-    """True where the arm is slowed down by people, or because their distance is not known.
-
-    Limits of the arm itself do not count: a path would wait for them for ever.
-
-    Args:
-        distances: Distances from people.
-        sent: Joint velocity sent to the arm [rad/s].
-        report: Result of the constraint layer.
-        safety: Settings of the safety filter, with constraints.
-    """
-    near = closes_in(distances, sent, safety)
-    return ~distances.known() | ~report.solved | ((report.slowed > _SLOWED) & near)
 
 
 def closes_in(
