@@ -81,7 +81,7 @@ def write_approach(folder: Path) -> None:
 
 
 def write_angle(folder: Path) -> None:
-    MarkerAngle(offset=0.3, spread=0.01).save(folder / "angle.json")
+    MarkerAngle(offset_rad=0.3, spread_rad=0.01).save(folder / "angle.json")
 
 
 def write_results(folder: Path) -> None:

@@ -35,19 +35,15 @@ _KEPT = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
-class _AngleFile:
+class MarkerAngle:
+    """Demonstrated turn of the end effector relative to the object's marker; the fields are
+    those of its file.
+    """
+
     version: Literal[2] = 2
     offset_rad: Radians
-    spread_rad: Radians
-
-
-@dataclass(frozen=True, kw_only=True)
-class MarkerAngle:
-    """Demonstrated turn of the end effector relative to the object's marker."""
-
-    offset: float
     """Heading of the tool's x axis less that of the marker's, modulo half turns [rad]."""
-    spread: float
+    spread_rad: Radians
     """Root mean square deviation of the offset among the demonstrations [rad]."""
 
     @classmethod
@@ -76,7 +72,7 @@ class MarkerAngle:
         # The mean of angles modulo half turns is half the mean of their doubles.
         offset = float(np.angle(np.exp(2j * np.array(differences)).mean())) / 2
         off = (np.array(differences) - offset + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2
-        return cls(offset=offset, spread=float(np.sqrt((off**2).mean())))
+        return cls(offset_rad=offset, spread_rad=float(np.sqrt((off**2).mean())))
 
     def turn(
         self,
@@ -98,7 +94,7 @@ class MarkerAngle:
                 forth.
             chosen: Turn chosen before; None: none.
         """
-        turn, (low, high) = heading + self.offset - _heading(reference), turn_range
+        turn, (low, high) = heading + self.offset_rad - _heading(reference), turn_range
         candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
         if chosen is not None:
             same = min(candidates, key=lambda c: abs(c - chosen))
@@ -109,7 +105,7 @@ class MarkerAngle:
 
     def save(self, path: Path) -> None:
         """Write a JSON file, atomically."""
-        write_json(path, _AngleFile(offset_rad=self.offset, spread_rad=self.spread))
+        write_json(path, self)
 
     @classmethod
     def load(cls, path: Path) -> "MarkerAngle":
@@ -119,8 +115,7 @@ class MarkerAngle:
             FileNotFoundError: There is no such file.
             ValueError: The file is damaged, or has an unknown version.
         """
-        content = read_json(path, _AngleFile, "fit it again")
-        return cls(offset=content.offset_rad, spread=content.spread_rad)
+        return read_json(path, cls, "fit it again")
 
 
 def _heading(orientation: Float[Tensor, "4"]) -> float:
@@ -216,7 +211,7 @@ class VisualServoSkill:
         if self.target is not None:
             values["target_error_px"] = self.target.error
         if self.angle is not None:
-            values["angle_spread_deg"] = math.degrees(self.angle.spread)
+            values["angle_spread_deg"] = math.degrees(self.angle.spread_rad)
         if self.approach is not None:
             values["approach_spread_deg"] = math.degrees(self.approach.spread_rad)
             values["approach_turned_deg"] = math.degrees(self.approach.turned_rad)

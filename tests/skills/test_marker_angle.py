@@ -101,8 +101,8 @@ def test_of_two_ways_to_grasp_the_one_within_reach_is_taken():
 
 
 def test_the_spread_is_that_of_the_demonstrations():
-    assert learned().spread < math.radians(0.3)
-    assert learned(noise=0.05).spread == pytest.approx(0.05, rel=0.5)
+    assert learned().spread_rad < math.radians(0.3)
+    assert learned(noise=0.05).spread_rad == pytest.approx(0.05, rel=0.5)
 
 
 def test_a_saved_angle_is_read_back(tmp_path):
