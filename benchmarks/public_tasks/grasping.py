@@ -3,20 +3,18 @@
 What is seen of the object is where its pixel was at the beginning, so it cannot be moved.
 """
 
-from itertools import count
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from public_tasks.protocol import ACTION, AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
-from hrc_learn.lerobot.arm_teleoperators import ArmExpert, ArmExpertConfig
+from hrc_learn.lerobot.arm_teleoperators import GuidedRobot
 from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot
 
 OBJECT = 2
 """Last numbers of what a `mujoco_arm` observes: the object's pixel."""
-_COUNT = count()
-"""By which the expert tells one work cell from another."""
 
 
 class Grasping:
@@ -29,9 +27,8 @@ class Grasping:
         """Build the work cell."""
         config = ArmEnvConfig(task="grasping", pixels=True, fps=round(self.fps))
         settings = config.gym_kwargs
-        settings["config"].id = f"{next(_COUNT)}"
         self._env = ArmEnv(settings["config"])
-        self.expert: Expert = _Expert(settings["config"].id)
+        self.expert: Expert = _Expert(self._env._robot)
         self.longest = settings["max_episode_steps"]
         self.n_actions = config.features[ACTION].shape[0]
 
@@ -56,17 +53,16 @@ class Grasping:
 class _Expert:
     """The scripted expert with its trembling hand, which knows where the box is."""
 
-    def __init__(self, robot_id: str):
-        self._expert = ArmExpert(ArmExpertConfig(robot_id=robot_id))
+    def __init__(self, robot: MujocoArmRobot):
+        self._robot = robot
 
     def begin(self) -> None:
-        """It looks for the robot that was connected."""
-        if not self._expert.is_connected:
-            self._expert.connect()
+        """From where the arm is."""
+        self._guided = GuidedRobot(self._robot, self._robot.run.expert)
 
     def act(self, seen: Observation) -> Float[np.ndarray, "A"]:
         """What it shows next."""
-        return np.array(list(self._expert.get_action().values()))
+        return np.array(list(self._guided.next()[0].values()))
 
 
 def _parted(seen: dict[str, Any]) -> Observation:

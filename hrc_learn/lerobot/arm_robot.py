@@ -166,25 +166,22 @@ def connected_robots() -> list[ArmRobot]:
     return []
 
 
-def find_robot(id: str | None) -> ArmRobot:
-    """The connected robot with a name, or the only one, for its teleoperator.
+def the_robot() -> ArmRobot:
+    """The only connected robot, for its teleoperator.
 
     LeRobot gives a teleoperator no reference to the robot. One that guides the end effector
     needs the state of the arm.
 
     Raises:
-        DeviceNotConnectedError: There is none, or several and no name is given.
+        DeviceNotConnectedError: There is none, or several.
     """
     robots = connected_robots()
-    found = [robot for robot in robots if id in (None, robot.id)]
-    if len(found) == 1:
-        return found[0]
-    names = ", ".join(repr(robot.id) for robot in robots) or "none"
-    wanted = "a robot of hrc_learn" if id is None else f"one robot with id {id!r}"
-    raise DeviceNotConnectedError(
-        f"this teleoperator guides {wanted} (mujoco_arm or franka_panda); connected: "
-        f"{names}. Give --teleop.robot_id where there are several."
-    )
+    if len(robots) != 1:
+        raise DeviceNotConnectedError(
+            "this teleoperator guides the one connected robot of hrc_learn (such as mujoco_arm "
+            f"or franka_panda), but connected are: {', '.join(map(str, robots)) or 'none'}."
+        )
+    return robots[0]
 
 
 @dataclass(kw_only=True)

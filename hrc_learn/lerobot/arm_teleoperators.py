@@ -15,7 +15,7 @@ from lerobot.utils.decorators import check_if_not_connected
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.kinematics import Arm, panda
-from hrc_learn.lerobot.arm_robot import ArmRobot, Device, find_robot
+from hrc_learn.lerobot.arm_robot import ArmRobot, Device, the_robot
 from hrc_learn.lerobot.arm_values import DOWN, ArmValues
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot
 from hrc_learn.lerobot.person import RobotPage
@@ -78,27 +78,16 @@ class GuidedRobot:
         return action, step.human_input
 
 
-@dataclass(kw_only=True)
-class ArmTeleoperatorConfig(TeleoperatorConfig):
-    """Settings common to all teleoperators of our arms."""
-
-    robot_id: str | None = None
-    """Identifier of the guided robot, if several are connected."""
-
-
 class ArmTeleoperator(Device, Teleoperator):
     """Common part of the teleoperators of our arms."""
 
-    def __init__(self, config: ArmTeleoperatorConfig):
-        super().__init__(config)
-        self._robot_id = config.robot_id
-        self._guided: GuidedRobot | None = None
+    _guided: GuidedRobot | None = None
 
     @property
     def action_features(self) -> dict[str, type]:
         names = ArmValues(panda.chain).action_names("joint")
         with suppress(DeviceNotConnectedError):  # LeRobot asks before it connects the robot
-            names = tuple(self._find().action_features)
+            names = tuple(the_robot().action_features)
         return dict.fromkeys(names, float)
 
     @property
@@ -125,14 +114,10 @@ class ArmTeleoperator(Device, Teleoperator):
             guided = self._guided = GuidedRobot(robot, human())
         return guided
 
-    def _find(self) -> ArmRobot:
-        """The robot that is guided, which is connected after its teleoperator."""
-        return find_robot(self._robot_id)
-
 
 @TeleoperatorConfig.register_subclass("arm_expert")
 @dataclass(kw_only=True)
-class ArmExpertConfig(ArmTeleoperatorConfig):
+class ArmExpertConfig(TeleoperatorConfig):
     """Scripted demonstrator of a `mujoco_arm`; `--teleop.type=arm_expert`."""
 
 
@@ -148,7 +133,7 @@ class ArmExpert(ArmTeleoperator):
 
     @check_if_not_connected
     def get_action(self) -> dict[str, float]:
-        robot = self._find()
+        robot = the_robot()
         if not isinstance(robot, MujocoArmRobot):
             raise ValueError(
                 f"arm_expert knows the scenarios of a mujoco_arm only, not of {robot.name}."
@@ -158,7 +143,7 @@ class ArmExpert(ArmTeleoperator):
 
 @TeleoperatorConfig.register_subclass("arm_page")
 @dataclass(kw_only=True)
-class ArmPageConfig(ArmTeleoperatorConfig):
+class ArmPageConfig(TeleoperatorConfig):
     """Person that guides an arm in a browser; `--teleop.type=arm_page`."""
 
     host: str = "127.0.0.1"
@@ -190,7 +175,7 @@ class ArmPage(ArmTeleoperator):
     def _open(self) -> None:
         arm = panda
         with suppress(DeviceNotConnectedError):  # which LeRobot may connect later
-            arm = self._find().work_arm
+            arm = the_robot().work_arm
         self._serve(arm)
 
     def _serve(self, arm: Arm) -> None:
@@ -204,7 +189,7 @@ class ArmPage(ArmTeleoperator):
 
     @check_if_not_connected
     def get_action(self) -> dict[str, float]:
-        robot = self._find()
+        robot = the_robot()
         if robot.work_arm is not self._arm:
             self._shown.close()
             self._serve(robot.work_arm)

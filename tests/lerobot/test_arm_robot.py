@@ -10,7 +10,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.arm_robot import ArmRobot, connected_robots, find_robot
+from hrc_learn.lerobot.arm_robot import ArmRobot, connected_robots, the_robot
 from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
 from hrc_learn.lerobot.episode_recording import observation_features
 from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
@@ -133,20 +133,17 @@ def test_the_hand_is_observed_on_the_side_where_it_was(simulated):
     assert np.abs(np.diff(vectors, axis=0)).max() < 0.1
 
 
-def test_a_robot_is_found_by_its_name_or_where_it_is_the_only_one(simulated):
-    with pytest.raises(DeviceNotConnectedError, match=r"a robot of hrc.*: none"):
-        find_robot(None)
+def test_a_robot_is_found_where_it_is_the_only_one(simulated):
+    with pytest.raises(DeviceNotConnectedError, match=r"connected are: none"):
+        the_robot()
     left = simulated(scenario="grasping", id="left")
-    assert find_robot(None) is find_robot("left") is left
-    with pytest.raises(DeviceNotConnectedError, match=r"one robot with id 'right' .* 'left'"):
-        find_robot("right")
+    assert the_robot() is left
     right = simulated(scenario="grasping", id="right")
-    assert find_robot("right") is right
-    with pytest.raises(DeviceNotConnectedError, match="'left', 'right'"):
-        find_robot(None)
+    with pytest.raises(DeviceNotConnectedError, match=r"left.*right"):
+        the_robot()
     assert connected_robots() == [left, right]
     left.disconnect()
-    assert find_robot(None) is right
+    assert the_robot() is right
 
 
 def test_an_action_of_the_hand_in_part_is_none_of_it():
