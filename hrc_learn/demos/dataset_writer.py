@@ -1,6 +1,7 @@
 """Recording demonstrations as a LeRobot dataset of version 3.0."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,8 +95,9 @@ class DatasetWriter:
         self.robot_type = robot_type
         self.joint_names = tuple(joint_names)
         self.features = {key: tuple(names) for key, names in (features or {}).items()}
-        self._pose_frames = dict(frames or {})
-        self._details = dict(details or {})
+        self._sidecar = Sidecar(
+            joint_names=self.joint_names, frames=dict(frames or {}), details=dict(details or {})
+        )
         self._given: tuple[str, ...] = ()
         self._task: str | None = None
         self._widths = {
@@ -108,7 +110,7 @@ class DatasetWriter:
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
-        self._video_features = video_features(cameras or {}, self.fps)
+        self._video_features = video_features(cameras or {})
         self._staging = staging_folder(self.root)
         self._images = CameraRecorder(cameras or {}, self.fps, self._staging)
         self._staging.parent.mkdir(parents=True, exist_ok=True)
@@ -346,7 +348,9 @@ class DatasetWriter:
     def _header(self, columns: Sequence[recorded.RecordedColumn]) -> recorded.RecordingHeader:
         """Properties of the dataset; those of a dataset to append to must be the same."""
         features = recorded.lerobot_features(columns) | self._video_features | INDEX_FEATURES
-        theirs = features if self._earlier is None else self._earlier.info["features"]
+        earlier = features if self._earlier is None else self._earlier.info["features"]
+        # LeRobot may have added properties of the videos.
+        theirs = {k: {n: v for n, v in f.items() if n != "info"} for k, f in earlier.items()}
         for key in theirs | features:
             if theirs.get(key) != features.get(key):
                 raise ValueError(
@@ -354,12 +358,10 @@ class DatasetWriter:
                     f"{features.get(key)}; record the same quantities, or a dataset of its own"
                 )
         known = {column.role: column for column in columns if column.role is not None}
-        sidecar = Sidecar(
+        sidecar = replace(
+            self._sidecar,
             units={role: ROLES[role].unit for role in known},
             columns={r: SidecarColumn(key=c.key, names=c.names) for r, c in known.items()},
-            joint_names=self.joint_names,
-            frames=self._pose_frames,
-            details=self._details,
         )
         return recorded.RecordingHeader(
             fps=self.fps, robot_type=self.robot_type, features=features, sidecar=sidecar

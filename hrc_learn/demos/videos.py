@@ -278,23 +278,16 @@ def video_path(folder: Path, key: str, episode: int) -> Path:
     return folder / f"episode_{episode:06d}.{key}.mp4"
 
 
-def video_features(cameras: Mapping[str, tuple[int, int]], fps: float) -> dict[str, dict]:
-    """Features of cameras (name -> height, width) as declared in `meta/info.json`."""
+def video_features(cameras: Mapping[str, tuple[int, int]]) -> dict[str, dict]:
+    """Features of cameras (name -> height, width) as declared in `meta/info.json`.
+
+    LeRobot reads codec and rate from the files.
+    """
     return {
         image_key(camera): {
             "dtype": "video",
             "shape": [height, width, 3],
             "names": ["height", "width", "channels"],
-            "info": {
-                "video.height": height,
-                "video.width": width,
-                "video.codec": "h264",
-                "video.pix_fmt": "yuv420p",
-                "video.fps": fps,
-                "video.channels": 3,
-                "has_audio": False,
-                "is_depth_map": False,
-            },
         }
         for camera, (height, width) in cameras.items()
     }

@@ -82,7 +82,7 @@ def _sound_keys(
     """Numeric columns that a file holds once, and its number of rows."""
     parquet = open_parquet(folder.root, file, entries[0].index)
     rows, schema = parquet.metadata.num_rows, parquet.schema_arrow
-    report.attempt(lambda: require_rows(file, entries, rows, folder.promised_rows[file]))
+    report.attempt(lambda: require_rows(folder, file, rows))
     report.run(_column_faults, folder, file, schema, report)
     numeric = [key for key, feature in folder.features.items() if feature.numeric]
     counts = Counter(schema.names)

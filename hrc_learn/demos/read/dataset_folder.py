@@ -106,14 +106,6 @@ class DatasetFolder:
         starts = accumulate((entry.length for entry in ordered), initial=0)
         return {e.index: start for e, start in zip(ordered, starts, strict=False)}
 
-    @cached_property
-    def promised_rows(self) -> dict[str, int]:
-        """Number of frames in each data file according to the list of episodes."""
-        return {
-            file: max(entry.start + entry.length for entry in entries)
-            for file, entries in self.files.items()
-        }
-
 
 def open_folder(path: str | Path) -> DatasetFolder:
     """Read the metadata of a dataset.

@@ -65,8 +65,7 @@ def read_each(
         try:
             parquet = open_parquet(folder.root, file, listed[0].index)
             if strict:
-                rows = parquet.metadata.num_rows
-                require_rows(file, listed, rows, folder.promised_rows[file])
+                require_rows(folder, file, parquet.metadata.num_rows)
             wanted = _columns(parquet, file, keys, strict)
         except DatasetError as error:
             yield from repeat(error, len(listed))
@@ -159,12 +158,14 @@ def _read_rows(
     return columns
 
 
-def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
+def require_rows(folder: DatasetFolder, file: str, rows: int) -> None:
     """Check the number of frames in a file against the list of episodes.
 
     Raises:
         DatasetError: The file holds more or fewer frames.
     """
+    entries = folder.files[file]
+    promised = max(entry.start + entry.length for entry in entries)
     if rows != promised:
         text = (
             f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
