@@ -24,6 +24,7 @@ from hrc_learn.skills.marker_sensor import FeatureSensor, LatencyConfig
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
+from hrc_learn.teleoperation import CombinedInput
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import TaskPage
 
@@ -205,22 +206,25 @@ def simulated_cell(
         opened = stack.enter_context(access.open(world))
         motion = MotionLog(world, opened.advance)
 
-        def advance(duration: float) -> None:
-            motion.advance(duration)
-            on_step()
-
-        people, advance_all, task = human, advance, None
+        task = None
         if page is not None:
             task = stack.enter_context(TaskPage(world, config.dt, page, title))
             observer.tell(f"Page at {task.url}")
-            people, advance_all = task.joined(human, advance)
+            human = CombinedInput(human, task.human)
+
+        def advance(duration: float) -> None:
+            motion.advance(duration)
+            on_step()
+            if task is not None:
+                task.tick()
+
         cell = WorkCell(
             chain=world.arm.robot.chain,
             arm=opened.arm,
             gripper=opened.gripper,
             sensor=sensor,
-            human=people,
-            advance=advance_all,
+            human=human,
+            advance=advance,
             config=config,
             on_phase=on_phase,
             rng=rng,
@@ -228,7 +232,7 @@ def simulated_cell(
             watch=watch,
         )
         if task is not None:
-            task.follow(cell)
+            task.cell = cell
         stack.enter_context(observer.view(cell, world, motion))
         yield cell, motion
 

@@ -23,6 +23,7 @@ from typing import final
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from hrc_learn.controller import VelocityStep, WantedVelocity
 from hrc_learn.deploy import (
@@ -327,27 +328,19 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         stop=torch.tensor(False),
         dt=CYCLE,
     )
-    if config.load is None or config.load.far_end is None:
-        return _opening(step, example, config)
-    # From the frame of the flange to that of the tool centre point.
-    offset = chain.tcp.new_tensor(config.load.far_end) - chain.tcp[:3, 3]
-    far_end = chain.tcp[:3, :3].T @ offset
-    open_runner = _opening(step, replace(example, load=far_end), config)
-    return partial(_with_load, open_runner, far_end.numpy())
-
-
-def _opening(
-    step: VelocityStep, example: WantedVelocity, config: FrankaConfig
-) -> Callable[[], StepRunner]:
+    if config.load is not None and config.load.far_end is not None:
+        # From the frame of the flange to that of the tool centre point.
+        offset = chain.tcp.new_tensor(config.load.far_end) - chain.tcp[:3, 3]
+        example = replace(example, load=chain.tcp[:3, :3].T @ offset)
+    open_runner = partial(EagerRunner, step, example)
     if config.compiled:
-        return partial(PackageRunner, export_step(step, example))
-    return partial(EagerRunner, step, example)
+        open_runner = partial(PackageRunner, export_step(step, example))
+    return partial(_with_load, open_runner, example.load)
 
 
-def _with_load(
-    open_runner: Callable[[], StepRunner], far_end: Float[np.ndarray, "3"]
-) -> StepRunner:
+def _with_load(open_runner: Callable[[], StepRunner], far_end: Tensor | None) -> StepRunner:
     """The runner with the far end of a load, which stays the same in all cycles."""
     runner = open_runner()
-    runner.observation["load"][:] = far_end
+    if far_end is not None:
+        runner.observation["load"][:] = far_end.numpy()
     return runner

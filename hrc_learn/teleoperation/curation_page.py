@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hrc_learn.demos import DatasetError, Demonstration, open_demos
+from hrc_learn.demos import DatasetError, open_demos
 from hrc_learn.demos.dataset_views import Chart, demonstration_charts
 from hrc_learn.demos.images import ImageReader, jpeg, thumbnail_size
 from hrc_learn.demos.issues import plain_text
@@ -25,7 +24,6 @@ from hrc_learn.demos.quality.repair import (
     write_curated,
 )
 from hrc_learn.demos.read.dataset_folder import open_folder
-from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.store import json_text
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.admission import RefusedError
@@ -36,6 +34,8 @@ _BLOCK = 32
 """Images sent at once: a second of a video, few enough to be shown soon."""
 _TALLEST = 360
 """Images are scaled down to this height [px]."""
+_MOST_LINES = 12
+"""Largest number of curves of a column that is not one of the known quantities."""
 _MOST_POINTS = 2000
 """Points of a curve; of longer ones the extremes of every stretch are sent."""
 _CLIENT = Path(__file__).parent / "curation_client"
@@ -79,9 +79,8 @@ class CurationPage:
         self._features = open_folder(ranking.path).features
         self._lock, self._writing = Lock(), ThreadPoolExecutor(1)
         self._written: Future[str] | None = None
-        files = folder_contents(_CLIENT)
-        contents = {**files, "/": files["/static/index.html"]}
-        self._gate = Gate(config, contents, {"session": self._session}, self.answer)
+        routes = {"session": self._session}
+        self._gate = Gate(config, folder_contents(_CLIENT), routes, self.answer)
         self.url = self._gate.address.link()
 
     def __enter__(self) -> CurationPage:
@@ -96,15 +95,14 @@ class CurationPage:
         """Wait until the page is closed by another thread, or for Ctrl-C."""
         self._gate.wait()
 
-    def answer(self, path: str) -> Content:
-        """Content at a path.
+    def answer(self, path: str) -> Content | None:
+        """Content at a path; None: there is nothing.
 
         Raises:
-            RefusedError: There is nothing at the path, or it cannot be read.
+            RefusedError: It cannot be read.
         """
-        words = path.strip("/").split("/")
         try:
-            match words:
+            match path.strip("/").split("/"):
                 case ["data", "overview"]:
                     return _json(self.overview())
                 case ["data", "state"]:
@@ -115,9 +113,9 @@ class CurationPage:
                     return self.images(int(episode), int(camera), int(first))
         except DatasetError as error:
             raise RefusedError(422, str(error)) from error
-        except (ValueError, LookupError) as error:
-            raise RefusedError(404, "There is nothing here.") from error
-        raise RefusedError(404, "There is nothing here.")
+        except (ValueError, LookupError):  # no such number
+            return None
+        return None
 
     def overview(self) -> dict[str, Any]:
         """All that the page shows before an episode is chosen."""
@@ -155,8 +153,11 @@ class CurationPage:
         """All that moves in an episode, over time."""
         source = open_demos(self.ranking.path, [episode])
         (demo,) = source
-        known = demonstration_charts(demo, source.units)
-        charts = [*known, *_other_charts(demo, self._features)]
+        charts = [*demonstration_charts(demo, source.units)]
+        for key, values in demo.extra.items():  # columns without a meaning, by their own names
+            if 0 < values.shape[1] <= _MOST_LINES:
+                names = map(self._features[key].component, range(values.shape[1]))
+                charts.append(Chart(key, key, "", dict(zip(names, values.T, strict=True))))
         return {
             "time": demo.time,
             "charts": [
@@ -178,17 +179,10 @@ class CurationPage:
         if episode not in self._lengths or not 0 <= first < self._lengths[episode]:
             raise RefusedError(404, "There is no such image.")
         wanted = range(first, min(first + _BLOCK, self._lengths[episode]))
-        height, width = self._size(key)
-        found = [
-            jpeg(image)
-            for _, image in self._images.stream(episode, key, wanted, (height, width))
-        ]
+        size = thumbnail_size(*self._images.size(key), _TALLEST)
+        found = [jpeg(image) for _, image in self._images.stream(episode, key, wanted, size)]
         head = struct.pack(f"<{1 + len(found)}I", len(found), *map(len, found))
         return Content(body=head + b"".join(found), kind="application/octet-stream")
-
-    def _size(self, key: str) -> tuple[int, int]:
-        """Height and width of the images sent [px]; even, as JPEG subsampling requires."""
-        return thumbnail_size(*self._images.size(key), _TALLEST)
 
     async def _session(self, connection: Any, visitor: Visitor) -> None:
         """Take decisions, and answer each with the state or the reason of its refusal."""
@@ -239,14 +233,6 @@ class CurationPage:
 
 def _json(content: Any) -> Content:
     return Content(body=json_text(content, indent=False).encode(), kind="application/json")
-
-
-def _other_charts(demo: Demonstration, features: Mapping[str, Feature]) -> Iterator[Chart]:
-    """Charts of columns without a meaning, by their own names."""
-    for key, values in demo.extra.items():
-        if 0 < values.shape[1] <= 12:
-            names = [features[key].component(i) for i in range(values.shape[1])]
-            yield Chart(key, key, "", dict(zip(names, values.T, strict=True)))
 
 
 def _points(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -101,8 +101,7 @@ def _served(port: int | None, data: Callable[[], Sequence[bytes]]) -> Iterator[s
 
         await first_of(listen(), speak())
 
-    files = folder_contents(_CLIENT)
-    contents = {**files, "/": files["/static/index.html"], **_viewer_contents()}
+    contents = {**folder_contents(_CLIENT), **_viewer_contents()}
     gate = Gate(AddressConfig(port=port), contents, {"session": session})
     gate.start()
     try:

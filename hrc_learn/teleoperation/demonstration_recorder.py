@@ -116,7 +116,15 @@ class RecordingQuality:
         """Frames from shortly before the arm begins to move until shortly after it has stopped;
         None: it does not move.
         """
-        return moving_part(np.array(self._stamps), np.stack(self.states))
+        time, state = np.array(self._stamps), np.stack(self.states)
+        away = np.flatnonzero((np.abs(state - state[0]) > STILL).any(axis=1))
+        not_there = np.flatnonzero((np.abs(state - state[-1]) > STILL).any(axis=1))
+        if not len(away):
+            return None
+        first, end = np.searchsorted(time, time[away[0]] - _REST[0]), len(time)
+        if len(not_there):
+            end = np.searchsorted(time, time[not_there[-1]] + _REST[1], side="right")
+        return slice(int(first), int(end))
 
     def worthless(self) -> str:
         """Why the frames show nothing at all; empty if they show something."""
@@ -170,28 +178,6 @@ def pressed(chain: SerialChain, state: ArmState) -> tuple[str, ...]:
     if force is None or float(np.linalg.norm(force)) < _PRESSES:
         return ()
     return (f"the arm pressed against something with more than {_PRESSES:.0f} N",)
-
-
-def moving_part(
-    time: Float[np.ndarray, " frames"], state: Float[np.ndarray, "frames n"]
-) -> slice | None:
-    """Frames from shortly before an arm begins to move until shortly after it has stopped.
-
-    Args:
-        time: Time of each frame [s].
-        state: Joints [rad] and gripper [m].
-
-    Returns:
-        None where nothing moves.
-    """
-    away = np.flatnonzero((np.abs(state - state[0]) > STILL).any(axis=1))
-    not_there = np.flatnonzero((np.abs(state - state[-1]) > STILL).any(axis=1))
-    if not len(away):
-        return None
-    first, end = np.searchsorted(time, time[away[0]] - _REST[0]), len(time)
-    if len(not_there):
-        end = np.searchsorted(time, time[not_there[-1]] + _REST[1], side="right")
-    return slice(int(first), int(end))
 
 
 RecorderState = Literal["ready", "recording", "stopped"]

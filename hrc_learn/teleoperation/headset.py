@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from hrc_learn.geometry import Body, Box, Capsule, read_mesh
 from hrc_learn.geometry.shapes import Colour
@@ -171,6 +170,8 @@ def body_meshes(body: Body) -> dict[Colour, Trimesh]:
     """All that a body looks like, one mesh for each colour: its own meshes, simplified, and the
     boxes with a name, or else its capsules and boxes in the colour of the first.
     """
+    import trimesh
+
     if not body.meshes:
         shapes = [*map(capsule_mesh, body.capsules), *map(box_mesh, body.boxes)]
         return {(*body.capsules, *body.boxes)[0].colour: _joined(shapes)}
@@ -178,7 +179,9 @@ def body_meshes(body: Body) -> dict[Colour, Trimesh]:
     for file in body.meshes:
         for part in (part.placed(file) for part in read_mesh(file.path)):
             assert part.colour is not None  # a placed part has one
-            parts.setdefault(part.colour, []).append(_mesh(part.vertices, part.faces))
+            # Corners are not merged: edges that have corners of their own stay sharp.
+            mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+            parts.setdefault(part.colour, []).append(mesh)
     for box in body.boxes:
         if box.name:
             parts.setdefault(box.colour, []).append(box_mesh(box))
@@ -204,15 +207,6 @@ def simplified(mesh: Trimesh) -> Trimesh:
     if np.abs(few.bounds - shape.bounds).max() > _OFF:
         return mesh
     return few
-
-
-def _mesh(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Trimesh:
-    import trimesh
-
-    # Corners are not merged: edges that have corners of their own stay sharp.
-    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def _joined(meshes: Sequence[Trimesh]) -> Trimesh:

@@ -23,8 +23,7 @@ from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.store import json_text
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
-from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, messages
-from hrc_learn.teleoperation.gate.admission import RefusedError
+from hrc_learn.teleoperation.gate import AddressConfig, Gate, messages
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.headset import headset_contents, headset_data
 from hrc_learn.teleoperation.page_operator import (
@@ -178,7 +177,7 @@ class Page:
         routes = {"session": self._sockets.session, "view": self._sockets.view}
         contents = {**page_contents(Path(viser.__file__).parent), **headset}
         try:
-            self._gate = Gate(config, contents, routes, self._answer)
+            self._gate = Gate(config, contents, routes, self._data.get)
         except ValueError:
             self._stop_viewer()
             raise
@@ -246,11 +245,6 @@ class Page:
     def show(self, status: PageStatus) -> None:
         """Tell how the session stands."""
         self._status = status
-
-    def _answer(self, path: str) -> Content:
-        if path not in self._data:
-            raise RefusedError(404, "There is nothing here.")
-        return self._data[path]
 
     def _links(self) -> Pose | None:
         state = self.human.state
@@ -335,7 +329,7 @@ class Page:
         """
         control, panel, held = self.control, self._panel, self._held_gizmos
         if control.gone:
-            held.clear()
+            held.release()
         present = control.present
         gizmos = held.held().values() if present else ()
         if gizmos:
@@ -363,7 +357,7 @@ class Page:
 
     def _let_go(self) -> None:
         """Release what was held before control changed."""
-        self._held_gizmos.clear()
+        self._held_gizmos.release()
         self._hands.forget()
 
     def _heard(self, message: messages.Message) -> None:

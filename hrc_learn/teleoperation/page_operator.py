@@ -127,26 +127,22 @@ class HeldGizmos:
                 self._turn = quaternion.normalize(quaternion.multiply(now, self._turn_before))
         self._changed()
 
-    def release(self, key: Key) -> None:
-        """Let go of a gizmo."""
-        self._release(lambda held: held == key)
+    def release(self, holder: Hashable = None, name: str | None = None) -> None:
+        """Let go of a gizmo: one by its name, or all of a holder, or all that are held.
 
-    def release_all(self, holder: Hashable) -> None:
-        """Forget a client that has left."""
-        self._release(lambda held: held[0] == holder)
+        A connection that comes back has to take its gizmo anew.
+        """
 
-    def clear(self) -> None:
-        """Let go of everything: a connection that comes back has to take its gizmo anew."""
-        self._release(lambda _: True)
+        def chosen(key: Key) -> bool:
+            return holder in (None, key[0]) and name in (None, key[1])
 
-    def _release(self, chosen: Callable[[Key], bool]) -> None:
         with self._lock:
-            kept = {key: held for key, held in self._held.items() if not chosen(key)}
-            fewer = len(kept) < len(self._held)
-            self._held = kept
+            released = [key for key in self._held if chosen(key)]
+            for key in released:
+                del self._held[key]
             if self._turning is not None and chosen(self._turning):
                 self._turning = None
-        if fewer:
+        if released:
             self._changed()
 
     def held(self) -> dict[Key, HeldGizmo]:
@@ -200,9 +196,9 @@ class HeadsetHands:
             guides: True if the end effector can be held.
         """
         self._held, self._guides = held, guides
-        self._grips: dict[str, Grip] = {}
+        # None: the next message tells what is held already, and moves nothing.
+        self._grips: dict[str, Grip] | None = None
         self.tracked: Mapping[str, TrackedHand] = {}
-        self._noted = False
 
     def hear(self, hands: Hands) -> None:
         """Take a message over.
@@ -217,10 +213,10 @@ class HeadsetHands:
         now = {
             grip.hand: grip for grip in hands.grips if self._guides or grip.joint is not None
         }
-        if not self._noted:
-            self._grips, self._noted = now, True
+        if self._grips is None:
+            self._grips = now
         for hand in self._grips.keys() - now.keys():
-            self._held.release(("headset", hand))
+            self._held.release("headset", hand)
         for hand, grip in now.items():
             key, pointer = ("headset", hand), np.array(grip.pointer)
             turned = grip.orientation if grip.joint is None else None
@@ -237,7 +233,7 @@ class HeadsetHands:
         """Forget the hands when control changes; held gizmos move nothing until they are taken
         again.
         """
-        self._noted, self.tracked = False, {}
+        self._grips, self.tracked = None, {}
 
 
 class PageHuman(Human):

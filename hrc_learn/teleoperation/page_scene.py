@@ -124,7 +124,7 @@ class PageScene:
             visible=False,
         )
         self._gizmo = self._add_gizmo() if guides or turns else None
-        server.on_client_disconnect(self._release)
+        server.on_client_disconnect(in_loop(lambda client: held.release(client.client_id)))
 
     def move(
         self,
@@ -234,10 +234,6 @@ class PageScene:
         gizmo.on_update(self._gizmo_dragged)
         return gizmo
 
-    async def _release(self, client: Any) -> None:
-        """Forget a client that has left."""
-        self._held.release_all(client.client_id)
-
     def _connect(self, node: Any, joint: int | None, parent: str) -> None:
         if joint is None and not self._guides:
             return
@@ -253,7 +249,7 @@ class PageScene:
             elif event.phase == "update":
                 self._held.move(key, pointer)
             else:
-                self._held.release(key)
+                self._held.release(*key)
 
     def _draw_box(self, box: Box) -> None:
         r, g, b, opacity = box.colour
@@ -296,7 +292,7 @@ class PageScene:
         elif event.phase == "update":
             self._held.move(key, pointer, orientation)
         else:
-            self._held.release(key)
+            self._held.release(*key)
 
 
 _CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)

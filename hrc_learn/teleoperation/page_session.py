@@ -2,7 +2,7 @@
 pulling the arm's body.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -289,7 +289,11 @@ def recorded_frame(step: GuidedStep, hands: Mapping[str, TrackedHand]) -> Frame:
 
 
 class TaskPage(Page):
-    """Page next to a task that runs autonomously: people watch it and pull the arm."""
+    """Page next to a task that runs autonomously: people watch it and pull the arm.
+
+    Attributes:
+        cell: Work cell of the task, whose log is shown; None: it has not begun.
+    """
 
     def __init__(
         self, world: World, dt: float, config: PageConfig, title: str = "Pick and place"
@@ -304,33 +308,13 @@ class TaskPage(Page):
         """
         super().__init__(world, config, guides=False, draws=True)
         self._title, self._rate, self._ticks = title, Rate(dt), 0
-        self._cell: WorkCell | None = None
-
-    def follow(self, cell: WorkCell) -> None:
-        """Show what a task does in a work cell, by its log."""
-        self._cell = cell
-
-    def joined(
-        self, person: Human, advance: Callable[[float], None]
-    ) -> tuple[Human, Callable[[float], None]]:
-        """Combine a person with those at the page, and let time pass for both.
-
-        Args:
-            person: Person near the arm.
-            advance: Advances the world by a time [s].
-        """
-
-        def advance_and_show(duration: float) -> None:
-            advance(duration)
-            self.tick()
-
-        return CombinedInput(person, self.human), advance_and_show
+        self.cell: WorkCell | None = None
 
     def tick(self) -> None:
         """After each control step: show where everything is, and let real time pass."""
         self.place()
-        if self._ticks % _SHOW_EVERY == 0 and self._cell is not None:
-            self.show(self.status(self._cell))
+        if self._ticks % _SHOW_EVERY == 0 and self.cell is not None:
+            self.show(self.status(self.cell))
         self._ticks += 1
         self._rate.wait()
 

@@ -209,7 +209,7 @@ class RegionEditor:
         self._mark = scene.add_icosphere(
             "/target", radius=0.02, color=rgba(VERMILION)[:3], visible=False
         )
-        self._mark.on_drag(self._mark_dragged)
+        self._mark.on_drag(in_loop(lambda event: self.mark(np.array(event.end_position))))
 
     async def _moved(self, event: Any) -> None:
         self.drawn = replace(self.drawn, centre=_triple(event.target.position))
@@ -224,9 +224,6 @@ class RegionEditor:
         if place is not None:
             half_size = np.clip(place - centre, _SMALLEST, _LARGEST)
             self.draw(replace(self.drawn, half_size=_triple(half_size)))
-
-    async def _mark_dragged(self, event: Any) -> None:
-        self.mark(np.array(event.end_position))
 
     def _resized(self, event: Any) -> None:
         if event.client is not None:  # otherwise we have moved the slider ourselves
@@ -257,23 +254,21 @@ class RegionEditor:
             self.draw(region_over(np.array(points), self.drawn.centre[2] - half, 2 * half))
 
     def _mark_above(self, event: Any) -> None:
-        """Mark the target above a point clicked."""
-        point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))
-        if point is not None:
-            self.mark(point + np.array([0.0, 0.0, _LIFTED]))
-
-    def _surface(
-        self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "3"] | None:
-        """Nearest point of the furniture on a ray, else that at the height of the table."""
+        """Mark the target above the nearest point of the furniture that was clicked, else above
+        that at the height of the table.
+        """
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         distances = [
             meet_box(origin, direction, np.array(box.centre), np.array(box.half_size))
             for box in self._boxes
         ]
         nearest = min(distances, default=np.inf)
         if np.isfinite(nearest):
-            return origin + nearest * direction
-        return meet_plane(origin, direction, 2, 0.0)
+            point = origin + nearest * direction
+        else:
+            point = meet_plane(origin, direction, 2, 0.0)
+        if point is not None:
+            self.mark(point + np.array([0.0, 0.0, _LIFTED]))
 
 
 def _once(

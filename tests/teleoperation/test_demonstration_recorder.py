@@ -10,7 +10,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.teleoperation.demonstration_recorder import (
     UNNAMED,
     DemonstrationRecorder,
-    moving_part,
+    RecordingQuality,
 )
 
 FPS = 5.0  # few frames make a demonstration of half a second
@@ -184,8 +184,10 @@ def resting_frames(moves):
 
 
 def without_rest(frames):
-    state = [np.append(f["joint_position"], f["gripper"]) for f in frames]
-    part = moving_part(np.array([f["time"] for f in frames]), np.stack(state))
+    quality = RecordingQuality(FINE)
+    for f in frames:
+        quality.add(f["time"], f["time"], f["joint_position"], f["gripper"])
+    part = quality.moving()
     return None if part is None else frames[part]
 
 

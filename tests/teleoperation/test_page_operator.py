@@ -68,7 +68,7 @@ def test_turns_of_the_rings_add_up_and_stay():
     assert not held.held()
     held.move(first, here, quaternion.multiply(rotation(0.2, 0.0, 0.0), stood).numpy())
     held.move(second, here, quaternion.multiply(rotation(0.9, 0.0, 0.0), stood).numpy())
-    held.release(first)
+    held.release(*first)
     assert not held.turning
     held.move(first, here, rotation(0.0, 1.0, 0.0).numpy())
     np.testing.assert_allclose(held.turn_vector, [0.2, 0.0, 0.0], atol=1e-12)
@@ -76,7 +76,7 @@ def test_turns_of_the_rings_add_up_and_stay():
     held.move(second, here, rotation(0.0, 0.3, 0.0).numpy())
     expected = quaternion.multiply(rotation(0.0, 0.3, 0.0), rotation(0.2, 0.0, 0.0))
     torch.testing.assert_close(held.turn, expected)
-    held.release_all(2)
+    held.release(2)
     assert not held.turning
     held.clear_turn()
     assert held.turn_vector is None
@@ -234,13 +234,13 @@ def test_a_handle_is_held_until_it_is_let_go(grips):
     grips.move((1, "elbow"), np.array([0.3, 0.0, 0.0]))
     (grip,) = grips.held().values()
     assert grip.pointer.tolist() == [0.3, 0.0, 0.0]
-    grips.release((1, "elbow"))
+    grips.release(1, "elbow")
     assert not grips.held()
 
 
 def test_what_was_dropped_moves_nothing_before_it_is_taken_anew(grips):
     grips.take((1, "elbow"), elbow())
-    grips.clear()
+    grips.release()
     grips.move((1, "elbow"), np.array([0.5, 0.0, 0.0]))
     assert not grips.held()
     grips.take((1, "elbow"), elbow())
@@ -251,5 +251,5 @@ def test_people_hold_independently_of_each_other(grips):
     grips.take((1, "elbow"), elbow(0.1))
     grips.take((2, "elbow"), elbow(0.2))
     assert len(grips.held()) == 2
-    grips.release_all(1)
+    grips.release(1)
     assert [holder for holder, _ in grips.held()] == [2]

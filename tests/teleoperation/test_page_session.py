@@ -15,7 +15,7 @@ from hrc_learn.regions import PositionRegion
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
-from hrc_learn.teleoperation import ScriptedPerturbation, page_session
+from hrc_learn.teleoperation import CombinedInput, ScriptedPerturbation, page_session
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.page import Page, PageConfig
 from hrc_learn.teleoperation.page_operator import HeldGizmo
@@ -49,6 +49,16 @@ def beside(world):
     with TaskPage(world, 0.01, PageConfig()) as beside:
         assert beside.url.startswith("http://127.0.0.1:")
         yield beside
+
+
+def joined(beside, person, advance):
+    """A person and those at the page as one, and time that passes for both."""
+
+    def advance_and_show(duration):
+        advance(duration)
+        beside.tick()
+
+    return CombinedInput(person, beside.human), advance_and_show
 
 
 class Asking(Human):
@@ -102,7 +112,7 @@ def test_an_arm_with_a_driver_does_not_go_home_through_a_board(tmp_path):
 
 
 def test_the_script_and_the_page_pull_together_while_somebody_holds_on(world, beside):
-    human, _ = beside.joined(Pulling(), world.advance)
+    human, _ = joined(beside, Pulling(), world.advance)
 
     def effort():
         return human.read(world.arm.read()).effort(7)
@@ -123,7 +133,7 @@ def test_the_script_and_the_page_pull_together_while_somebody_holds_on(world, be
 
 
 def test_time_passes_for_the_world_as_it_does_for_the_person(world, beside):
-    _, advance = beside.joined(Pulling(), world.advance)
+    _, advance = joined(beside, Pulling(), world.advance)
     began = time.perf_counter()
     for _ in range(20):
         advance(0.01)
@@ -132,9 +142,9 @@ def test_time_passes_for_the_world_as_it_does_for_the_person(world, beside):
 
 
 def test_the_page_tells_what_the_task_and_its_safety_filter_do(world, beside):
-    human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
+    human, advance = joined(beside, ScriptedPerturbation(panda, ()), world.advance)
     cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
-    beside.follow(cell)
+    beside.cell = cell
     assert beside.status(cell).doing == "getting ready"
     cell.begin_phase("interact")
     for _ in range(5):
@@ -152,7 +162,7 @@ def test_the_page_tells_what_the_task_and_its_safety_filter_do(world, beside):
 
 def test_the_page_shows_the_region_that_a_controller_follows(world, beside, monkeypatch):
     monkeypatch.setattr(page_session, "_REMARK_STAYS", 0.05)
-    human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
+    human, advance = joined(beside, ScriptedPerturbation(panda, ()), world.advance)
     cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
     cell.region = PositionRegion(
         centre=torch.tensor([0.3, 0.4, 0.2], dtype=torch.float64),
@@ -169,7 +179,7 @@ def test_the_page_shows_the_region_that_a_controller_follows(world, beside, monk
 
 def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, beside):
     page = beside
-    human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
+    human, advance = joined(beside, ScriptedPerturbation(panda, ()), world.advance)
     cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
     # Both the arm's and its twin's, which viser's thread colours one after the other.
     elbows, wrist = page._scene._knobs[4], page._scene._knobs[6][0]
@@ -185,7 +195,7 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
             if holds:
                 page._held_gizmos.take((1, "elbow"), held)
             else:
-                page._held_gizmos.release((1, "elbow"))
+                page._held_gizmos.release(1, "elbow")
             time.sleep(0.02)
 
     def arrow_colour():

@@ -67,12 +67,14 @@ class Content:
 
 
 def folder_contents(folder: Path, prefix: str = "/static/") -> dict[str, Content]:
-    """Files of a folder, by path."""
-    return {
+    """Files of a folder, by path; an index is the page itself as well."""
+    contents = {
         f"{prefix}{file.name}": Content.of(file.name, file.read_bytes())
         for file in sorted(folder.iterdir())
         if file.is_file()
     }
+    index = contents.get(f"{prefix}index.html")
+    return contents if index is None else {**contents, "/": index}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +117,7 @@ class Gate:
         config: AddressConfig,
         contents: Mapping[str, Content],
         routes: Mapping[str, Route],
-        data: Callable[[str], Content] | None = None,
+        data: Callable[[str], Content | None] = lambda path: None,
     ):
         """Bind the port; no client is accepted before `start`.
 
@@ -124,8 +126,8 @@ class Gate:
             contents: Public content by path.
             routes: Conversations by the first part of the path of a socket. "session" needs the
                 secret; the others need an open session of the same client.
-            data: Content of a path for clients with the secret, called in threads; raises
-                `RefusedError`.
+            data: Content of a path for clients with the secret, None if there is none; called
+                in threads.
 
         Raises:
             ValueError: The page cannot be served at this address, or not securely.
@@ -232,9 +234,10 @@ class Gate:
         self._admission.right(secret if kind == "Bearer" else "")
         if path == "/admitted":
             return Content(body=b"", kind=_PLAIN)
-        if self._data is None:
+        content = await asyncio.to_thread(self._data, path)
+        if content is None:
             raise RefusedError(404, "There is nothing here.")
-        return await asyncio.to_thread(self._data, path)
+        return content
 
     async def _admit(self, request: Request) -> None:
         """Check a socket that asks to be opened.
