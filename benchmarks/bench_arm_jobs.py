@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from lossy_link import LossyLink
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from served_cycles import CycleLog, DrivenCycle, LossyLink
 
 from hrc_learn import cli
 from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
@@ -40,7 +40,7 @@ from hrc_learn.experiments.collaboration_trial import (
 )
 from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.hardware import DriverError
-from hrc_learn.hardware.protocol_server import ArmServer, DrivenCycle, serve_world
+from hrc_learn.hardware.protocol_server import ArmServer, serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
@@ -113,13 +113,12 @@ def job(
     aiming: VisualServoSkill, placing: PlacingSkill, seed: int, args: Args
 ) -> dict[str, Any]:
     """One of them, as a row."""
-    cycles: list[DrivenCycle] = []
-    served: list[tuple[ArmServer, LossyLink]] = []
+    served: list[tuple[ArmServer, LossyLink, CycleLog]] = []
 
     @contextmanager
     def serve(world: World) -> Iterator[ArmServer]:
-        with serve_world(world, cycles.append) as server:
-            served.append((server, LossyLink(server, args.loss)))
+        with serve_world(world) as server:
+            served.append((server, LossyLink(server, args.loss), CycleLog(server)))
             yield server
 
     begun = time.monotonic()
@@ -155,7 +154,7 @@ def job(
                 run.world.self_contacts,
             )
         )
-    server, link = served[-1]
+    server, link, cycles = served[-1]
     # A cycle whose packet was dropped is missed, too.
     gaps = itertools.groupby(cycles, lambda cycle: cycle.answered)
     longest = max((len([*gap]) for answered, gap in gaps if not answered), default=0)

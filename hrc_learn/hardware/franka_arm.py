@@ -141,10 +141,8 @@ class FrankaArm(Connected):
     @property
     def report(self) -> Report:
         """Newest report of the loop, with its counts of cycles and faults."""
-        line = self._shared.report.read()
-        if line is None:  # it died in the middle of a line
-            return Report(phase=Phase.ENDED)
-        return Report.of(line)
+        # None: it died in the middle of a line.
+        return self._shared.report.read() or Report(phase=Phase.ENDED)
 
     def read(self) -> ArmState:
         """Return the newest state, by the clock of the robot.
@@ -240,14 +238,13 @@ class FrankaArm(Connected):
     def _order(self, **changes: object) -> None:
         with self._writing:
             self._orders = replace(self._orders, **changes)  # pyright: ignore[reportArgumentType]
-            self._shared.orders.write(self._orders.line())
+            self._shared.orders.write(self._orders)
 
     def _check(self) -> None:
         """Raise what keeps the arm from moving."""
         report = self.report
-        if report.phase == Phase.FAULTED:
-            raise DriverError(self._shared.message)
-        if report.phase == Phase.ENDED or not self._process.is_alive():
+        stopped = report.phase in (Phase.FAULTED, Phase.ENDED)
+        if stopped or not self._process.is_alive():
             raise DriverError(self._stalled(report, math.inf))
 
     def _stalled(self, report: Report, age: float) -> str:

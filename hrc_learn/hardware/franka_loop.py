@@ -115,7 +115,7 @@ def serve(
         loop = ControlLoop(shared, ip, config, open_runner(), parent)
     except Exception as error:
         shared.message = f"{type(error).__name__}: {error}"
-        shared.report.write(Report(phase=Phase.ENDED, faults=1).line())
+        shared.report.write(Report(phase=Phase.ENDED, faults=1))
         return
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -238,12 +238,9 @@ class ControlLoop:
             self._runner.step()
 
     def _read_orders(self) -> None:
-        line = self._shared.orders.read()
-        if line is None:
-            return  # its writer died or is stopped: what was wanted runs out
-        self._orders = Orders.of(line)
-        if self._orders.end:
-            self.ending = True
+        # None: its writer died or is stopped; what was wanted runs out.
+        self._orders = self._shared.orders.read() or self._orders
+        self.ending |= self._orders.end
 
     def _wanted(self) -> Float[np.ndarray, "7"]:
         """The velocity that holds now [rad/s]."""
@@ -327,7 +324,7 @@ class ControlLoop:
 
     def _publish(self, phase: Phase) -> None:
         self._report.phase = phase
-        self._shared.report.write(self._report.line())
+        self._shared.report.write(self._report)
 
     def _fail(self, error: Exception) -> None:
         self._shared.message = _explained(error)

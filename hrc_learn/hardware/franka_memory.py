@@ -22,48 +22,6 @@ _TRIES = 100
 written within a microsecond or two."""
 
 
-@final
-class Mailbox:
-    """The newest line of numbers that one process writes and others read, without a lock.
-
-    The first number counts: odd while a line is being written. A reader takes a line only if
-    the count was even and has not changed meanwhile, and never waits for a writer.
-    """
-
-    def __init__(self, line: Float[np.ndarray, " size"]):
-        """Take shared memory for lines of this length, with this one in it."""
-        self._memory = RawArray("d", len(line) + 1)
-        self._attach()
-        self.write(line)
-
-    def _attach(self) -> None:
-        self._line = np.frombuffer(self._memory, dtype=float)
-
-    def __getstate__(self) -> object:
-        return self._memory
-
-    def __setstate__(self, memory: Any) -> None:
-        self._memory = memory
-        self._attach()
-
-    def write(self, line: Float[np.ndarray, " size"]) -> None:
-        """Replace the line. There is one writer at a time."""
-        # Odd whatever it was: a signal may have ended an earlier writing half-way.
-        count = self._line[0] // 2 * 2 + 1
-        self._line[0] = count
-        self._line[1:] = line
-        self._line[0] = count + 1
-
-    def read(self) -> Float[np.ndarray, " size"] | None:
-        """Return the newest line; None: its writer stays in the middle of one."""
-        for _ in range(_TRIES):
-            before = self._line[0]
-            line = self._line[1:].copy()
-            if before % 2 == 0 and self._line[0] == before:
-                return line
-        return None
-
-
 class Phase(IntEnum):
     """Activity of the loop."""
 
@@ -80,7 +38,9 @@ def _zeros() -> Float[np.ndarray, "7"]:
 
 
 class Numbers:
-    """Base of dataclasses whose fields are the numbers of a line, in order."""
+    """Base of dataclasses whose fields are the numbers of a line, in order, and which have a
+    default.
+    """
 
     def line(self) -> Float[np.ndarray, " size"]:
         """The numbers."""
@@ -97,6 +57,44 @@ class Numbers:
             setattr(new, name, numbers if joints else type(default)(numbers[0]))
             begin = end
         return new
+
+
+@final
+class Mailbox[Line: Numbers]:
+    """The newest line of numbers that one process writes and others read, without a lock.
+
+    The first number counts: odd while a line is being written. A reader takes a line only if
+    the count was even and has not changed meanwhile, and never waits for a writer.
+    """
+
+    def __init__(self, line: Line):
+        """Take shared memory for lines of this kind, with this one in it."""
+        self.__setstate__((type(line), RawArray("d", len(line.line()) + 1)))
+        self.write(line)
+
+    def __getstate__(self) -> tuple[type[Line], Any]:
+        return self._kind, self._memory
+
+    def __setstate__(self, state: tuple[type[Line], Any]) -> None:
+        self._kind, self._memory = state
+        self._line = np.frombuffer(self._memory, dtype=float)
+
+    def write(self, line: Line) -> None:
+        """Replace the line. There is one writer at a time."""
+        # Odd whatever it was: a signal may have ended an earlier writing half-way.
+        count = self._line[0] // 2 * 2 + 1
+        self._line[0] = count
+        self._line[1:] = line.line()
+        self._line[0] = count + 1
+
+    def read(self) -> Line | None:
+        """Return the newest line; None: its writer stays in the middle of one."""
+        for _ in range(_TRIES):
+            before = self._line[0]
+            line = self._line[1:].copy()
+            if before % 2 == 0 and self._line[0] == before:
+                return self._kind.of(line)
+        return None
 
 
 @dataclass
@@ -149,7 +147,7 @@ class Shared:
     """The memory that both processes have."""
 
     def __init__(self):
-        self.orders, self.report = Mailbox(Orders().line()), Mailbox(Report().line())
+        self.orders, self.report = Mailbox(Orders()), Mailbox(Report())
         self._text = RawArray("c", _TEXT)
 
     @property

@@ -71,6 +71,9 @@ class GripperThread(Connected):
     newest. A lost connection is reopened. Failures are printed on stderr and kept until the
     next move, so that a task can check for them at a suitable moment while the
     control loop continues.
+
+    Attributes:
+        failure: Failure since the last new opening was requested; None if there was none.
     """
 
     def __init__(self, open_driver: Callable[[], GripperDriver], *, startup: float = 5.0):
@@ -85,7 +88,7 @@ class GripperThread(Connected):
         """
         self._open = open_driver
         self._width: float | None = None
-        self._failure: GripperError | None = None
+        self.failure: GripperError | None = None
         self._driver: GripperDriver | None = None
         self._wanted: float | None = None
         self._last: float | None = None
@@ -101,10 +104,10 @@ class GripperThread(Connected):
         for thread in self._threads:
             thread.start()
         with self._news:
-            self._news.wait_for(lambda: self._width is not None or self._failure, startup)
+            self._news.wait_for(lambda: self._width is not None or self.failure, startup)
             if self._width is not None:
                 return
-            failure = self._failure
+            failure = self.failure
         self.close()
         raise failure or GripperError(
             f"the gripper has not reported its width for {startup:g} s: is it mounted, "
@@ -117,19 +120,13 @@ class GripperThread(Connected):
         assert self._width is not None  # the constructor waits for the first
         return self._width
 
-    @property
-    def failure(self) -> GripperError | None:
-        """Failure since the last new opening was requested; None if there was none."""
-        return self._failure
-
     def check(self) -> None:
         """Raise the failure since the last new opening was requested, if any.
 
         Raises:
             GripperError: A move failed, or the gripper cannot be reached.
         """
-        failure = self._failure
-        if failure is not None:
+        if (failure := self.failure) is not None:
             raise failure
 
     def move(self, width: float) -> None:
@@ -149,7 +146,7 @@ class GripperThread(Connected):
                 return
             self._last = self._wanted = width
             if self._driver is not None:
-                self._failure = None
+                self.failure = None
             self._news.notify_all()
 
     def close(self) -> None:
@@ -217,8 +214,8 @@ class GripperThread(Connected):
         because = "" if error is None else f" ({type(error).__name__}: {error})"
         failure = GripperError(f"the gripper {what}{because}.")
         with self._news:
-            known = str(self._failure) == str(failure)
-            self._failure = failure
+            known = str(self.failure) == str(failure)
+            self.failure = failure
             self._news.notify_all()
         if not known and not self._closed:
             print(f"gripper: {failure}", file=sys.stderr)

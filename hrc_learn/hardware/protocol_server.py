@@ -12,9 +12,9 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float
@@ -33,18 +33,6 @@ whoever advances the time is busy, a cycle goes by after each of these [s]."""
 _BRIDGED = 20
 """Cycles without an answer, in a row, after which a control box stops the arm (libfranka,
 network requirements)."""
-
-
-class DrivenCycle(NamedTuple):
-    """One cycle of a motion, with its command."""
-
-    motion: int
-    """Number that the driver has given to the motion."""
-    velocity: Float[np.ndarray, " joints"]
-    """Commanded joint velocities, extrapolated where no answer has come [rad/s]."""
-    position: Float[np.ndarray, " joints"]
-    """Previous joint positions, as sent to the driver [rad]."""
-    answered: bool
 
 
 class ArmServer:
@@ -66,26 +54,22 @@ class ArmServer:
     Attributes:
         world: The world.
         address: Network address of the arm, for its driver.
+        robot: The arm, as the protocol knows it.
         link: Server of the protocol, from franky-sim.
         cycles: Number of cycles so far.
         missed: Number of cycles of a motion that the driver did not answer in time.
     """
 
-    def __init__(
-        self,
-        world: World,
-        on_cycle: Callable[[DrivenCycle], None] | None = None,
-    ):
+    def __init__(self, world: World):
         """Listen; `serve_world` calls this and closes the server.
 
         Args:
             world: The world. Its physics runs in steps of a cycle from now on.
-            on_cycle: Called with each cycle of a motion, on the server's thread.
 
         Raises:
             ImportError: The package franky-sim is not installed.
         """
-        self.world, self._on_cycle = world, on_cycle
+        self.world = world
         self.cycles = self.missed = self._gap = 0
         try:
             from hrc_learn.hardware.served_robot import PunctualServer, ServedRobot
@@ -94,8 +78,8 @@ class ArmServer:
                 "the protocol of the arm is spoken by the package franky-sim: pip install "
                 "'hrc-learn[hardware]'."
             ) from error
-        self._robot = ServedRobot(world)
-        self.link: Any = PunctualServer(self._robot, loopback_addresses())
+        self.robot = ServedRobot(world)
+        self.link: Any = PunctualServer(self.robot, loopback_addresses())
         self.link.init()
         self.address: str = self.link.hostname
         self.link.process_commands()  # none yet, but a step needs a command before it
@@ -196,7 +180,7 @@ class ArmServer:
         """Send the state to the driver and step the physics; the answer counts in the next
         cycle.
         """
-        robot = self._robot
+        robot = self.robot
         robot.step()
         robot.begin_cycle()
         connected = self.link.udp_connected
@@ -204,19 +188,16 @@ class ArmServer:
         self.cycles += 1
         self._sent = self._sent + 1 if connected else 0
         self._await_answer()
-        if motion := self.link.current_motion_id:
+        if self.link.current_motion_id:
             self._gap = 0 if robot.answered else self._gap + 1
             if not robot.answered and self._gap <= _BRIDGED:
                 robot.go_on()
-            if self._on_cycle is not None:
-                position = robot.reading.joint_position
-                self._on_cycle(DrivenCycle(motion, robot.velocity, position, robot.answered))
 
     def _await_answer(self) -> None:
         give_up = time.monotonic() + _LATE
         while True:
             self.link.process_commands()
-            if self._robot.answered or not self.link.current_motion_id:
+            if self.robot.answered or not self.link.current_motion_id:
                 return
             if time.monotonic() > give_up:
                 self.missed += 1
@@ -274,15 +255,12 @@ def loopback_addresses() -> list[str]:
 
 
 @contextmanager
-def serve_world(
-    world: World, on_cycle: Callable[[DrivenCycle], None] | None = None
-) -> Iterator[ArmServer]:
+def serve_world(world: World) -> Iterator[ArmServer]:
     """A server of a world's arm, until the block ends.
 
     Args:
         world: The world, at rest, and not to be reset meanwhile. Its physics runs in steps of
             1 ms meanwhile.
-        on_cycle: Called with each cycle of a motion, on the server's thread.
 
     Raises:
         ImportError: The package franky-sim is not installed.
@@ -290,7 +268,7 @@ def serve_world(
     step = world.model.opt.timestep
     world.model.opt.timestep = CYCLE
     try:
-        with closing(ArmServer(world, on_cycle)) as server:
+        with closing(ArmServer(world)) as server:
             yield server
     finally:
         world.model.opt.timestep = step

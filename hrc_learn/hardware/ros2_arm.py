@@ -137,14 +137,11 @@ class Ros2Arm(Connected):
         with self._changed:
             if self._changed.wait_for(lambda: self._state is not None, self.config.startup):
                 return
-        topic, why = (
-            self.config.joint_states,
-            "is its driver running, and ROS_DOMAIN_ID the same?",
-        )
+        why = "is its driver running, and ROS_DOMAIN_ID the same?"
         if self._seen:
             missing = ", ".join(sorted({*self._names} - {*self._seen}))
             why = f"{missing} are not among {', '.join(self._seen)}"
-        longest = self.config.startup
+        topic, longest = self.config.joint_states, self.config.startup
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
 
     def _await_controllers(self) -> None:
@@ -265,18 +262,16 @@ class Ros2Arm(Connected):
             (step, goal, velocity),
             (step + rest, goal + 0.5 * rest * velocity, 0 * velocity),
         ]
-        message, made = JointTrajectory(joint_names=list(self._names)), []
+        message = JointTrajectory(joint_names=list(self._names))
         message.header.stamp = self.session.node.get_clock().now().to_msg()
-        for at, position, speed in points:
-            since = Duration(seconds=at).to_msg()
-            made.append(
-                JointTrajectoryPoint(
-                    positions=position.tolist(),
-                    velocities=speed.tolist(),
-                    time_from_start=since,
-                )
+        message.points = [
+            JointTrajectoryPoint(
+                positions=position.tolist(),
+                velocities=speed.tolist(),
+                time_from_start=Duration(seconds=at).to_msg(),
             )
-        message.points = made
+            for at, position, speed in points
+        ]
         return message
 
     def move(self, width: float) -> None:

@@ -41,6 +41,8 @@ PARAMETERS: dict[str, tuple[float, float, float, str]] = {
 """Parameters of the node, read at `configure`: default, range and meaning."""
 _REPORTS = 0.1
 """Time between markers, and ten times between diagnostics [s]."""
+_RECENT = 500
+"""Commands whose latency the diagnostics report."""
 _HISTORY = 500
 """Joint states that are kept to find that of an image."""
 _PATH = 500
@@ -302,11 +304,8 @@ class ControllerNode:
 
         stamp = self.node.get_clock().now().to_msg()
         if self.stopped or now - self._diagnosed > 10 * _REPORTS:
-            self._diagnosed, arm = now, self._arm
-            rows = self._counts()
-            recent = [*self.latencies][-500:] or [0.0]
-            rows["latency_p99_ms"] = 1e3 * float(np.percentile(recent, 99))
-            rows["ignored_states"] = 0 if arm is None else arm.ignored
+            self._diagnosed, rows = now, self.figures(_RECENT)
+            rows["ignored_states"] = 0 if self._arm is None else self._arm.ignored
             status = DiagnosticStatus(
                 level=DiagnosticStatus.ERROR if self.stopped else DiagnosticStatus.OK,
                 name="hrc_learn: controller",
@@ -349,20 +348,21 @@ class ControllerNode:
         done = self._done.SUCCESS
         return self.node.trigger_configure() == done and self.node.trigger_activate() == done
 
-    def figures(self) -> dict[str, float]:
-        """Latency from joint state to command [ms], and interventions of the safety filter."""
-        rows = {f"safety_{k}": float(v) for k, v in self._counts().items()}
-        values = 1e3 * np.array([*self.latencies] or [np.nan])
+    def figures(self, recent: int = 0) -> dict[str, float]:
+        """Number of commands, steps in which each limit of the safety filter acted, and latency
+        from joint state to command [ms].
+
+        Args:
+            recent: Number of newest commands whose latency counts; 0: all.
+        """
+        rows = {"commands": float(len(self.latencies))}
+        if hasattr(self, "_runner"):
+            counts = map(float, self._runner.state["safety.counts"])
+            rows |= {f"safety_{k}": n for k, n in zip(INTERVENTIONS, counts, strict=True)}
+        values = 1e3 * np.array([*self.latencies][-recent:] or [np.nan])
         for percentile in (50, 99, 100):
             rows[f"latency_p{percentile}_ms"] = float(np.percentile(values, percentile))
-        return {"commands": float(len(self.latencies)), **rows}
-
-    def _counts(self) -> dict[str, float]:
-        """Steps in which each limit of the safety filter acted."""
-        counts = (
-            self._runner.state["safety.counts"].tolist() if hasattr(self, "_runner") else ()
-        )
-        return {str(k): v for k, v in zip(INTERVENTIONS, counts, strict=False)}
+        return rows
 
     def close(self) -> None:
         """Bring the arm to rest and leave the graph."""

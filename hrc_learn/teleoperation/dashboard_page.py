@@ -21,7 +21,7 @@ from urllib.request import urlopen
 
 from hrc_learn.store import new_file
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
-from hrc_learn.teleoperation.gate.gate import Visitor, first_of, incoming
+from hrc_learn.teleoperation.gate.gate import Visitor, first_of
 from hrc_learn.teleoperation.gate.messages import MessageError
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ def _served(port: int | None, data: Callable[[], Sequence[bytes]]) -> Iterator[s
 
     async def session(connection: Any, visitor: Visitor) -> None:
         async def listen() -> None:
-            async for _ in incoming(connection, _nothing):
-                pass
+            async for _ in connection:
+                raise MessageError("a dashboard sends no messages")
 
         async def speak() -> None:
             sent = 0
@@ -108,10 +108,6 @@ def _served(port: int | None, data: Callable[[], Sequence[bytes]]) -> Iterator[s
         yield gate.address.link()
     finally:
         gate.close()
-
-
-def _nothing(raw: str | bytes) -> None:
-    raise MessageError("a dashboard sends no messages")
 
 
 def _viewer_contents() -> dict[str, Content]:

@@ -221,6 +221,9 @@ class DemonstrationRecorder:
     demonstration that is still open then is saved: a signal or an error loses none. While it
     is recorded a draft of it is written every `_DRAFT_EVERY` seconds, which `recover_dataset`
     makes an episode of after a power cut.
+
+    Attributes:
+        state: State of the demonstration in hand.
     """
 
     def __init__(
@@ -245,7 +248,7 @@ class DemonstrationRecorder:
         self._writing: list[Future[int]] = []
         self._draft: Future[None] = self._thread.submit(lambda: None)
         self._draft_due = 0.0
-        self._state: RecorderState = "ready"
+        self.state: RecorderState = "ready"
         self._note, self._insists = "", False
 
     def __enter__(self) -> "DemonstrationRecorder":
@@ -264,7 +267,7 @@ class DemonstrationRecorder:
 
     def finish(self) -> None:
         """Keep what is open, unless nothing in it moves, and wait until all is on disk."""
-        if self._state != "ready":  # ended by a signal, say: what was shown is not lost
+        if self.state != "ready":  # ended by a signal, say: what was shown is not lost
             self._insists = True
             self._save(task=self._task() or UNNAMED)
         wait(self._writing)
@@ -276,24 +279,19 @@ class DemonstrationRecorder:
         failed = next((w.exception() for w in self._writing[::-1] if w.done()), None)
         note = self._note if failed is None else f"not saved: {failed}"
         return RecorderStatus(
-            state=self._state, seconds=self._quality.seconds, saved=saved, note=note
+            state=self.state, seconds=self._quality.seconds, saved=saved, note=note
         )
-
-    @property
-    def recording(self) -> bool:
-        """True while frames are recorded."""
-        return self._state == "recording"
 
     def handle(self, request: Request) -> None:
         """Do what a person asks; what makes no sense now is noted, not done."""
-        match request, self._state:
+        match request, self.state:
             case "start", "ready" | "stopped":
                 # Starting over is the quickest way to discard.
                 self._forget()
-                self._state, self._note = "recording", ""
+                self.state, self._note = "recording", ""
                 self._draft_due = self._clock() + _DRAFT_EVERY
             case "stop", "recording":
-                self._state, self._note = "stopped", ""
+                self.state, self._note = "stopped", ""
             case "save", "recording" | "stopped":
                 self._save(self._task())
             case "discard", "recording" | "stopped":
@@ -309,7 +307,7 @@ class DemonstrationRecorder:
             frame: Columns of the frame.
             touching: Unexpected contacts of the arm, as text.
         """
-        if not self.recording:
+        if self.state != "recording":
             return
         now = self._clock()
         self._frames.append(frame)
@@ -333,12 +331,12 @@ class DemonstrationRecorder:
         self._thread.submit(self._writer.discard_draft)
 
     def _clear(self) -> None:
-        self._frames, self._state, self._insists = [], "ready", False
+        self._frames, self.state, self._insists = [], "ready", False
         self._quality.clear()
 
     def _save(self, task: str) -> None:
         if not task.strip():
-            self._state = "stopped"
+            self.state = "stopped"
             self._note = "not saved yet: say in Task what is demonstrated"
             return
         if why := self._quality.worthless():
@@ -346,7 +344,7 @@ class DemonstrationRecorder:
             self._note = f"nothing to save: {why}"
             return
         if not self._insists and (doubt := self._doubt()):
-            self._state, self._insists = "stopped", True
+            self.state, self._insists = "stopped", True
             self._note = f"not saved yet: {doubt}. Save again to keep it all the same"
             return
         frames = self._frames[self._quality.moving() or slice(None)]

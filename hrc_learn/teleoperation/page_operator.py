@@ -23,6 +23,7 @@ from hrc_learn.teleoperation.hand_guiding import (
     guiding_twist,
 )
 
+_NOWHERE = np.zeros(3)
 _NO_TURN = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
@@ -313,7 +314,7 @@ def gizmo_command(
     gizmos: Collection[HeldGizmo],
     config: InteractionForceConfig,
     *,
-    direction: Float[np.ndarray, "3"] | None = None,
+    direction: Float[np.ndarray, "3"] = _NOWHERE,
     turn: Float[torch.Tensor, "4"] | None = None,
 ) -> GizmoCommand:
     """Command of held gizmos and keys. Their inputs add up, with the bounds of a single one.
@@ -324,14 +325,12 @@ def gizmo_command(
         gizmos: Held gizmos.
         config: Gains and bounds of gizmos.
         direction: Direction in which keys move the end effector, as a fraction of the largest
-            speed; None: no key is pressed.
+            speed; zero: no key is pressed.
         turn: Rotation added to the coarse orientation rule (wxyz); None: none.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
-    d, velocity = np.zeros(len(chain.joint_names)), np.zeros(3)
-    guided = direction is not None and bool(direction.any())
-    if direction is not None:
-        velocity += config.speed * direction
+    d, velocity = np.zeros(len(chain.joint_names)), config.speed * direction
+    guided = bool(direction.any())
     arrows = np.empty((len(gizmos), 2, 3))
     for k, gizmo in enumerate(gizmos):
         point = _point_held(links, gizmo)

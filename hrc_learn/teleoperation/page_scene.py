@@ -123,7 +123,16 @@ class PageScene:
             thickness=0.003,
             visible=False,
         )
-        self._gizmo = self._add_gizmo() if guides or turns else None
+        self._gizmo = self._scene.add_transform_controls(
+            "/end_effector",
+            scale=0.2,
+            disable_axes=not guides,
+            disable_sliders=not guides,
+            disable_rotations=guides,
+            depth_test=False,
+            visible=guides or turns,
+        )
+        self._gizmo.on_update(self._gizmo_dragged)
         server.on_client_disconnect(in_loop(lambda client: held.release(client.client_id)))
 
     def move(
@@ -148,9 +157,7 @@ class PageScene:
             for knob in knobs:
                 knob.position = links.position[joint - 1].numpy()
         gizmo = self._gizmo
-        if gizmo is None or self._held.turning:
-            return
-        if all(name != gizmo.name for _, name in self._held.held()):
+        if not self._held.turning and all(name != gizmo.name for _, name in self._held.held()):
             gizmo.position, gizmo.wxyz = links.position[-1].numpy(), _BASE_AXES
 
     def show_twin(self, visible: bool) -> None:
@@ -165,8 +172,7 @@ class PageScene:
 
     def let_turn(self, rings: bool) -> None:
         """Show or hide the rings of the end effector's gizmo."""
-        if self._gizmo is not None:
-            self._gizmo.disable_rotations = not rings
+        self._gizmo.disable_rotations = not rings
 
     def point(
         self,
@@ -220,19 +226,6 @@ class PageScene:
         )
         self._connect(knob, joint, parent)
         return knob
-
-    def _add_gizmo(self) -> Any:
-        guides = self._guides
-        gizmo = self._scene.add_transform_controls(
-            "/end_effector",
-            scale=0.2,
-            disable_axes=not guides,
-            disable_sliders=not guides,
-            disable_rotations=guides,
-            depth_test=False,
-        )
-        gizmo.on_update(self._gizmo_dragged)
-        return gizmo
 
     def _connect(self, node: Any, joint: int | None, parent: str) -> None:
         if joint is None and not self._guides:

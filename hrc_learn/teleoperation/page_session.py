@@ -208,7 +208,7 @@ class PageSession:
             self._page.farewell = f"Finished: {counted(saved)} saved. You can close this tab."
         elif request == "home":
             # A demonstration must not contain that.
-            if self._recorder.status.state == "recording":
+            if self._recorder.state == "recording":
                 self._recorder.handle("stop")
             self._go_home()
         else:
@@ -217,14 +217,14 @@ class PageSession:
     def _met(self, step: GuidedStep) -> tuple[str, ...]:
         """Unwanted contacts of the arm since the last frame, as text."""
         last, self._looked = self._looked, self.world.time
-        if not self._recorder.recording:
+        if self._recorder.state != "recording":
             return ()
         felt = pressed(self.world.arm.robot.chain, step.state)
         return (*self.world.touched_since(last), *felt)
 
     def _stop_when_left(self) -> None:
         """End a recording that everybody at the page has left, and keep what was shown."""
-        if self._recorder.status.state != "recording":
+        if self._recorder.state != "recording":
             self._watched, self._alone = False, 0
         elif self._page.control.people:
             self._watched, self._alone = True, 0

@@ -17,6 +17,7 @@ import pytest
 import torch
 from franka_servers import franky_sim, loopback
 from loop_on_franka import loop_of
+from programs_as_modules import load_program
 
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
@@ -298,10 +299,11 @@ def test_in_lockstep_a_state_after_a_pause_is_not_taken_for_a_late_one():
 
 
 def test_a_simulator_is_answered_smoothly_after_its_driver_was_held_up():
-    world, cycles = World(SceneConfig(objects=())), []
+    world = World(SceneConfig(objects=()))
     world.reset(panda.ready.numpy())
     config = replace(CONFIG, gripper=False, lockstep=True)
-    with serve_world(world, on_cycle=cycles.append) as server:
+    with serve_world(world) as server:
+        cycles = load_program("benchmarks/served_cycles.py").CycleLog(server)
         with server.running():
             driver = FrankaArm(server.address, panda, config)
         with closing(ServedArm(driver, server)) as arm:

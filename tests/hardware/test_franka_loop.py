@@ -2,6 +2,7 @@
 
 import multiprocessing
 import time
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -9,22 +10,27 @@ import pytest
 
 from hrc_learn.hardware import FrankaConfig
 from hrc_learn.hardware.franka_loop import Punctuality, answer_was_lost
-from hrc_learn.hardware.franka_memory import Mailbox, Orders, Phase, Report, Shared
+from hrc_learn.hardware.franka_memory import Mailbox, Numbers, Orders, Phase, Report, Shared
 
 LONG = 50_000
 """Numbers that take so long to copy that writer and reader meet."""
+
+
+@dataclass
+class Long(Numbers):
+    values: np.ndarray = field(default_factory=lambda: np.zeros(LONG))
 
 
 def write_lines(mailbox: Mailbox, seconds: float) -> None:
     end, k = time.monotonic() + seconds, 0
     while time.monotonic() < end:
         k += 1
-        mailbox.write(np.full(LONG, float(k)))
+        mailbox.write(Long(np.full(LONG, float(k))))
         time.sleep(1e-4)
 
 
 def test_a_line_is_read_whole_while_another_process_writes():
-    mailbox = Mailbox(np.zeros(LONG))
+    mailbox = Mailbox(Long())
     writer = multiprocessing.get_context("fork").Process(
         target=write_lines, args=(mailbox, 1.0)
     )
@@ -33,19 +39,18 @@ def test_a_line_is_read_whole_while_another_process_writes():
     while writer.is_alive():
         line = mailbox.read()
         if line is not None:
-            assert np.ptp(line) == 0, "half of one line, half of another"
-            seen.add(line[0])
+            assert np.ptp(line.values) == 0, "half of one line, half of another"
+            seen.add(line.values[0])
     writer.join()
     assert len(seen) > 10
 
 
 def test_a_writer_that_died_in_the_middle_of_a_line_holds_nobody_up():
-    mailbox = Mailbox(np.zeros(3))
-    mailbox.write(np.ones(3))
+    mailbox = Mailbox(Long())
     mailbox._line[0] += 1  # as at the moment of its death, or of a signal
     assert mailbox.read() is None
-    mailbox.write(np.full(3, 2.0))
-    np.testing.assert_array_equal(mailbox.read(), np.full(3, 2.0))
+    mailbox.write(Long(np.full(LONG, 2.0)))
+    np.testing.assert_array_equal(mailbox.read().values, np.full(LONG, 2.0))
 
 
 def test_orders_and_reports_come_out_as_they_went_in():

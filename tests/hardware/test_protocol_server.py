@@ -21,7 +21,7 @@ pytest.importorskip("franky_sim")
 
 pytestmark = pytest.mark.realtime
 
-LossyLink = load_program("benchmarks/lossy_link.py").LossyLink
+served_cycles = load_program("benchmarks/served_cycles.py")
 
 DT = 0.01
 
@@ -138,9 +138,9 @@ def test_physics_that_fails_is_told_to_whoever_lets_time_pass():
 
 def test_without_answers_the_arm_goes_on_with_its_acceleration():
     """Lost packets of both ways; the motion hardly differs from the one without."""
-    cycles = []
-    with served_world(on_cycle=cycles.append) as served:
-        link = LossyLink(served.server, 0.1)
+    with served_world() as served:
+        cycles = served_cycles.CycleLog(served.server)
+        link = served_cycles.LossyLink(served.server, 0.1)
         times, _, actual, commands = follow(
             served, lambda k: 0.3 * np.sin(2 * np.pi * 0.8 * k * DT), 125
         )
@@ -161,15 +161,16 @@ def test_without_answers_the_arm_goes_on_with_its_acceleration():
 
 
 def test_the_acceleration_told_is_that_of_the_commands():
-    cycles, told, servers = [], [], []
+    told = []
 
-    def note(cycle):
-        cycles.append(cycle)
-        told.append(servers[0]._robot.state.ddq_d[0])
+    class Log(served_cycles.CycleLog):
+        def append(self, cycle):
+            super().append(cycle)
+            told.append(self._robot.state.ddq_d[0])
 
-    with served_world(on_cycle=note) as served:
-        LossyLink(served.server, 0.05)
-        servers.append(served.server)
+    with served_world() as served:
+        served_cycles.LossyLink(served.server, 0.05)
+        cycles = Log(served.server)
         follow(served, lambda k: 0.3 * np.sin(2 * np.pi * 0.8 * k * DT), 60)
     velocity = np.array([cycle.velocity[0] for cycle in cycles])
     # A state tells of the commands before it.
@@ -178,10 +179,10 @@ def test_the_acceleration_told_is_that_of_the_commands():
 
 
 def test_a_box_without_any_answer_holds_the_velocity_in_the_end():
-    cycles = []
-    with served_world(on_cycle=cycles.append) as served:
+    with served_world() as served:
+        cycles = served_cycles.CycleLog(served.server)
         follow(served, lambda k: 0.02 * k, 8)
-        link = LossyLink(served.server, 1.0)
+        link = served_cycles.LossyLink(served.server, 1.0)
         served.server.advance(0.04)
         last_answer = max(k for k, cycle in enumerate(cycles) if cycle.answered)
         velocity = np.array([cycle.velocity[0] for cycle in cycles[last_answer:]])

@@ -7,6 +7,7 @@ A message that fits no schema raises `MessageError`. Decoders go no deeper than 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -255,34 +256,22 @@ def acts(message: Any) -> bool:
     return not isinstance(message, _Watching)
 
 
-_session = msgspec.json.Decoder(Message)
-_curation = msgspec.json.Decoder(CurationMessage)
-_view = msgspec.msgpack.Decoder(ViewMessage)
-
-
 def _decoded(decoder: Any, raw: str | bytes) -> Any:
-    try:
-        return decoder.decode(raw)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(f"not a message of this page: {error}") from error
-
-
-def session_message(raw: str | bytes) -> Message:
-    """Decode a message of our own clients, in JSON.
+    """Message of a client.
 
     Raises:
         MessageError: It fits no schema.
     """
-    return _decoded(_session, raw)
+    try:
+        return decoder.decode(raw)
+    # TypeError: text where viser's page sends bytes.
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, TypeError) as error:
+        raise MessageError(f"not a message of this page: {error}") from error
 
 
-def curation_message(raw: str | bytes) -> CurationMessage:
-    """Decode a message of the curation page, in JSON; errors as in `session_message`."""
-    return _decoded(_curation, raw)
-
-
-def view_message(raw: str | bytes) -> ViewMessage:
-    """Decode a message of viser's page, in MessagePack; errors as in `session_message`."""
-    if isinstance(raw, str):
-        raise MessageError("viser's messages are binary.")
-    return _decoded(_view, raw)
+session_message = partial(_decoded, msgspec.json.Decoder(Message))
+"""Decodes a message of our own clients, in JSON."""
+curation_message = partial(_decoded, msgspec.json.Decoder(CurationMessage))
+"""Decodes a message of the curation page, in JSON."""
+view_message = partial(_decoded, msgspec.msgpack.Decoder(ViewMessage))
+"""Decodes a message of viser's page, in MessagePack."""

@@ -1,8 +1,40 @@
-"""Packets of a served arm's protocol that are lost on purpose."""
+"""Cycles of a served arm's protocol: a record of them, and packets lost on purpose."""
 
 import random
+from typing import NamedTuple
+
+import numpy as np
 
 from hrc_learn.hardware.protocol_server import ArmServer
+
+
+class DrivenCycle(NamedTuple):
+    """One cycle of a motion, with its command."""
+
+    motion: int
+    """Number that the driver has given to the motion."""
+    velocity: np.ndarray
+    """Commanded joint velocities, extrapolated where no answer has come [rad/s]."""
+    position: np.ndarray
+    """Previous joint positions, as sent to the driver [rad]."""
+    answered: bool
+
+
+class CycleLog(list[DrivenCycle]):
+    """All cycles of motions from now on, each noted as the next one begins."""
+
+    def __init__(self, server: ArmServer):
+        """Take notes before each step of the arm."""
+        super().__init__()
+        self._robot, self._link = server.robot, server.link
+        self._step, self._robot.step = self._robot.step, self._noted_step
+
+    def _noted_step(self) -> None:
+        robot = self._robot
+        if motion := self._link.current_motion_id:
+            position = robot.reading.joint_position
+            self.append(DrivenCycle(motion, robot.velocity, position, robot.answered))
+        self._step()
 
 
 class LossyLink:
