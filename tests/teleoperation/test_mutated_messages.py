@@ -82,7 +82,7 @@ def plain(message):
     [(session_message, SESSION), (curation_message, CURATION), (view_message, VIEW)],
 )
 def test_messages_are_refused_or_have_finite_numbers(decode, sound):
-    rng, refused = random.Random(decode.__name__), 0
+    rng, refused = random.Random(len(sound)), 0
     for number in range(600):
         original = sound[number % len(sound)]
         mutant = mutated(original if isinstance(original, bytes) else original.encode(), rng)
