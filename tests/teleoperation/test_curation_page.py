@@ -106,6 +106,14 @@ def test_only_who_has_the_secret_gets_in(unchanged):
     assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 
 
+def test_the_most_typical_episode_is_shown_next_to_others(unchanged):
+    _, client = unchanged
+    shown = json.loads(client.ask("/data/overview")[1])
+    distance = {e["episode"]: e["measures"]["distance"] for e in shown["episodes"]}
+    assert len(set(distance.values())) > 1
+    assert distance[shown["usual"]] == min(distance.values())
+
+
 def test_another_site_decides_nothing(unchanged):
     page, client = unchanged
     said = json.dumps({"type": "decide", "episode": 0, "verdict": "reject"})

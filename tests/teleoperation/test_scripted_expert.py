@@ -53,12 +53,17 @@ def test_a_guided_path_passes_its_waypoints_from_rest_to_rest():
         np.testing.assert_allclose(path.velocity(time), numeric, atol=1e-6)
 
 
-def test_tremor_is_a_small_motion_about_the_path():
-    tremor = Tremor(5e-4, np.random.default_rng(0))
-    dt = 1e-3
-    velocity = np.array([tremor.velocity(t) for t in np.arange(0, 20, dt)])
-    drift = np.cumsum(velocity, axis=0) * dt
-    assert 1e-4 < np.abs(drift - drift.mean(axis=0)).max() < 5e-3
+def test_tremor_has_the_amplitude_asked_for_and_its_drift_three_times_that():
+    tremor, dt = Tremor(5e-4, np.random.default_rng(0)), 0.05
+    # All four waves pass through whole periods in 100 s, so each has a line of its own.
+    velocity = np.array([tremor.velocity(t) for t in np.arange(0, 100, dt)])
+    spectrum = 2 * np.abs(np.fft.rfft(velocity, axis=0)) / len(velocity)
+    frequency = np.fft.rfftfreq(len(velocity), dt)
+    moves = spectrum > 1e-6
+    for axis in range(3):
+        np.testing.assert_allclose(frequency[moves[:, axis]], [0.22, 0.35, 7.2, 8.0])
+        size = spectrum[moves[:, axis], axis] / (2 * np.pi * frequency[moves[:, axis]])
+        np.testing.assert_allclose(size, [1.5e-3, 1.5e-3, 3.5e-4, 5e-4])
 
 
 def test_the_experts_hand_reaches_the_end_of_the_path():
