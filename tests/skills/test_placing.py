@@ -143,6 +143,8 @@ def test_plans_have_the_shapes_that_they_declare(skill, space):
     steps = round(plan.duration / 0.1) + 1
     assert plan.path.shape == (steps, 7)
     assert plan.tool_pose.position.shape == (steps, 3)
+    # Unless told otherwise, a motion lasts as long as its demonstrations.
+    assert plan.duration == pytest.approx(float(skill.joint.duration), abs=0.1)
 
 
 def test_the_papers_plan_in_joint_space_bends_the_way_into_other_shelves(plans):
