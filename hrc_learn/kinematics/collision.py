@@ -10,11 +10,11 @@ with v the velocity of the person's nearest point.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import combinations
-from typing import final
+from typing import Any, final
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -41,6 +41,14 @@ class LinkCapsule(Capsule):
 
     link: int
     """Number of the link it belongs to; 0 is the base."""
+
+
+def link_capsules(rows: Iterable[Sequence[Any]]) -> tuple[LinkCapsule, ...]:
+    """Capsules from rows of a file: link, both ends of the axis, radius."""
+    return tuple(
+        LinkCapsule(link=link, start=tuple(start), end=tuple(end), radius=radius)
+        for link, start, end, radius in rows
+    )
 
 
 @final

@@ -31,7 +31,7 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics.arm import TCP_OFFSET, Arm, ArmShape, hand_capsules
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.collision import LinkCapsule
+from hrc_learn.kinematics.collision import link_capsules
 from hrc_learn.kinematics.description import pseudo_inertia
 from hrc_learn.kinematics.limits import JointLimits
 
@@ -164,43 +164,17 @@ def _along_z(distance: float, angle: float = 0.0) -> Tensor:
 TOOL_LINK = 9
 """Number of the tool centre point's frame, on which the hand is mounted."""
 
-# (link, start [m], end [m], radius [m]) in the frame of the link.
-LINK_CAPSULES = tuple(
-    LinkCapsule(link=link, start=start, end=end, radius=radius)
-    for link, start, end, radius in (
-        (0, (-0.06, 0.0, 0.05), (0.0, 0.0, 0.07), 0.07),
-        (1, (0.0, 0.0, -0.19), (0.0, 0.0, -0.02), 0.06),
-        (1, (0.0, -0.05, 0.0), (0.0, 0.03, 0.0), 0.06),
-        (2, (0.0, -0.02, 0.0), (0.0, -0.12, 0.0), 0.06),
-        (2, (0.0, 0.0, -0.04), (0.0, 0.0, 0.04), 0.06),
-        (3, (0.0, 0.0, -0.16), (0.0, 0.0, -0.07), 0.06),
-        (3, (0.0825, -0.03, 0.0), (0.0825, 0.03, 0.0), 0.055),
-        (4, (0.0, 0.0, -0.04), (0.0, 0.0, 0.04), 0.06),
-        (4, (-0.0825, 0.03, 0.0), (-0.0825, 0.10, 0.0), 0.055),
-        (5, (0.0, 0.0, -0.26), (0.0, 0.0, -0.19), 0.06),
-        (5, (0.0, 0.08, -0.17), (0.0, 0.09, -0.02), 0.03),
-        (6, (0.0, 0.0, -0.06), (0.0, 0.0, 0.02), 0.05),
-        (6, (0.088, 0.0, 0.0), (0.088, 0.05, 0.0), 0.045),
-        (7, (0.0, 0.0, -0.02), (0.0, 0.0, 0.062), 0.045),
-    )
+_LINKS = tomllib.loads(
+    files(__package__).joinpath("franka_links.toml").read_text(encoding="utf-8")
 )
+LINK_CAPSULES = link_capsules(_LINKS["capsules"])
 """Capsules of the links of either arm; the simulated arm is built from the same ones."""
-
-LINK_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
-"""Masses of links 1 to 7 [kg], from franka_description."""
-HAND_MASS = 0.73
-"""Mass of the gripper without its fingers [kg], from franka_description."""
-
-# Links whose capsules overlap by design although they are no neighbours. The flange (8) has
-# none, so the hand follows link 7.
-OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, TOOL_LINK), (7, TOOL_LINK))
 
 
 def _inertias() -> tuple[Float[np.ndarray, "4 4"] | None, ...]:
     """Pseudo-inertias of base, links, flange and gripper."""
-    table = files(__package__).joinpath("franka_inertia.toml").read_text(encoding="utf-8")
     found = []
-    for mass, row in zip((*LINK_MASSES, HAND_MASS), tomllib.loads(table)["rows"], strict=True):
+    for mass, row in zip(_LINKS["masses"], _LINKS["inertia"], strict=True):
         x, y, z, xx, xy, xz, yy, yz, zz = row
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         found.append(pseudo_inertia(mass, (x, y, z), inertia))
@@ -221,12 +195,13 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
             [0, -pi / 4, 0, -3 * pi / 4, 0, pi / 2, pi / 4], dtype=torch.float64
         ),
     )
+    *links, hand = _LINKS["masses"]
     return Arm(
         name=name,
         chain=chain,
-        shape=ArmShape(masses=(None, *LINK_MASSES, 0.0, HAND_MASS), inertia=_inertias()),
+        shape=ArmShape(masses=(None, *links, 0.0, hand), inertia=_inertias()),
         capsules=LINK_CAPSULES + hand_capsules(TOOL_LINK),
-        overlapping=OVERLAPPING,
+        overlapping=_LINKS["overlapping"],
         closed_form=partial(franka_branches, ranges=ranges),
     )
 

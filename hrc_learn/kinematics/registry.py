@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.kinematics.arm import Arm
-from hrc_learn.kinematics.collision import LinkCapsule
+from hrc_learn.kinematics.collision import link_capsules
 from hrc_learn.kinematics.described_arm import FittedBody, LimitsGiven, arm_from_file
 from hrc_learn.kinematics.description import turn_to
 from hrc_learn.kinematics.franka import fr3, panda
@@ -39,24 +39,7 @@ _INSTALL = {
     "gym-aloha": "--no-deps gym-aloha==0.1.5",
 }
 _OWN = {"panda": panda, "fr3": fr3}
-# Other names of robots in LeRobot datasets, without "follower" and the like. A SO-100 has the
-# joints of a SO-101, and LeRobot calibrates both to the same zero.
-_OTHER_NAMES = {
-    "so100": "so101",
-    "so": "so101",
-    "franka": "panda",
-    "frankaemikapanda": "panda",
-    "fer": "panda",
-    "frankaresearch3": "fr3",
-    "droid": "panda",
-    "kinova": "gen3",
-    "kinovagen3": "gen3",
-    "iiwa": "iiwa7",
-    "kukaiiwa": "iiwa7",
-    "vx300s": "viperx",
-    "xarm": "xarm7",
-    "unitreez1": "z1",
-}
+# Words of robot types in LeRobot datasets that name no arm.
 _ROLES = re.compile("follower|leader|robot$|arm$|description$")
 
 CAPSULES = Path(__file__).with_name("capsules.json")
@@ -65,18 +48,18 @@ CAPSULES = Path(__file__).with_name("capsules.json")
 
 @cache
 def _sources() -> Mapping[str, Mapping[str, Any]]:
-    """Descriptions in installed packages, by the name of the arm."""
+    """Makers, other names and descriptions in installed packages, by the name of the arm."""
     return read_toml(Path(__file__).with_name("registered_arms.toml"))
 
 
 def registered_arms() -> tuple[str, ...]:
     """Names that `arm` takes."""
-    return (*_OWN, *sorted(_sources()))
+    return (*_OWN, *sorted(_sources().keys() - _OWN.keys()))
 
 
 def maker_of(name: str) -> str:
     """Manufacturer of a registered arm."""
-    return "Franka Robotics" if name in _OWN else _sources()[name]["maker"]
+    return _sources()[name]["maker"]
 
 
 def arm_of_robot(robot_type: str | None) -> Arm | None:
@@ -89,10 +72,10 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
     if simulated != robot_type and simulated in registered_arms():
         return ArmChoice(simulated).work_arm()
     name = _plain(_ROLES.sub("", (robot_type or "").lower().replace("_", "").replace("-", "")))
-    known = {_plain(registered): registered for registered in registered_arms()}
-    found = _OTHER_NAMES.get(name) or known.get(name)
+    also = {other: arm for arm, row in _sources().items() for other in row.get("also", ())}
+    found = also.get(name, name)
     try:
-        return _registered(found) if found else None
+        return _registered(found) if found in registered_arms() else None
     except MissingModelError:
         return None
 
@@ -241,11 +224,7 @@ def _fitted_body(name: str, description: Path) -> FittedBody | None:
     digest = hashlib.sha256(description.read_bytes()).hexdigest()
     if entry is None or entry["description_sha256"] != digest:
         return None
-    capsules = [
-        LinkCapsule(link=link, start=tuple(start), end=tuple(end), radius=radius)
-        for link, start, end, radius in entry["capsules"]
-    ]
-    return capsules, [(first, second) for first, second in entry["overlapping"]]
+    return link_capsules(entry["capsules"]), entry["overlapping"]
 
 
 @dataclass(frozen=True)
