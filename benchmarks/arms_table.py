@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 import torch
-from grasp_trials import TrialConfig, run_trials
+from grasp_trials import TrialConfig, reach_of, run_trials
 from rich.console import Console
 
 from hrc_learn import cli
@@ -138,7 +138,7 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
     spent = time.thread_time() - begun
     figures = {
         "joints": float(n),
-        "reach_m": described.reach,
+        "reach_m": reach_of(described),
         "inverse_found": float(found.double().mean()),
         "inverse_ms": 1e3 * spent / args.poses,
     }

@@ -102,7 +102,7 @@ class TrialArm:
             self.centre = self.scaled(CENTRE)
             self.postures = arm.postures(Pose(self.centre, self.down))
             return
-        self.scale, self.down = min(1.0, arm.reach / _PANDA_REACH), gripper_down()
+        self.scale, self.down = min(1.0, reach_of(arm) / _PANDA_REACH), gripper_down()
         possible = []
         for nearer, height in itertools.product(_NEARER, _HEIGHTS):
             place = self._place((nearer * CENTRE[0], nearer * CENTRE[1], height))
@@ -212,7 +212,15 @@ class TrialArm:
         return CapsuleArm(self.chain, [c for c in self._above.capsules if tells(c)])
 
 
-_PANDA_REACH = 0.95  # [m], as `Arm.reach` of it
+_PANDA_REACH = 0.95  # [m], as `reach_of` it
+
+
+def reach_of(arm: Arm) -> float:
+    """Largest distance of the tool centre point from joint 2 [m], over random postures."""
+    limits, rng = arm.limits, torch.Generator().manual_seed(0)
+    share = torch.rand(5000, arm.joints, generator=rng, dtype=torch.float64)
+    q = limits.lower + (limits.upper - limits.lower) * share
+    return float((arm.forward(q).position - arm.joint_origins(q)[:, 1]).norm(dim=-1).max())
 
 
 def clear_posture(

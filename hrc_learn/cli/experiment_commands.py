@@ -36,7 +36,7 @@ from hrc_learn.experiments.real_arm import ArmSite, Task, run_on_arm, task_of
 from hrc_learn.hardware import CaptureCamera
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
-from hrc_learn.sim.unmarked_scene import UnmarkedLook
+from hrc_learn.sim.scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.store import read_json, write_json
 from hrc_learn.teleoperation.page import PageConfig

@@ -20,7 +20,7 @@ from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.lerobot_device import GRIPPER, LeaderArm
 from hrc_learn.kinematics import Arm, ArmChoice
 from hrc_learn.sim import CameraKind, PhysicsError, World, open_camera
-from hrc_learn.sim.unmarked_scene import UnmarkedLook, unmarked
+from hrc_learn.sim.scene import UnmarkedLook, unmarked
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor

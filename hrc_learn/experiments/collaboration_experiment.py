@@ -23,7 +23,7 @@ from hrc_learn.experiments.surroundings import unmarked_for, workplace_for
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import RunRecording
 from hrc_learn.sim import Imperfections
-from hrc_learn.sim.unmarked_scene import UnmarkedLook
+from hrc_learn.sim.scene import UnmarkedLook
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill

@@ -37,7 +37,7 @@ from hrc_learn.jacobian import RBFImageJacobian
 from hrc_learn.kinematics import ArmChoice, gripper_down
 from hrc_learn.log import RunRecording
 from hrc_learn.sim import CameraKind, Imperfections, Touch
-from hrc_learn.sim.unmarked_scene import UnmarkedLook
+from hrc_learn.sim.scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill

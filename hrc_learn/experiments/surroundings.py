@@ -31,7 +31,7 @@ from hrc_learn.sim import (
     whole_arm,
 )
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
-from hrc_learn.sim.unmarked_scene import UnmarkedLook, unmarked
+from hrc_learn.sim.scene import UnmarkedLook, unmarked
 from hrc_learn.sim.worker import IMAGE_RATE, PARTS, REGIONS
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace, pose_on_table

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import is_number, may_branch
+from hrc_learn.geometry.numerics import check_settings, is_number, may_branch
 from hrc_learn.jacobian.estimators import ImageJacobianEstimator, Measurement, evaluate
 from hrc_learn.jacobian.fitting import component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
@@ -85,12 +85,7 @@ class CameraConfig:
     """Images in a row with such an error after which the camera counts as moved."""
 
     def __post_init__(self) -> None:
-        for name in ("frames", "hypotheses", "surprises"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}.")
-        for name in ("min_step", "pixel_noise", "tilt", "place", "marker", "residual", "bump"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        check_settings(self, positive=vars(self))
 
 
 @pytree

@@ -215,15 +215,6 @@ class Arm(SerialChain):
         return CapsuleArm(self, links, self.whole.overlapping)
 
     @cached_property
-    def reach(self) -> float:
-        """Largest distance of the tool centre point from joint 2 [m], over random postures."""
-        limits, rng = self.limits, torch.Generator().manual_seed(0)
-        fraction = torch.rand(5000, self.joints, generator=rng, dtype=torch.float64)
-        q = limits.lower + (limits.upper - limits.lower) * fraction
-        offset = self.forward(q).position - self.joint_origins(q)[:, 1]
-        return float(torch.linalg.vector_norm(offset, dim=-1).max())
-
-    @cached_property
     def masses(self) -> tuple[float, ...]:
         """Masses of base, links, flange and tool [kg].
 

@@ -286,10 +286,8 @@ class SerialChain:
         """`joint_origins` and `jacobian` for little more than the price of one."""
         q = self.joint_positions(q)
         frames = self._joint_frames(q)
-        tip = frames[-1] @ self._tip.like(q)
-        frames = torch.stack(frames, dim=-3)
-        axis, origin = frames[..., 2], frames[..., 3]
-        return origin, self._screw_jacobian(axis, origin, tip[..., None, :, 3])
+        tip, frames = frames[-1] @ self._tip.like(q), torch.stack(frames, dim=-3)
+        return frames[..., 3], self._screw_jacobian(frames, tip)
 
     def jacobian(self, q: ArrayLike) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the tool centre point.
@@ -319,9 +317,8 @@ class SerialChain:
                 q, self._mount_entries, self._tip_entries, self._slides
             )
         frames = self._joint_frames(q)
-        tip = frames[-1] @ self._tip.like(q)
-        frames = torch.stack(frames, dim=-3)
-        return tip, self._screw_jacobian(frames[..., 2], frames[..., 3], tip[..., None, :, 3])
+        tip, frames = frames[-1] @ self._tip.like(q), torch.stack(frames, dim=-3)
+        return tip, self._screw_jacobian(frames, tip)
 
     def joint_jacobian(self, q: ArrayLike, joint: int) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the frame of one joint, to pull the arm there.
@@ -341,8 +338,7 @@ class SerialChain:
             _, J = transform_and_jacobian(q, mounts, _NO_TOOL, self._slides[:joint])
             return torch.nn.functional.pad(J, (0, count - joint))
         frames = torch.stack(self._joint_frames(self.joint_positions(q), joint), dim=-3)
-        origin = frames[..., -1:, :, 3]
-        J = self._screw_jacobian(frames[..., 2], frames[..., 3], origin)
+        J = self._screw_jacobian(frames, frames[..., -1, :, :])
         return torch.nn.functional.pad(J, (0, count - joint))
 
     def _joint_frames(self, q: Tensor, count: int | None = None) -> list[Tensor]:
@@ -360,12 +356,12 @@ class SerialChain:
 
     def _screw_jacobian(
         self,
-        axis: Float[Tensor, "*batch some 3"],
-        origin: Float[Tensor, "*batch some 3"],
-        point: Float[Tensor, "*batch 1 3"],
+        frames: Float[Tensor, "*batch some 3 4"],
+        tip: Float[Tensor, "*batch 3 4"],
     ) -> Float[Tensor, "*batch 6 some"]:
-        """Twist of a frame at `point` for unit speed of each of the first joints."""
-        linear, angular = torch.linalg.cross(axis, point - origin), axis
+        """Twist of the tip for unit speed of each of the first joints, from their frames."""
+        axis, origin = frames[..., 2], frames[..., 3]
+        linear, angular = torch.linalg.cross(axis, tip[..., None, :, 3] - origin), axis
         if self._turning is not None:
             turning = self._turning.like(axis)[: axis.shape[-2]]
             linear, angular = torch.lerp(axis, linear, turning), turning * axis

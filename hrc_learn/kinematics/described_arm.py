@@ -176,8 +176,7 @@ def _places(
     description: Description, base: str, moving: Sequence[Joint], base_turn: float
 ) -> tuple[dict[str, tuple[int, Transform]], list[Transform]]:
     """Number of each link's frame and its pose there, and the mounts of the joints."""
-    turned, (c, s) = np.eye(4), (np.cos(base_turn), np.sin(base_turn))
-    turned[:2, :2] = [[c, -s], [s, c]]
+    turned = motion("revolute", np.array([0.0, 0.0, 1.0]), base_turn)
     subtree = description.rigid_subtree(base)
     places = {name: (0, turned @ pose) for name, pose in subtree.items()}
     mounts = []

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.geometry.shapes import Line
 from hrc_learn.protocols import Camera
 from hrc_learn.sim.recorded_world import DrawnWorld, RecordedWorld
@@ -259,12 +260,7 @@ class CameraChange:
     """Factor on its focal length."""
 
     def __post_init__(self) -> None:
-        if self.distance < 0 or self.angle < 0 or not self.focus > 0:
-            raise ValueError(
-                "a camera's change needs distance and angle that are not negative and a "
-                f"positive focus, but they are {self.distance:g} m, {self.angle:g} rad and "
-                f"{self.focus:g}."
-            )
+        check_settings(self, positive=["focus"], not_negative=["distance", "angle"])
 
     def applied(
         self,
@@ -349,11 +345,7 @@ class OcclusionInterval:
     """ArUco number."""
 
     def __post_init__(self) -> None:
-        if self.start < 0 or self.duration < 0:
-            raise ValueError(
-                "an occlusion's start and duration must not be negative, but are "
-                f"{self.start:g} s and {self.duration:g} s."
-            )
+        check_settings(self, not_negative=["start", "duration"])
 
 
 class ScriptedOcclusion:

@@ -331,7 +331,7 @@ class CellLayout:
     @property
     def rank(self) -> float:
         """Quality, less what views of the marker are missing."""
-        return _worth(self.quality, self.seen)
+        return _worth(self)
 
 
 type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
@@ -374,16 +374,16 @@ def _candidates(robot: Arm) -> Iterator[tuple[list[Workplace], _Above]]:
             ]
             above = _above_table(places[0])
             # No layout is better than the best posture above its table.
-            if any(_worth(m.quality, m.seen) >= _ENOUGH for _, m in above):
+            if any(_worth(marked) >= _ENOUGH for _, marked in above):
                 yield places, above
             elif above:
                 unlikely.append((places, above))
     yield from unlikely
 
 
-def _worth(quality: float, seen: float) -> float:
+def _worth(found: CellLayout | MarkedTurns) -> float:
     # A marker that is out of view for longer than a moment ends the servoing.
-    return min(quality, 1.0 - _UNSEEN * (1.0 - seen))
+    return min(found.quality, 1.0 - _UNSEEN * (1.0 - found.seen))
 
 
 def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
@@ -504,7 +504,7 @@ def _above_table(workplace: Workplace) -> _Above:
         workplace.table_reach,
     )
     found = [(hover, turns(hover)) for hover in postures]
-    found.sort(key=lambda pair: _worth(pair[1].quality, pair[1].seen), reverse=True)
+    found.sort(key=lambda pair: _worth(pair[1]), reverse=True)
     return found[: 2 * _TRIED]
 
 

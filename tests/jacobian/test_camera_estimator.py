@@ -209,7 +209,7 @@ def test_a_network_without_a_camera_is_refused():
     plain = RBFImageJacobian.from_jacobian(torch.zeros(2, 6), paper_grid(), 0.1)
     with pytest.raises(ValueError, match="has no camera: fit it again"):
         CameraEstimator(plain)
-    with pytest.raises(ValueError, match="frames must be at least 1"):
+    with pytest.raises(ValueError, match="frames must be positive"):
         CameraConfig(frames=0)
 
 

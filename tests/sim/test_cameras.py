@@ -186,7 +186,7 @@ def test_refocusing_scales_the_image_about_the_principal_point():
 def test_a_camera_that_would_look_elsewhere_is_refused():
     with pytest.raises(ValueError, match="change it less"):
         CameraChange(focus=9.0).applied(MODEL, WATCHED, np.random.default_rng(0), 50)
-    with pytest.raises(ValueError, match="not negative"):
+    with pytest.raises(ValueError, match="distance must not be negative"):
         CameraChange(distance=-0.1)
 
 

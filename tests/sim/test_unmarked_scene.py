@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.sim import HAND_MARKER, RenderingUnavailableError, World, open_camera
-from hrc_learn.sim.unmarked_scene import UnmarkedLook, unmarked
+from hrc_learn.sim.scene import UnmarkedLook, unmarked
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.vision import MarkerDetector
 
