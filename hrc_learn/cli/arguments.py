@@ -74,10 +74,6 @@ class Columns:
     mapping: dict[str, str] = field(default_factory=dict)
     """Columns by quantity, such as: joint_position "observation.state[0:7]"."""
 
-    def columns(self) -> dict[str, str | list[str]]:
-        """`mapping` as the reader takes it."""
-        return columns(self.mapping)
-
 
 def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str]]:
     """Columns by quantity: a feature, a range of it, or a list of names from "a,b"."""

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hrc_learn.cli._run import configuration, has_screen, one_line, updated, write_values
-from hrc_learn.cli.arguments import Check, Curate, Import, Merge, Push, Repair
+from hrc_learn.cli.arguments import Check, Curate, Import, Merge, Push, Repair, columns
 from hrc_learn.demos import (
     RepairOptions,
     check_dataset,
@@ -80,14 +80,14 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
         read = read_toml if mapping.suffix == ".toml" else read_json
         said = updated(said, read(mapping), f"{mapping}: ")
     turn = _words(args.orientation)
-    columns = {
+    fields = {
         "joint_position": _words(args.joints),
         "command_position": _words(args.command),
         "gripper": _words(args.gripper),
         "position": _words(args.position),
         f"quaternion_{args.quaternion_order}": turn,
     }
-    given = {name: words for name, words in columns.items() if words}
+    given = {name: words for name, words in fields.items() if words}
     return replace(
         said,
         columns=said.columns | given,
@@ -115,7 +115,7 @@ def check(args: Check) -> int:
     """
     if not args.dataset.is_dir():  # no error of the data
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
-    report = check_dataset(args.dataset, args.columns(), units=args.units)
+    report = check_dataset(args.dataset, columns(args.mapping), units=args.units)
     if report.contract is not None:
         print(*report.contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")
@@ -156,7 +156,7 @@ def _store_contract(dataset: Path, contract: Contract | None) -> None:
 
 def _camera_moved(args: Check) -> bool:
     """True if the camera was moved between episodes; prints its places."""
-    demos = load_demos(args.dataset, mapping=args.columns(), units=args.units)
+    demos = load_demos(args.dataset, mapping=columns(args.mapping), units=args.units)
     placements = camera_placements(list(feature_trajectories(demos)), IMAGE_SIZE)
     if not placements:
         print("camera: the marker is visible in fewer than two episodes, nothing to compare")
@@ -190,7 +190,7 @@ def repair(args: Repair) -> None:
         args.dataset,
         args.folder,
         options,
-        mapping=args.columns(),
+        mapping=columns(args.mapping),
         units=args.units,
         progress=partial(track, description="Repairing"),
     )

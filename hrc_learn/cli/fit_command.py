@@ -11,7 +11,7 @@ from rich.console import Console
 
 from hrc_learn import distributed
 from hrc_learn.cli._run import command_line, configuration, refuse_repeats, write_values
-from hrc_learn.cli.arguments import FitPrimitives, refuse_given
+from hrc_learn.cli.arguments import FitPrimitives, columns, refuse_given
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.source import open_dataset
@@ -133,7 +133,7 @@ def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
     source = open_demos(
         args.dataset,
         args.episodes or None,
-        args.columns(),
+        columns(args.mapping),
         args.units,
         args.joint_names or None,
         where=moves,

@@ -11,9 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from hrc_learn.demos import Demonstration, load_demos
+from hrc_learn.demos import load_demos
 from hrc_learn.experiments.experiment import Study
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.placing_metrics import (
@@ -25,21 +24,22 @@ from hrc_learn.experiments.placing_metrics import (
 )
 from hrc_learn.experiments.placing_trial import (
     SPACES,
+    PlacingScene,
     SimulatedPlacing,
     demonstrated_path,
     demonstrated_shelf,
-    place,
     random_start,
     taught_correction,
 )
 from hrc_learn.experiments.run_recorder import record
 from hrc_learn.experiments.run_report import placing_joints_figure, placing_paths_figure
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import RunRecording
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, PlanningSpace
+from hrc_learn.skills.placing import PlacingSkill, PlanningSpace
 from hrc_learn.store import read_made_by
 from hrc_learn.viz.report import Picture, Section
 
@@ -80,11 +80,7 @@ class PlacingExperiment:
     network protocol."""
 
     def __post_init__(self) -> None:
-        if self.speed <= 0 or self.noise < 0:
-            raise ValueError(
-                "speed must be positive and noise not negative, but they are "
-                f"{self.speed:g} and {self.noise:g}."
-            )
+        check_settings(self, positive=["speed"], not_negative=["noise"])
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> PlacingRun:
         """Place on all shelves in both spaces, from the start of the demonstration.
@@ -103,7 +99,7 @@ class PlacingExperiment:
             for shelf in scene.workplace.shelf_names():
                 observer.tell(f"Placing on the {shelf} shelf, planned in {label}")
                 viewed = (planned, shelf) == ("joint", scene.demonstrated_shelf)
-                placings[planned, shelf], outcomes[planned][shelf] = scene.place(
+                placings[planned, shelf] = placed = scene.place(
                     shelf,
                     torch.from_numpy(joints[0]),
                     space=planned,
@@ -111,15 +107,10 @@ class PlacingExperiment:
                     access=access_by(self.arm, scene.skill.robot),
                     observer=observer if viewed else UNOBSERVED,
                 )
-        return PlacingRun(
-            workplace=scene.workplace,
-            demonstration=scene.demonstration,
-            demonstrated_shelf=scene.demonstrated_shelf,
-            placings=placings,
-            outcomes=outcomes,
-        )
+                outcomes[planned][shelf] = PlacingOutcome.of(placed, scene)
+        return PlacingRun(scene=scene, placings=placings, outcomes=outcomes)
 
-    def open_scene(self, rng: np.random.Generator) -> "PlacingScene":
+    def open_scene(self, rng: np.random.Generator) -> PlacingScene:
         """World with drawn imperfections, skill, demonstration and taught correction."""
         skill = PlacingSkill.load(self.placing, self.robot.work_arm())
         demonstration = load_demos(self.demonstrations, episodes=[0])[0]
@@ -149,7 +140,7 @@ class PlacingExperiment:
     def recordings(self, run: PlacingRun) -> Mapping[str, RunRecording]:
         """Placings planned in task space; that on the demonstrated shelf is named "run"."""
         recordings = {}
-        for shelf in run.workplace.shelf_names():
+        for shelf in run.scene.workplace.shelf_names():
             placed = run.placings["pose", shelf]
             recording = record(
                 f"Placing on the {shelf} shelf",
@@ -157,9 +148,9 @@ class PlacingExperiment:
                 placed.world,
                 placed.motion,
                 plans=[placed.plan],
-                demonstration=run.demonstration,
+                demonstration=run.scene.demonstration,
             )
-            name = "run" if shelf == run.demonstrated_shelf else f"run_{shelf}"
+            name = "run" if shelf == run.scene.demonstrated_shelf else f"run_{shelf}"
             # Neither a camera nor a person takes part.
             recordings[name] = replace(recording, camera=None, nullspace_input=None)
         return recordings
@@ -201,33 +192,6 @@ class PlacingExperiment:
         return Workplace.of(self.robot.work_arm()).shelf_names()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacingScene:
-    """World of placings, with the skill and the demonstration it was learned from."""
-
-    skill: PlacingSkill
-    workplace: Workplace
-    world: World
-    demonstration: Demonstration
-    demonstrated_shelf: str
-    correction: PlaceCorrection | None
-
-    def place(
-        self, shelf: str, start: Tensor, **options: Any
-    ) -> tuple[SimulatedPlacing, PlacingOutcome]:
-        """Place on a shelf from joint positions [rad] with options of `placing_trial.place`."""
-        placed = place(
-            self.skill,
-            self.workplace,
-            shelf,
-            start,
-            world=self.world,
-            correction=self.correction,
-            **options,
-        )
-        return placed, PlacingOutcome.of(placed, self.workplace, self.demonstration)
-
-
 @dataclass(frozen=True)
 class RandomStart:
     """One trial: place on each shelf, each time from another random start."""
@@ -241,9 +205,8 @@ class RandomStart:
         outcomes = {}
         for shelf in scene.workplace.shelf_names():
             start = random_start(scene.world, scene.workplace, noise, rng)
-            _, outcomes[shelf] = scene.place(
-                shelf, start, space="pose", speed=self.experiment.speed
-            )
+            placed = scene.place(shelf, start, space="pose", speed=self.experiment.speed)
+            outcomes[shelf] = PlacingOutcome.of(placed, scene)
         evaluation = evaluate(placing_metrics(scene.workplace.shelf_names()), outcomes)
         return {**evaluation.values, "failure": evaluation.failure}
 

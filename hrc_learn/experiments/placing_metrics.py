@@ -7,16 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.demos import Demonstration
 from hrc_learn.demos.quality.ranking import log_dimensionless_jerk
 from hrc_learn.experiments.metric_table import Metric, never, p95, success_rate
-from hrc_learn.experiments.placing_trial import SPACES, SimulatedPlacing, demonstrated_path
+from hrc_learn.experiments.placing_trial import (
+    SPACES,
+    PlacingScene,
+    SimulatedPlacing,
+    demonstrated_path,
+)
 from hrc_learn.experiments.run_measures import limit_violations, place_angle
 from hrc_learn.experiments.run_recorder import demonstrated_joints
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import Touch
-from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlanningSpace
 
 DEVIATION_MM, PLACE_ERROR_MM, PLACE_TILT_DEG = 12.0, 3.0, 3.0
@@ -49,10 +52,9 @@ class PlacingOutcome:
     """True if the object stands on its board afterwards."""
 
     @classmethod
-    def of(
-        cls, run: SimulatedPlacing, workplace: Workplace, demonstration: Demonstration
-    ) -> "PlacingOutcome":
-        """Measure a placing on any shelf against a demonstration."""
+    def of(cls, run: SimulatedPlacing, scene: PlacingScene) -> "PlacingOutcome":
+        """Measure a placing on any shelf against the demonstration."""
+        workplace, demonstration = scene.workplace, scene.demonstration
         shown = demonstrated_path(demonstration, run.cell.chain)
         # The load crosses the front edge of the boards before the end effector does.
         edge = workplace.scene.cabinet.front + workplace.scene.objects[0].half_size[2]
@@ -115,9 +117,7 @@ def _approach(
 class PlacingRun:
     """Placings on every shelf, planned in both spaces."""
 
-    workplace: Workplace
-    demonstration: Demonstration
-    demonstrated_shelf: str
+    scene: PlacingScene
     placings: Mapping[tuple[PlanningSpace, str], SimulatedPlacing]
     """Placings from the start of the demonstration, by space and shelf."""
     outcomes: Mapping[PlanningSpace, Mapping[str, PlacingOutcome]]
@@ -128,7 +128,7 @@ class PlacingRun:
     @property
     def reproduction(self) -> SimulatedPlacing:
         """Demonstrated motion, reproduced in joint space as in the paper."""
-        return self.placings["joint", self.demonstrated_shelf]
+        return self.placings["joint", self.scene.demonstrated_shelf]
 
     @property
     def log(self) -> LoggedSteps:
@@ -224,7 +224,7 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
     return [
         Metric(
             "demonstration, duration",
-            lambda run: float(run.demonstration.duration),
+            lambda run: float(run.scene.demonstration.duration),
             "s",
             claim="30 s",
         ),
@@ -250,5 +250,5 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
 def _joint_rmse(run: PlacingRun) -> float:
     """RMSE of the reproduced joints at equal fractions of the motion [deg]."""
     done = run.reproduction
-    demonstrated = demonstrated_joints(run.demonstration, done.time / done.time[-1])
+    demonstrated = demonstrated_joints(run.scene.demonstration, done.time / done.time[-1])
     return float(np.rad2deg(np.sqrt(np.square(done.joint_position - demonstrated).mean())))

@@ -84,62 +84,65 @@ class SimulatedPlacing(CellRun):
         return true_tool(self.motion, self.world, len(self.plan.path)).position.numpy()
 
 
-def place(
-    skill: PlacingSkill,
-    workplace: Workplace,
-    shelf: str,
-    start: Float[Tensor, " joints"],
-    *,
-    space: PlanningSpace,
-    speed: float = 1.5,
-    world: World | None = None,
-    correction: PlaceCorrection | None = None,
-    access: ArmAccess = SIMULATED,
-    observer: Observer = UNOBSERVED,
-) -> SimulatedPlacing:
-    """Carry the first object of the scene, already in the gripper, to a shelf; release it.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacingScene:
+    """World of placings, with the skill and the demonstration it was learned from."""
 
-    Args:
-        skill: Learned placing motion.
-        workplace: Workplace with the shelves.
-        shelf: Name of the shelf.
-        start: True joint positions at the start [rad].
-        space: Planning space: the primitive of the joints, as in the paper, or of the pose.
-        speed: Speed relative to the demonstration.
-        world: World of that workplace, to be reused with its imperfections; by default a new
-            one without imperfections.
-        correction: Correction of the arm's measured poses; None: they are taken as true.
-        access: Access to the arm.
-        observer: Live dashboard of the run.
+    skill: PlacingSkill
+    workplace: Workplace
+    world: World
+    """World of that workplace, reused by each placing with its imperfections."""
+    demonstration: Demonstration
+    demonstrated_shelf: str
+    correction: PlaceCorrection | None = None
+    """Correction of the arm's measured poses; None: they are taken as true."""
 
-    Raises:
-        ValueError: If there is no such shelf, or the arm cannot reach it.
-    """
-    goal = workplace.shelf(shelf)
-    measured_goal = goal if correction is None else correction.apply(goal)
-    item = workplace.scene.objects[0]
-    world = world or World(workplace.scene)
-    world.hold(item.name, start.numpy())
-    human = ScriptedPerturbation(workplace.robot.chain, ())
-    with simulated_cell(world, human=human, access=access, observer=observer) as (cell, motion):
-        plan = skill.plan(
-            cell.joints, measured_goal, space=space, dt=cell.config.dt, speed=speed
+    def place(
+        self,
+        shelf: str,
+        start: Float[Tensor, " joints"],
+        *,
+        space: PlanningSpace,
+        speed: float = 1.5,
+        access: ArmAccess = SIMULATED,
+        observer: Observer = UNOBSERVED,
+    ) -> SimulatedPlacing:
+        """Carry the first object of the scene, already in the gripper, to a shelf; release it.
+
+        Args:
+            shelf: Name of the shelf.
+            start: True joint positions at the start [rad].
+            space: Planning space: the primitive of the joints, as in the paper, or of the pose.
+            speed: Speed relative to the demonstration.
+            access: Access to the arm.
+            observer: Live dashboard of the run.
+
+        Raises:
+            ValueError: If there is no such shelf, or the arm cannot reach it.
+        """
+        world, workplace = self.world, self.workplace
+        goal, item = workplace.shelf(shelf), workplace.scene.objects[0]
+        measured_goal = goal if self.correction is None else self.correction.apply(goal)
+        world.hold(item.name, start.numpy())
+        human = ScriptedPerturbation(workplace.robot.chain, ())
+        with simulated_cell(world, human=human, access=access, observer=observer) as connected:
+            cell, motion = connected
+            plan = self.skill.plan(
+                cell.joints, measured_goal, space=space, dt=cell.config.dt, speed=speed
+            )
+            lowering, size = workplace.lowering(item.half_size), workplace.robot.hand_size
+            release_time = place_along(cell, plan, measured_goal, lowering, size)
+        contacts = unwanted_contacts(world, cell.log, {item.name: release_time})
+        return SimulatedPlacing(
+            goal=goal,
+            plan=plan,
+            world=world,
+            cell=cell,
+            motion=motion,
+            object_pose=world.object_pose(item.name),
+            contacts=sum(contacts.values(), ()),
+            placed=world.rests_on(item.name, f"board_{shelf}"),
         )
-        lowering = workplace.lowering(item.half_size)
-        release_time = place_along(
-            cell, plan, measured_goal, lowering, workplace.robot.hand_size
-        )
-    contacts = unwanted_contacts(world, cell.log, {item.name: release_time})
-    return SimulatedPlacing(
-        goal=goal,
-        plan=plan,
-        world=world,
-        cell=cell,
-        motion=motion,
-        object_pose=world.object_pose(item.name),
-        contacts=sum(contacts.values(), ()),
-        placed=world.rests_on(item.name, f"board_{shelf}"),
-    )
 
 
 def taught_correction(

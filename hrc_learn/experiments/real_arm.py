@@ -24,6 +24,7 @@ from hrc_learn.experiments.placing_experiment import PlacingExperiment
 from hrc_learn.experiments.run_recorder import record
 from hrc_learn.experiments.simulated_cell import CellRun
 from hrc_learn.experiments.surroundings import workplace_for
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.hardware import (
     ArmProcess,
     CameraError,
@@ -98,9 +99,7 @@ class ArmSite:
     effector pauses the task."""
 
     def __post_init__(self) -> None:
-        for name in ("dynamics", "speed"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in (0, 1], but is {getattr(self, name)}.")
+        check_settings(self, fraction=("dynamics", "speed"))
 
     @property
     def chain(self) -> SerialChain:

@@ -262,14 +262,14 @@ def _out_of_sight(run: RunRecording) -> Bool[np.ndarray, " time"]:
 
 def placing_paths_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
     """Paths of the end effector to shelves, one panel for each planning space."""
-    shown = demonstrated_path(run.demonstration, run.workplace.robot.chain)
+    shown = demonstrated_path(run.scene.demonstration, run.scene.workplace.robot.chain)
     paths = {key: placed.path for key, placed in run.placings.items()}
     points = np.concatenate([shown, *paths.values()])
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 4.5))
         for i, (planned, label) in enumerate(SPACES.items()):
             axes = space(figure, position=(1, len(SPACES), 1 + i))
-            for box in near(tuple(run.workplace.scene.cabinet.boxes()), points):
+            for box in near(tuple(run.scene.workplace.scene.cabinet.boxes()), points):
                 draw_box(axes, box, "#8D8F94")
             axes.plot(*shown.T, color=palette.DEMO, lw=5, label="demonstration")
             for shelf, colour in zip(shelves, _SHELVES, strict=False):
@@ -287,7 +287,7 @@ def placing_paths_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
 
 def placing_joints_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
     """Joint positions over time: the demonstration, and the motion to each shelf."""
-    shown, chain = run.demonstration, run.workplace.robot.chain
+    shown, chain = run.scene.demonstration, run.scene.workplace.robot.chain
     assert shown.joint_position is not None
     time = shown.time - shown.time[0]
     curves = [JointCurves("demonstration", time, shown.joint_position, *DEMO_LOOK)]

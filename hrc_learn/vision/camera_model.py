@@ -124,6 +124,8 @@ class CameraModel:
         """Normalised (x/z, y/z) points seen at the given pixels: the lens undone."""
         import cv2
 
+        if not pixels.size:  # OpenCV refuses them
+            return pixels
         # Ten steps of the fixed point are enough for common lenses, thirty for wide ones.
         steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         points, lens = pixels.reshape(-1, 1, 2), np.array(self.distortion)

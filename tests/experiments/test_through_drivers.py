@@ -8,6 +8,7 @@ import pytest
 from taught_models import teach
 from unchecked import shapes_unchecked
 
+from hrc_learn.demos import Demonstration
 from hrc_learn.experiments.collaboration_trial import (
     CollaborationScenario,
     simulate_collaboration,
@@ -17,11 +18,11 @@ from hrc_learn.experiments.grasping_trial import (
     GraspingSceneConfig,
     simulate_grasp,
 )
-from hrc_learn.experiments.placing_trial import place
+from hrc_learn.experiments.placing_trial import PlacingScene
 from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import Imperfections
+from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 
@@ -79,15 +80,15 @@ def test_an_object_is_grasped(skills):
 
 
 def place_on_shelf(skill, access):
-    run = place(
-        skill,
-        WORKPLACE,
-        "upper",
-        WORKPLACE.home_joints(),
-        space="pose",
-        speed=1.0,
-        access=access,
+    scene = PlacingScene(
+        skill=skill,
+        workplace=WORKPLACE,
+        world=World(WORKPLACE.scene),
+        demonstration=Demonstration(time=np.arange(2.0)),
+        demonstrated_shelf="middle",
     )
+    home = WORKPLACE.home_joints()
+    run = scene.place("upper", home, space="pose", speed=1.0, access=access)
     assert run.placed
     assert not run.contacts
     np.testing.assert_allclose(run.object_pose[:2, 3], run.goal.position[:2], atol=5e-3)

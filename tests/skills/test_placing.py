@@ -14,7 +14,7 @@ from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.placing_experiment import PlacingExperiment
 from hrc_learn.experiments.placing_metrics import PlacingOutcome, PlacingRun, placing_metrics
-from hrc_learn.experiments.placing_trial import SPACES, place
+from hrc_learn.experiments.placing_trial import SPACES, PlacingScene
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.learning.primitive_fitting import fit_primitives
@@ -184,8 +184,15 @@ def test_check_plan_names_what_would_be_hit(plans, world):
 
 @shapes_unchecked()
 def test_an_executed_placing_ends_on_the_shelf_as_demonstrated(skill, demos):
-    run = place(skill, WORKPLACE, "middle", HOME, space="joint", speed=2.5)
-    outcome = PlacingOutcome.of(run, WORKPLACE, demos[0])
+    scene = PlacingScene(
+        skill=skill,
+        workplace=WORKPLACE,
+        world=World(WORKPLACE.scene),
+        demonstration=demos[0],
+        demonstrated_shelf="middle",
+    )
+    run = scene.place("middle", HOME, space="joint", speed=2.5)
+    outcome = PlacingOutcome.of(run, scene)
     assert evaluate(placing_metrics(["middle"]), {"middle": outcome}).faults == ()
     assert outcome.placed
     assert outcome.jerk < 1e-2
@@ -195,9 +202,7 @@ def test_an_executed_placing_ends_on_the_shelf_as_demonstrated(skill, demos):
     # The same placing for every shelf and space: it is recorded, measured and reported.
     shelves = WORKPLACE.shelf_names()
     placings = PlacingRun(
-        workplace=WORKPLACE,
-        demonstration=demos[0],
-        demonstrated_shelf="middle",
+        scene=scene,
         placings={(space, shelf): run for space in SPACES for shelf in shelves},
         outcomes={space: dict.fromkeys(shelves, outcome) for space in SPACES},
     )

@@ -104,8 +104,9 @@ def test_image_jacobian_is_the_derivative_of_the_projection():
     np.testing.assert_allclose(model.image_jacobian(points, origins), numeric, atol=2e-4)
 
 
-def test_no_points_have_no_image_jacobians():
+def test_no_points_have_no_image_jacobians_and_no_pixels_no_directions():
     assert CameraModel().image_jacobian(np.zeros((0, 3))).shape == (0, 2, 6)
+    assert camera().to_normalised(np.zeros((0, 2))).shape == (0, 2)
 
 
 def test_rotation_about_the_point_itself_moves_nothing():
