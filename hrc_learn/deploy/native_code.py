@@ -17,7 +17,7 @@ from typing import Any, final
 import numpy as np
 import torch
 from jaxtyping import Int
-from llvmlite import ir
+from llvmlite import binding, ir
 from torch import Tensor
 
 from hrc_learn.deploy.scalar_program import ScalarProgram, operands
@@ -253,8 +253,6 @@ def _allocate(
 
 def lanes_of(dtype: np.dtype) -> int:
     """Numbers in a vector register of this processor."""
-    from llvmlite import binding
-
     features = binding.get_host_cpu_features()
     width = 64 if features.get("avx512f") else 32 if features.get("avx2") else 16
     return width // dtype.itemsize
@@ -262,8 +260,6 @@ def lanes_of(dtype: np.dtype) -> int:
 
 def assemble(text: str) -> bytes:
     """Object code of a module for this processor."""
-    from llvmlite import binding
-
     machine = _machine()
     module = binding.parse_assembly(text)
     module.triple = machine.triple
@@ -272,8 +268,6 @@ def assemble(text: str) -> bytes:
 
 def _machine() -> Any:
     """LLVM's code generator for this processor."""
-    from llvmlite import binding
-
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     return binding.Target.from_default_triple().create_target_machine(
@@ -307,8 +301,6 @@ class NativeStep:
             workspace: Size of the workspace in numbers.
             shared: Rows of each vector in which the number of the first arm counts for all.
         """
-        from llvmlite import binding
-
         engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
         engine.add_object_file(binding.ObjectFileRef.from_data(code))
         engine.finalize_object()

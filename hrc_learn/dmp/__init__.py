@@ -1,7 +1,6 @@
 """Dynamic movement primitives: learned motions that start, goal and duration reshape."""
 
 from hrc_learn.dmp import coupling as coupling
-from hrc_learn.dmp import orientation_error as orientation_error
 from hrc_learn.dmp.closed_loop_step import DMPState as DMPState
 from hrc_learn.dmp.dynamics import ExponentialPhase as ExponentialPhase
 from hrc_learn.dmp.dynamics import GaussianBasis as GaussianBasis

@@ -28,6 +28,7 @@ from hrc_learn.dmp.pose_dmp import PoseDMP
 from hrc_learn.dmp.probabilistic_dmp import (
     KINDS,
     columns_of_ends,
+    common_reference,
     mean_primitive,
     with_common_reference,
 )
@@ -240,7 +241,7 @@ class LearnedMotion:
         else:
             if self.by_ends:
                 like = mean_primitive(self.each)
-                like = self.each.with_motion(like.motion, self._reference)
+                like = self.each.with_motion(like.motion, common_reference(self.each))
                 context = columns_of_ends(like, like.with_boundary(start, goal))
             elif context is None:
                 size = self.context.shape[1]
@@ -272,14 +273,8 @@ class LearnedMotion:
         """Shrunk primitives with coordinates, and durations of weighted demonstrations."""
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x, self.chosen.shrinkage)
-        middle, reference = mean_primitive(self.each).motion, self._reference
+        middle, reference = mean_primitive(self.each).motion, common_reference(self.each)
         return self.each.with_motion(middle.with_coordinates(x, lasting), reference)
-
-    @property
-    def _reference(self) -> Tensor | None:
-        """Common reference of orientations, (4,)."""
-        found = getattr(self.each, "reference", None)
-        return None if found is None else found.reshape(-1, 4)[0]
 
     def rollout(self, time: Any = None, *arguments: Any, **options: Any) -> Any:
         """Motion at times [s]; other arguments as for `at`."""

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
-from hrc_learn.dmp.linear_primitive import LinearPrimitive
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.probabilistic_dmp import (
     PATH_TIMES,
@@ -83,7 +82,9 @@ class MixtureDMP[P: MotionPrimitive]:
         x = motion.coordinates().detach().double().flatten(0, -3)
         if n_modes is not None and not 1 <= n_modes <= n:
             raise ValueError(f"{n} primitives have 1 to {n} modes, not {n_modes}")
-        r = _responsibilities(principal_components(_paths(motion)), n_modes)
+        s = torch.linspace(0, 1, PATH_TIMES, dtype=torch.float64).to(x)
+        paths = (x @ motion.response.evaluate(s)[:, 0].mT).flatten(1)
+        r = _responsibilities(principal_components(paths), n_modes)
         if context is None:
             c = x[..., -2:].flatten(1)
         else:
@@ -136,13 +137,6 @@ class MixtureDMP[P: MotionPrimitive]:
         """Mixture with probabilities updated by Bayes' rule."""
         score = self.probability.log() + log_likelihood
         return replace(self, probability=torch.softmax(score, 0))
-
-
-def _paths(motion: LinearPrimitive) -> Float[Tensor, "n DT"]:
-    s = torch.linspace(0, 1, PATH_TIMES, dtype=torch.float64)
-    rows = motion.response.evaluate(s.to(motion.start.device))[:, 0]
-    x = motion.coordinates().detach().double().flatten(0, -3)
-    return (x @ rows.mT).flatten(1)
 
 
 def principal_components(paths: Float[Tensor, "n F"]) -> Float[Tensor, "n d"]:

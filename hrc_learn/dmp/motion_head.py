@@ -56,9 +56,8 @@ class MotionHead(nn.Module):
     """
 
     amplitude: Tensor
-    """Root mean square deviation of each column for unit normal parameters, (D,)."""
-    goal_scale: Tensor
-    """Standard deviation of the goal for unit normal parameters, (D,)."""
+    """Root mean square deviation of each column for unit normal parameters, and standard
+    deviation of its goal, (D,)."""
     goal_centre: Tensor | None
     """Centre of the goals, (D,); None: the start."""
     modes: Tensor
@@ -72,7 +71,6 @@ class MotionHead(nn.Module):
         duration: float | tuple[float, float] = 1.0,
         delay: float = 0.0,
         amplitude: Vectors | float = 1.0,
-        goal_scale: Vectors | float | None = None,
         goal_centre: Vectors | None = None,
     ):
         """Compute the modes.
@@ -82,10 +80,9 @@ class MotionHead(nn.Module):
             n_basis: N.
             duration: Duration [s], or a range in which a parameter selects it, geometrically.
             delay: Longest delay before a motion [s]; 0: no parameter for it.
-            amplitude: Root mean square deviation over a motion for unit normal weights, in the
-                units of the columns; (D,) or one for all.
-            goal_scale: Standard deviation of the goal for a unit normal parameter; `amplitude`
-                by default.
+            amplitude: Root mean square deviation over a motion for unit normal weights, and
+                standard deviation of the goal for a unit normal parameter, in the units of the
+                columns; (D,) or one for all.
             goal_centre: Centre of the goals, (D,); None: the start of each motion.
 
         Raises:
@@ -101,15 +98,10 @@ class MotionHead(nn.Module):
         self.columns = columns
         self.shortest, self.longest, self.latest = low, high, delay
         self.response = response_of(SpringDamper(), GaussianBasis(count=n_basis), 1.0)
-        self.register_buffer("amplitude", _each_column("amplitude", amplitude, columns))
-        goal_scale = self.amplitude if goal_scale is None else goal_scale
-        self.register_buffer("goal_scale", _each_column("goal_scale", goal_scale, columns))
-        centre = (
-            None
-            if goal_centre is None
-            else checked_vector("goal_centre", goal_centre, self.amplitude)
-        )
-        self.register_buffer("goal_centre", centre)
+        self.register_buffer("amplitude", _each_column(amplitude, columns))
+        if goal_centre is not None:
+            goal_centre = checked_vector("goal_centre", goal_centre, self.amplitude)
+        self.register_buffer("goal_centre", goal_centre)
         modes = _modes(self.response).to(self.amplitude)
         self.register_buffer("modes", modes, persistent=False)
 
@@ -254,9 +246,8 @@ class MotionHead(nn.Module):
         plan = self._plan(zeros, y[..., 0, :], start_velocity, None, None)
         s, waiting = self._normalised(time, plan)
         missing = y - PlannedTrajectory(plan, s, waiting, self.response).position
-        rows = self._rows(s, plan)[..., None, :, :] * self._scales()[:, None, :].double()
         # Each column in units of its noise; the prior has unit covariance.
-        rows = rows / (noise * self.amplitude.double())[:, None, None]
+        rows = self._rows(s, plan)[..., None, :, :] / noise
         missing = missing.mT.double() / (noise * self.amplitude.double())[:, None]
         normal = rows.mT @ rows + torch.eye(rows.shape[-1]).to(rows)
         z = torch.linalg.solve(normal, rows.mT @ missing[..., None])[..., 0]
@@ -291,7 +282,7 @@ class MotionHead(nn.Module):
             if since is None:
                 raise ValueError("origin belongs to a motion that continues: give since too")
             first = checked_vector("origin", origin, like)
-        scaled = linear * self._scales().to(linear)
+        scaled = linear * self.amplitude.to(linear)[:, None]
         centre = first if self.goal_centre is None else self.goal_centre.to(linear)
         goal = centre + scaled[..., -1]
         weights = scaled[..., :-1] @ self.modes.to(linear).mT
@@ -318,12 +309,6 @@ class MotionHead(nn.Module):
             delay = self.latest * fraction[..., -1]
         fixed = parameters.new_tensor([self.shortest, 0.0])
         return fixed[0] if duration is None else duration, fixed[1] if delay is None else delay
-
-    def _scales(self) -> Float[Tensor, "D M"]:
-        """Scale of the whitened weights and the goal of each column."""
-        N = self.modes.shape[0]
-        weights = self.amplitude[:, None].expand(-1, N)
-        return torch.cat([weights, self.goal_scale[:, None]], -1)
 
     def _normalised(self, time: Times, plan: "_Plan") -> tuple[Tensor, Tensor | None]:
         """Normalised times since the end of the delay, and a mask of times before it."""
@@ -478,16 +463,18 @@ class MotionDistribution:
         mean = PlannedTrajectory(plan, s, waiting, head.response).position
         rows = head._rows(s, plan).to(mean)
         factor = self.scale_tril.unflatten(-2, (head.columns, -1))
-        factor = head._scales().to(mean)[..., None] * factor
+        factor = head.amplitude.to(mean)[:, None, None] * factor
         return mean, torch.einsum("...tm,...dmr->...tdr", rows, factor)
 
 
-def _each_column(name: str, value: Any, columns: int) -> Float[Tensor, "D"]:
-    """Positive number for each column."""
-    dtype = value.dtype if isinstance(value, Tensor) else torch.get_default_dtype()
-    values = positive(name, to_tensor(value, dtype), torch.empty(0, dtype=dtype))
+def _each_column(amplitude: Any, columns: int) -> Float[Tensor, "D"]:
+    """Positive amplitude of each column."""
+    dtype = amplitude.dtype if isinstance(amplitude, Tensor) else torch.get_default_dtype()
+    values = positive("amplitude", to_tensor(amplitude, dtype), torch.empty(0, dtype=dtype))
     if values.ndim > 1 or (values.ndim and len(values) != columns):
-        raise ValueError(f"{name} must be one number or {columns}, got {tuple(values.shape)}")
+        raise ValueError(
+            f"amplitude must be one number or {columns}, got {tuple(values.shape)}"
+        )
     return values.expand(columns).clone()
 
 

@@ -334,7 +334,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
     the error [rad], which bound those of the angle.
     """
 
-    error_columns: ClassVar[slice] = slice(0, 3)
+    error_columns: ClassVar[slice] = OrientationState.error_columns
     state_type: ClassVar[type] = OrientationState
     trajectory_type: ClassVar[type] = OrientationTrajectory
 

@@ -107,6 +107,12 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
     return primitives.with_motion(motion, middle.expand_as(own))
 
 
+def common_reference(primitives: MotionPrimitive) -> Tensor | None:
+    """Reference that all orientations of a batch have, (4,); None for joints."""
+    found = getattr(primitives, "reference", None)
+    return None if found is None else found.reshape(-1, 4)[0]
+
+
 def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
     if motions.forcing_scale.turns and motions.weights.ndim > 2:
         raise ValueError(
@@ -186,7 +192,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
 
     def mean_primitive(self) -> P:
         """Most likely primitive."""
-        return self._with_coordinates(self.mean)
+        motion = self.primitive.motion
+        return self.primitive.with_motion(motion.with_coordinates(self.mean))
 
     def sample(self, n: int, generator: torch.Generator | None = None) -> P:
         """Batch of n random primitives, with durations of their own."""
@@ -420,10 +427,6 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         root = torch.einsum("tm,dmr->tdr", rows, spread)
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
 
-    def _with_coordinates(self, x: Float[Tensor, "*batch D M"]) -> P:
-        motion = self.primitive.motion
-        return self.primitive.with_motion(motion.with_coordinates(x))
-
 
 def gaussians_of_modes[P: MotionPrimitive](
     primitives: P, responsibilities: Float[Tensor, "n K"], slack: float
@@ -457,9 +460,7 @@ def gaussians_of_modes[P: MotionPrimitive](
         free = _free_forcing(middle, slack)
         spread = torch.cat([spread, free], dim=1)
         timing = torch.nn.functional.pad(timing, (0, free.shape[1]))
-    reference = getattr(primitives, "reference", None)
-    if reference is not None:
-        reference = reference.reshape(-1, 4)[0]
+    reference = common_reference(primitives)
     dependence = _dependence_on_ends(motion, x)
     return [
         ProbabilisticDMP(

@@ -16,7 +16,7 @@ HEADS = {
     "fixed": {"duration": 1.5},
     "timed": {"duration": (1.0, 3.0), "delay": 0.5},
     "late": {"delay": 0.5, "goal_centre": (0.3, -0.2)},
-    "scaled": {"duration": (0.5, 2.0), "amplitude": (0.2, 3.0), "goal_scale": 0.7},
+    "scaled": {"duration": (0.5, 2.0), "amplitude": (0.2, 3.0)},
 }
 
 
@@ -71,7 +71,7 @@ def primitive_of(head, z, start, velocity):
     linear = z[..., : head.n_linear].unflatten(-1, (2, -1))
     weights = head.amplitude[:, None] * linear[..., :-1] @ head.modes.mT
     centre = start if head.goal_centre is None else head.goal_centre
-    goal = centre + head.goal_scale * linear[..., -1]
+    goal = centre + head.amplitude * linear[..., -1]
     duration = head(z, TIME, start).duration.expand(len(z))
     ends = torch.stack([velocity * duration[:, None], start, goal], -1)
     grid = torch.linspace(0, 1, 11).double()
