@@ -28,7 +28,6 @@ from hrc_learn.learning.multiply_motions import (
     NewMotion,
     Segmentation,
     find_segments,
-    stacked,
 )
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.store import read_json, write_json
@@ -278,7 +277,9 @@ class Multiplication:
             rows.append((scene, weights, rng.uniform(*config.speed), start))
         scenes, weights, speed, start = zip(*rows, strict=True)
         return Draws(
-            scene={name: stacked([scene[name] for scene in scenes]) for name in self.objects},
+            scene={
+                name: Pose.stack([scene[name] for scene in scenes]) for name in self.objects
+            },
             weights=torch.from_numpy(np.stack(weights)),
             speed=torch.tensor(speed).double(),
             start=torch.from_numpy(np.stack(start)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,6 +35,12 @@ class Pose:
             value = getattr(self, name)
             if isinstance(value, (np.ndarray, list, tuple)):  # which torch 2.15 traces
                 object.__setattr__(self, name, as_tensor(value))
+
+    @staticmethod
+    def stack(poses: Sequence[Pose]) -> Pose:
+        """Poses as one batch, along a new first dimension."""
+        position = torch.stack([pose.position for pose in poses])
+        return Pose(position, torch.stack([pose.orientation for pose in poses]))
 
     @staticmethod
     def from_matrix(T: ArrayLike) -> Pose:

@@ -125,7 +125,7 @@ def find_segments(
     frames = []
     for k in range(1, min(map(len, cuts.values()))):
         ends = [pose[cuts[demo.episode][k]] for demo, pose in zip(demos, tool, strict=True)]
-        frames.append(_best_frame(stacked(ends), objects))
+        frames.append(_best_frame(Pose.stack(ends), objects))
     return Segmentation(frames=tuple(frames), cuts=cuts)
 
 
@@ -167,12 +167,6 @@ def frame_of(objects: Mapping[str, Pose], name: str, like: Pose) -> Pose:
         return Pose(torch.zeros_like(like.position), still)
     pose = objects[name.removesuffix(POSITION_ONLY)]
     return Pose(pose.position, still) if name.endswith(POSITION_ONLY) else pose
-
-
-def stacked(poses: Sequence[Pose]) -> Pose:
-    """Poses as one batch."""
-    positions = torch.stack([pose.position for pose in poses])
-    return Pose(positions, torch.stack([pose.orientation for pose in poses]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -336,7 +330,7 @@ class MotionSource:
         return cls(
             robot=robot,
             fps=float(demos[0].fps),
-            start=stacked([pose[0] for pose in tool]),
+            start=Pose.stack([pose[0] for pose in tool]),
             near=posture,
             segments=tuple(segments),
             obstacles=torch.zeros(0, 6).double() if obstacles is None else obstacles,

@@ -88,7 +88,9 @@ def fit_visual_servo(
     target = None
     if ends:
         objects = np.array([end.object_pixel for end in ends], dtype=np.float64)
-        target = VisualTarget.fit(camera.camera, objects, _poses(ends))
+        target = VisualTarget.fit(
+            camera.camera, objects, Pose.stack([end.pose for end in ends])
+        )
     return VisualServoSkill(
         jacobian=network,
         target=target,
@@ -175,13 +177,6 @@ def _end(demo: Demonstration, source: str) -> _End:
     )
 
 
-def _poses(ends: Sequence[_End]) -> Pose:
-    return Pose(
-        torch.stack([end.pose.position for end in ends]),
-        torch.stack([end.pose.orientation for end in ends]),
-    )
-
-
 def _marker_angle(
     ends: Sequence[_End], camera: Float[Tensor, "13"], target: VisualTarget
 ) -> MarkerAngle | None:
@@ -191,4 +186,6 @@ def _marker_angle(
         return None
     objects = np.array([end.object_pixel for end in known], dtype=np.float64)
     angles = [end.angle for end in known if end.angle is not None]
-    return MarkerAngle.fit(camera, objects, angles, _poses(known), target)
+    return MarkerAngle.fit(
+        camera, objects, angles, Pose.stack([end.pose for end in known]), target
+    )

@@ -105,12 +105,8 @@ class ArmTeleoperator(Device, Teleoperator):
 
     def _guided_robot(self, robot: ArmRobot, human: Callable[[], Human]) -> GuidedRobot:
         """The guided robot, anew whenever everything has been put in place."""
-        guided = self._guided
-        if (
-            guided is None
-            or guided.robot is not robot
-            or guided.initial_configuration != robot.initial_configurations
-        ):
+        guided, now = self._guided, (robot, robot.initial_configurations)
+        if guided is None or (guided.robot, guided.initial_configuration) != now:
             guided = self._guided = GuidedRobot(robot, human())
         return guided
 

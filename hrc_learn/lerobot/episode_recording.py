@@ -27,17 +27,13 @@ from hrc_learn.store import DATASET, replacing
 
 def observation_features(robot: ArmRobot) -> dict[str, dict]:
     """Dataset features of a robot's observations, the person's values in their own columns."""
-    columns = {key: names(robot.values.chain) for key, names in COLUMNS.items()}
-    own = {key: names for key, names in columns.items() if names[0] in robot.person_names}
-    rest = {
-        name: shape
-        for name, shape in robot.observation_features.items()
-        if name not in robot.person_names
-    }
-    return hw_to_dataset_features(rest, OBS_STR) | {
-        key: {"dtype": "float32", "shape": (len(names),), "names": list(names)}
-        for key, names in own.items()
-    }
+    values = robot.observation_features.items()
+    rest = {name: shape for name, shape in values if name not in robot.person_names}
+    features = hw_to_dataset_features(rest, OBS_STR)
+    for key, names_of in COLUMNS.items() if robot.person_names else ():
+        names = list(names_of(robot.values.chain))
+        features[key] = {"dtype": "float32", "shape": (len(names),), "names": names}
+    return features
 
 
 @contextmanager

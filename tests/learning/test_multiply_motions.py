@@ -14,7 +14,6 @@ from hrc_learn.learning.multiply_motions import (
     MotionSource,
     Segmentation,
     find_segments,
-    stacked,
 )
 
 N = len(BLOCKS)
@@ -33,7 +32,7 @@ def tool(demos):
 @pytest.fixture(scope="module")
 def objects():
     far = [Pose(torch.tensor([0.3, 0.5, 0.2]).double(), BLOCKS[0].orientation)] * N
-    return {"block": stacked(BLOCKS), "shelf": stacked(far)}
+    return {"block": Pose.stack(BLOCKS), "shelf": Pose.stack(far)}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +52,7 @@ def draws(blocks, weights=None, speed=1.0, start=(0.0, 0.0, 0.0)):
     weights = torch.eye(N).double()[torch.arange(B) % N] if weights is None else weights
     shelf = Pose(torch.tensor([[0.3, 0.5, 0.2]]).double(), BLOCKS[0].orientation[None])
     return Draws(
-        scene={"block": stacked(blocks), "shelf": shelf[[0] * B]},
+        scene={"block": Pose.stack(blocks), "shelf": shelf[[0] * B]},
         weights=weights,
         speed=torch.full((B,), float(speed)).double(),
         start=torch.tensor(start).double().expand(B, 3),
@@ -78,7 +77,7 @@ def test_a_motion_that_does_not_turn_with_its_object_follows_its_position(demos,
         Pose(at.position, torch.tensor([1.0, 0, 0, 0]).double()) @ pose
         for at, pose in zip(BLOCKS, own, strict=True)
     ]
-    found = find_segments(demos, {"block": stacked(turned)}, upright)
+    found = find_segments(demos, {"block": Pose.stack(turned)}, upright)
     assert found.frames == ("block position", "block position")
 
 
@@ -88,7 +87,7 @@ def test_a_motion_that_ends_where_no_object_is_stays_in_the_base(demos):
         Pose(fixed.position.expand(END, 3), fixed.orientation.expand(END, 4)) for _ in demos
     ]
     bare = [replace(demo, gripper=None) for demo in demos]
-    found = find_segments(bare, {"block": stacked(BLOCKS)}, still)
+    found = find_segments(bare, {"block": Pose.stack(BLOCKS)}, still)
     assert found.frames == ("base",)
 
 

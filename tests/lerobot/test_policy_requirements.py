@@ -23,5 +23,7 @@ def make(name, **arguments):
 @pytest.mark.parametrize("stats", [None, {}])
 def test_a_dataset_without_statistics_is_refused(tmp_path, name, stats):
     meta = SimpleNamespace(root=tmp_path, fps=20.0)
-    with pytest.raises(ValueError, match=r"no statistics \(meta/stats.json\).*recompute_stats"):
+    with pytest.raises(
+        ValueError, match=r"statistics \(meta/stats.json\) lack .*recompute_stats"
+    ):
         make(name, dataset_stats=stats, dataset_meta=meta)

@@ -223,15 +223,9 @@ class MotionPolicy(PreTrainedPolicy):
         Raises:
             ValueError: Statistics are missing or not finite.
         """
-        if dataset_meta is not None and not stats:
-            raise ValueError(
-                f"the dataset in {dataset_meta.root} has no statistics (meta/stats.json), by "
-                "which the policy whitens observations and actions: compute them with "
-                "LeRobot's `lerobot-edit-dataset --operation.type recompute_stats`, or record "
-                "it again"
-            )
-        if stats is None:
+        if stats is None and dataset_meta is None:
             return
+        stats = stats or {}
         for key, width in self.encoder.widths.items():
             _require_statistics(stats, key, width, ("mean", "std"))
         width = len(self.encoding.mean)
@@ -290,7 +284,11 @@ def _require_statistics(
 ) -> None:
     for name in names:
         if name not in stats.get(key, {}):
-            raise ValueError(f"the dataset's statistics (meta/stats.json) lack {name} of {key}")
+            raise ValueError(
+                f"the dataset's statistics (meta/stats.json) lack {name} of {key}, by which "
+                "the policy whitens its numbers: compute them with LeRobot's "
+                "`lerobot-edit-dataset --operation.type recompute_stats`, or record again"
+            )
         values = torch.as_tensor(stats[key][name])
         if values.shape != (width,) or not values.isfinite().all():
             raise ValueError(
