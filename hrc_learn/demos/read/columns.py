@@ -54,14 +54,6 @@ class ColumnSelection:
     assumed: str = ""
     """Encoding that no name states, in words; "" if names or the caller state it."""
 
-    def only(self, labels: Sequence[str]) -> "ColumnSelection":
-        """The columns of these labels, in this order."""
-        place = dict(zip(self.labels, self.columns, strict=True))
-        columns = tuple(place[label] for label in labels)
-        units = dict(zip(self.labels, self.units, strict=False))
-        stated = tuple(units[label] for label in labels) if units else ()
-        return replace(self, columns=columns, labels=tuple(labels), units=stated)
-
     def column_name(self, number: int) -> str:
         """Feature and label of a column, for messages."""
         return f"{self.columns[number][0]} ({self.labels[number]})"
@@ -103,8 +95,8 @@ def map_columns(
     replaced = replaced_roles(mapping or {})
     found = {role: selection for role, selection in found.items() if role not in replaced}
     found |= parse_mapping(mapping or {}, usable)
-    found = {role: _with_units(s, usable) for role, s in found.items()}
-    names, found, unmatched = _align_joints(found)
+    names, aligned, unmatched = _align_joints(found)
+    found = {role: _with_units(selection, usable) for role, selection in aligned.items()}
     taken = {column for selection in found.values() for column in selection.columns}
     extra = (
         key
@@ -461,7 +453,9 @@ def _align_joints(
         if role not in JOINT_FIELDS or selection.labels == first.labels:
             aligned[role] = selection
         elif set(selection.labels) >= set(first.labels):
-            aligned[role] = selection.only(first.labels)
+            place = dict(zip(selection.labels, selection.columns, strict=True))
+            columns = tuple(place[label] for label in first.labels)
+            aligned[role] = replace(selection, columns=columns, labels=first.labels)
         elif len(selection.labels) == len(first.labels) and (
             selection.numbered or first.numbered
         ):
