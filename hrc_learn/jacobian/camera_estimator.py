@@ -233,15 +233,6 @@ class CameraEstimator(ImageJacobianEstimator):
         first = camera_jacobian(state.best, pose[..., None]).squeeze(-3)
         return first + evaluate(state.weight, self.network.basis(pose))
 
-    def restored(self, state: CameraState) -> CameraState:
-        """The state, reset where it is not finite."""
-        known = is_number(state.cameras).flatten(-2).all(-1)
-        known = known & is_number(state.weight).flatten(-2).all(-1)
-        known = known & is_number(state.pixel).flatten(-2).all(-1)
-        if may_branch(known) and bool(known.all()):
-            return state
-        return chosen(known, state, self.initial_state(*known.shape))
-
     def update(self, state: CameraState, measurement: Measurement) -> CameraState:
         """State after an image; unchanged without a visible marker."""
         seen = measurement.valid & is_number(measurement.feature).all(-1)

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import is_number, matmul
+from hrc_learn.geometry.numerics import is_number, matmul, may_branch
 from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import chosen, pytree
@@ -76,10 +78,14 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """State after one control step."""
 
     def restored(self, state: Any) -> Any:
-        """The state, reset where it is not finite."""
-        known = all_numbers(state.weight)
-        initial = self.network.weight.detach()
-        return replace(state, weight=torch.where(known, state.weight, initial))
+        """The state; the initial one where any number of it is not finite."""
+        batch = state.weight.shape[:-2]
+        numbers = [x for x in tree_leaves(state) if x.is_floating_point()]
+        finite = [is_number(x.reshape(*batch, -1)).all(-1) for x in numbers]
+        known = reduce(torch.logical_and, finite)
+        if may_branch(known) and bool(known.all()):
+            return state
+        return chosen(known, state, self.initial_state(*batch))
 
     def resumed(self, state: Any, pause: float) -> Any:
         """State after a pause without images.
@@ -109,11 +115,6 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """The network's weights, repeated for each element of a batch."""
         weight = self.network.weight.detach()
         return weight.expand(*batch, *weight.shape).clone()
-
-
-def all_numbers(matrix: Float[Tensor, "*batch rows columns"]) -> Bool[Tensor, "*batch 1 1"]:
-    """True where all entries are finite."""
-    return is_number(matrix).all(-1, keepdim=True).all(-2, keepdim=True)
 
 
 def evaluate(
@@ -271,14 +272,6 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         """
         entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
         return entries.flatten(-2).unsqueeze(-1)
-
-    def restored(self, state: Any) -> Any:
-        """The state with weights and key frame reset where they are not finite."""
-        state = super().restored(state)
-        key, pose = state.key, state.key.pose
-        numbers = torch.cat([pose.position, pose.orientation, key.feature, key.theta], dim=-1)
-        absent = KeyFrame.absent(self.network, *state.weight.shape[:-2])
-        return replace(state, key=chosen(is_number(numbers).all(-1), key, absent))
 
     def resumed(self, state: Any, pause: float) -> Any:
         """The same weights, and no key frame."""
@@ -521,12 +514,6 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             covariance=self.first_covariance.expand(*batch, *shape).clone(),
             key=KeyFrame.absent(self.network, *batch),
         )
-
-    def restored(self, state: KalmanState) -> KalmanState:
-        """The state reset where invalid, with the initial covariance for initial weights."""
-        known = all_numbers(state.weight) & all_numbers(state.covariance)
-        covariance = torch.where(known, state.covariance, self.first_covariance)
-        return replace(super().restored(state), covariance=covariance)
 
     def resumed(self, state: KalmanState, pause: float) -> KalmanState:
         """No key frame, and the drift of the pause."""
