@@ -10,7 +10,7 @@ from franky_servers import READY
 from lerobot.robots import make_robot_from_config
 
 from hrc_learn.hardware.protocol_server import ArmServer, serve_world
-from hrc_learn.lerobot.franka_panda import FrankaPanda, FrankaPandaConfig
+from hrc_learn.lerobot.driven_arms import FrankaPanda, FrankaPandaConfig
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim import SceneConfig, World
 

@@ -12,8 +12,8 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_robot import ArmRobot, connected_robots, the_robot
 from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
+from hrc_learn.lerobot.driven_arms import FrankaPandaConfig
 from hrc_learn.lerobot.episode_recording import observation_features
-from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 

@@ -13,7 +13,7 @@ from hrc_learn.hardware import CollisionConfig, DriverError, Load
 from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_values import GRIPPER, ArmValues
-from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
+from hrc_learn.lerobot.driven_arms import FrankaPandaConfig
 from hrc_learn.sim import SceneConfig, World
 
 FPS = 20.0

@@ -11,8 +11,8 @@ from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import person
 from hrc_learn.lerobot.arm_teleoperators import GuidedRobot
 from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
+from hrc_learn.lerobot.driven_arms import FrankaPandaConfig
 from hrc_learn.lerobot.episode_recording import add_frame, new_dataset
-from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
 from hrc_learn.lerobot.policy.policy_base import read_episodes
 from hrc_learn.protocols import HumanInput

@@ -9,8 +9,8 @@ from lerobot.teleoperators import TeleoperatorConfig
 
 from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.arm_teleoperators import ArmExpertConfig, ArmPageConfig
+from hrc_learn.lerobot.driven_arms import FrankaPandaConfig
 from hrc_learn.lerobot.envs import ArmEnvConfig
-from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 
 

@@ -22,7 +22,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.ros2_arm_robot import Ros2ArmRobotConfig, Ros2CameraConfig
+from hrc_learn.lerobot.driven_arms import Ros2ArmRobotConfig, Ros2CameraConfig
 from hrc_learn.sim import SceneConfig, World
 
 pytestmark = [pytest.mark.realtime, pytest.mark.simulation]
