@@ -266,7 +266,8 @@ def _decoded(decoder: Any, raw: str | bytes) -> Any:
         return decoder.decode(raw)
     # TypeError: text where viser's page sends bytes.
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, TypeError) as error:
-        raise MessageError(f"not a message of this page: {error}") from error
+        words = " ".join(str(error).split())  # they may quote line breaks of the client
+        raise MessageError(f"not a message of this page: {words}") from error
 
 
 session_message = partial(_decoded, msgspec.json.Decoder(Message))
