@@ -12,7 +12,6 @@ from hrc_learn.hardware.franka_settings import Load as Load
 from hrc_learn.hardware.franka_settings import RealtimeError as RealtimeError
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
 from hrc_learn.hardware.gripper import GripperError as GripperError
-from hrc_learn.hardware.gripper import GripperThread as GripperThread
 from hrc_learn.hardware.lerobot_arm import LeRobotArm as LeRobotArm
 from hrc_learn.hardware.lerobot_arm import LeRobotConfig as LeRobotConfig
 from hrc_learn.hardware.opencv_cameras import CameraError as CameraError

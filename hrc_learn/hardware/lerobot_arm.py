@@ -20,7 +20,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
-from hrc_learn.hardware.lerobot_device import JointUnits, forget_late_replies, open_device
+from hrc_learn.hardware.lerobot_device import (
+    JointUnits,
+    forget_late_replies,
+    in_words,
+    open_device,
+)
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
@@ -94,9 +99,9 @@ class LeRobotArm(Connected):
             )
             self._names, limits = chain.joint_names, chain.limits
             self._fastest = limits.velocity.numpy()
-            ends = self.units.reachable()
-            self._lower = np.maximum(limits.lower.numpy(), ends[0])
-            self._upper = np.minimum(limits.upper.numpy(), ends[1])
+            zero, span = self.units.zero, self.units.span  # of the calibrated range
+            self._lower = np.maximum(limits.lower.numpy(), zero - span)
+            self._upper = np.minimum(limits.upper.numpy(), zero + span)
             self._readings: deque[tuple[float, np.ndarray]] = deque(maxlen=_SLOPE)
             # One thread at a time on the bus, and in the numbers; both only in this order.
             self._bus, self._lock = threading.Lock(), threading.Lock()
@@ -180,7 +185,7 @@ class LeRobotArm(Connected):
                 if bus is not None and not fault:  # a servo cuts its torque with an alarm
                     bus.enable_torque()
             except Exception as error:
-                fault = f"the bus does not answer ({_text(error)}): check cable and power."
+                fault = f"the bus does not answer ({in_words(error)}): check cable and power."
             with self._lock:
                 self._fault = fault
                 if fault:
@@ -206,7 +211,7 @@ class LeRobotArm(Connected):
                 with self._bus:
                     self._turn()
             except Exception as error:  # a lost reply: the silence counts
-                self._failure = _text(error)
+                self._failure = in_words(error)
                 forget_late_replies(self._robot)
 
     def _turn(self) -> None:
@@ -297,7 +302,3 @@ def led_goal(
     """
     goal = np.clip(goal, here - lag, here + lag)
     return np.clip(goal, np.minimum(lower, here), np.maximum(upper, here))
-
-
-def _text(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

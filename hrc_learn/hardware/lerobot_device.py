@@ -42,12 +42,12 @@ def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -
     except ImportError as error:
         raise ModuleNotFoundError(
             f"{place} needs its maker's SDK: pip install 'lerobot[feetech]' (or [dynamixel]); "
-            f"{_first_line(error)}"
+            f"{in_words(error)}"
         ) from error
     except Exception as error:
         port = getattr(config, "port", None)
         raise ConnectionError(
-            f"{place} cannot be reached{f' at {port}' if port else ''} ({_first_line(error)}): "
+            f"{place} cannot be reached{f' at {port}' if port else ''} ({in_words(error)}): "
             "check cable, power and --robot.port (lerobot-find-port names it)."
         ) from error
     if not device.is_calibrated:
@@ -103,10 +103,11 @@ def _config(kind: str, settings: Mapping[str, Any]) -> Any:
     try:
         return draccus.decode(base, values)
     except Exception as error:  # draccus has several kinds for one mistake
-        raise ValueError(f"--{kind}.*: {_first_line(error)}") from error
+        raise ValueError(f"--{kind}.*: {in_words(error)}") from error
 
 
-def _first_line(error: BaseException) -> str:
+def in_words(error: BaseException) -> str:
+    """Message of an error in one line, at most 300 characters long."""
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
@@ -186,12 +187,6 @@ class JointUnits:
         raw = (joint_position - self.zero) / self.scale
         action = dict(zip(self.keys, map(float, raw), strict=True))
         return action | ({GRIPPER: 100 * share} if self.gripper else {})
-
-    def reachable(
-        self,
-    ) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, " joints"]]:
-        """Ends of the calibrated range [rad]."""
-        return self.zero - self.span, self.zero + self.span
 
     def alarms(self, device: Any) -> dict[str, int]:
         """Status of the servos by name, 0 without a fault; empty if they report none."""

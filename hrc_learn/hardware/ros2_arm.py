@@ -111,12 +111,10 @@ class Ros2Arm(Connected):
         self._commanded_at = -math.inf
         node, kind = self.session.node, config.interface
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
-        self._commands = node.create_publisher(form, config.command, quality(reliable=True))
-        self._hand = (
-            node.create_publisher(Float64MultiArray, config.gripper, quality(reliable=True))
-            if config.gripper
-            else None
-        )
+        self._hand, once = None, quality(reliable=True)
+        if config.gripper:
+            self._hand = node.create_publisher(Float64MultiArray, config.gripper, once)
+        self._commands = node.create_publisher(form, config.command, once)
         node.create_subscription(JointState, config.joint_states, self._on_state, quality())
         self._guard: subprocess.Popen | None = None
         self._dog = Watchdog(config.timeout, self.stop)

@@ -335,11 +335,8 @@ class ControllerNode:
         path.scale.x = 0.004
         path.points = [Point(x=p[0], y=p[1], z=p[2]) for p in self._path]
         for marker, colour in ((box, (0.2, 0.6, 1.0, 0.3)), (path, (1.0, 0.6, 0.1, 1.0))):
-            marker.header.frame_id, marker.header.stamp, marker.ns = (
-                self._config.base,
-                stamp,
-                "hrc_learn",
-            )
+            marker.header.frame_id, marker.header.stamp = self._config.base, stamp
+            marker.ns = "hrc_learn"
             marker.color.r, marker.color.g, marker.color.b, marker.color.a = colour
         return [box, path]
 

@@ -323,9 +323,8 @@ class HandGuidedArm:
         )
         command = velocity.numpy()
         self._arm.command(command)
-        pushed = bool(human_input.twist.any())
+        pushed = bool(human_input.twist.any() or effort.any())
         if effort.any():
-            pushed = True
             projected = null_projection(J, null_velocity)
             in_null_space = float(fraction_in_null_space(null_velocity, projected))
             self._feedback.note("task", in_null_space)
@@ -343,12 +342,10 @@ class HandGuidedArm:
         if self._posture is None:
             return None
         ahead = self._posture - q
-        if float(ahead.abs().max()) < _ARRIVED:
+        if (farthest := float(ahead.abs().max())) < _ARRIVED:
             self._posture = None
         # All joints slow down together, which keeps the line straight.
-        fastest = _APPROACH_RATE * float(ahead.abs().max())
-        scale = min(1.0, RETURN_SPEED / max(fastest, TINY))
-        return scale * _APPROACH_RATE * ahead
+        return min(_APPROACH_RATE, RETURN_SPEED / max(farthest, TINY)) * ahead
 
     def _attraction(
         self, human_input: HumanInput, position: Float[torch.Tensor, "3"]

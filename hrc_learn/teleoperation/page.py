@@ -339,7 +339,7 @@ class Page:
             state.joint_position,
             gizmos,
             panel.forces,
-            direction=panel.direction() if present else np.zeros(3),
+            direction=panel.keys.direction() if present else np.zeros(3),
             turn=held.turn,
         )
         editor = panel.editor

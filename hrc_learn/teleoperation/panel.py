@@ -87,6 +87,7 @@ class Panel:
 
     Attributes:
         gripper: Opening the person wants [m]; None until asked for.
+        keys: Keys that are held to move the end effector.
         editor: Region and target that people draw; None: they cannot.
     """
 
@@ -127,7 +128,7 @@ class Panel:
         gui.main_panel.dock_right()
         self._task = self._switch = self._keep = None
         self._next: Request = "start"
-        self._keys = KeyboardState()
+        self.keys = KeyboardState()
         self.gripper: float | None = None
         self._state, self._told = gui.add_html(""), gui.add_html("")
         if guides:
@@ -181,7 +182,7 @@ class Panel:
                 f"Move the end effector {_KEYS[key]}",
                 hotkey=key.upper(),  # type: ignore
             )
-            command.on_trigger(in_loop(lambda _, key=key: self._keys.press(key)))
+            command.on_trigger(in_loop(lambda _, key=key: self.keys.press(key)))
         self._gui.add_markdown(
             "Keys **I K J L U O** move the end effector away, back, left, right, up, down."
         )
@@ -228,10 +229,6 @@ class Panel:
             fits = isinstance(value, str) and len(value) <= LONGEST_TEXT
             return fits and (options is None or value in options)
         return isinstance(value, int | float) and handle.min <= value <= handle.max
-
-    def direction(self) -> Float[np.ndarray, "3"]:
-        """Direction of motion requested by keys: a unit vector, or zero."""
-        return self._keys.direction()
 
     def refresh(
         self,

@@ -4,7 +4,8 @@ import threading
 
 import pytest
 
-from hrc_learn.hardware import GripperError, GripperThread
+from hrc_learn.hardware import GripperError
+from hrc_learn.hardware.gripper import GripperThread
 
 PATIENCE = 20.0
 
