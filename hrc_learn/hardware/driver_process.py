@@ -7,6 +7,7 @@ timeout that the other is gone.
 
 from __future__ import annotations
 
+import importlib
 import math
 import multiprocessing
 import signal
@@ -42,6 +43,18 @@ class DriverError(RuntimeError):
 
 class ArmFaultError(RuntimeError):
     """The arm has stopped and takes no commands until `recover` is called."""
+
+
+def imported(name: str, advice: str) -> Any:
+    """Import the library of a driver when its device is opened.
+
+    Raises:
+        ImportError: It is not installed; the message gives the advice.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(f"{advice} ({error})") from error
 
 
 class Connected(ABC):
@@ -294,7 +307,6 @@ class StoppableArm(Arm, Gripper, Protocol):
 
     def stop(self) -> None:
         """Bring the arm to rest."""
-        ...
 
 
 @final

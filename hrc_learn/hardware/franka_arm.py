@@ -103,8 +103,8 @@ class FrankaArm(Connected):
             raise ValueError(
                 f"a Franka arm has {JOINTS} joints, but the chain {len(chain.joint_names)}."
             )
-        self._config, self._names = config or FrankaConfig(), chain.joint_names
-        config = self._config
+        self._config = config = config or FrankaConfig()
+        self._names = chain.joint_names
         self._shared, self._orders = Shared(), Orders()
         # Of the threads here that command: the loop is never held up by it.
         self._writing = threading.Lock()

@@ -14,7 +14,6 @@ after each that was lost, for there the box goes on with a constant acceleration
 from __future__ import annotations
 
 import gc
-import importlib
 import math
 import os
 import signal
@@ -29,6 +28,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.deploy import StepRunner
+from hrc_learn.hardware.driver_process import imported
 from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
 from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig, RealtimeError
 
@@ -80,14 +80,11 @@ def import_pylibfranka() -> Any:
     Raises:
         ImportError: It is not installed, or conflicts with another driver in this process.
     """
-    try:
-        return importlib.import_module("pylibfranka")
-    except ImportError as error:
-        raise ImportError(
-            "an arm at 1 kHz needs Franka's pylibfranka, in the version for the system of "
-            "its control box: pip install pylibfranka. One process cannot have both it and "
-            f"franky. {error}"
-        ) from error
+    return imported(
+        "pylibfranka",
+        "an arm at 1 kHz needs Franka's pylibfranka, in the version for the system of its "
+        "control box: pip install pylibfranka. One process cannot have both it and franky",
+    )
 
 
 def _take_priority(needed: bool) -> None:

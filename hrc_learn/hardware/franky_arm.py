@@ -7,7 +7,6 @@ RUN ON HARDWARE.
 from __future__ import annotations
 
 import atexit
-import importlib
 import os
 from contextlib import suppress
 from functools import partial
@@ -17,13 +16,22 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
+from hrc_learn.hardware.driver_process import (
+    ArmFaultError,
+    Connected,
+    checked_velocity,
+    imported,
+)
 from hrc_learn.hardware.franka_settings import FrankyConfig, RealtimeError
 from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
 
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 """Holds 1 under a kernel with PREEMPT_RT."""
+_MISSING = (
+    "a real Panda needs the driver package franky: pip install franky-control, in the build "
+    "for the server version of its control box, on a machine with a real-time kernel"
+)
 _JOINTS = tuple(f"joint {k}" for k in range(1, 8))
 _COMING_TO_REST = 2.0
 """Longest wait for the arm to rest [s]: from the fastest velocity with 0.15 of the driver's
@@ -62,7 +70,7 @@ class FrankyArm(Connected):
         self._ip, self.config = ip, config or FrankyConfig()
         if self.config.realtime:
             require_realtime()
-        self._franky = _import_franky()
+        self._franky = imported("franky", _MISSING)
         self._hold = self._franky.Duration(round(1e3 * self.config.timeout))
         self._fault, self._lost = "", False
         self._robot: Any = None
@@ -331,14 +339,3 @@ def _scheduling() -> tuple[int, os.sched_param]:
 def _names(errors: Any) -> list[str]:
     """Names of the errors that are set."""
     return [name for name in dir(errors) if not name.startswith("_") and getattr(errors, name)]
-
-
-def _import_franky() -> Any:
-    try:
-        return importlib.import_module("franky")
-    except ImportError as error:
-        raise ImportError(
-            "a real Panda needs the driver package franky: pip install franky-control, in the "
-            "build for the server version of its control box, on a machine with a real-time "
-            "kernel."
-        ) from error

@@ -16,14 +16,13 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from hrc_learn.hardware.driver_process import Connected
+from hrc_learn.hardware.driver_process import Connected, imported
 from hrc_learn.protocols import Arm, Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, centre
 
@@ -202,12 +201,8 @@ def taken_by(capture: Any, now: float, oldest: float) -> float:
 
 def _opened(source: str, name: str, timeout: float) -> Any:
     """A capture of OpenCV's that is open."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError(
-            f"{name} needs OpenCV: pip install opencv-python-headless, or hrc-learn[hardware]."
-        ) from error
+    advice = "pip install opencv-python-headless, or hrc-learn[hardware]"
+    cv2 = imported("cv2", f"{name} needs OpenCV: {advice}")
     if "://" in source:
         limits = {
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: timeout + _FIRST_IMAGE,
@@ -276,8 +271,7 @@ def turning_velocity(passed: float, duration: float) -> float:
     return _SPEED * gentle * math.sin(2 * math.pi * turns)
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasuredDelay:
+class MeasuredDelay(NamedTuple):
     """A measured camera delay."""
 
     delay: float

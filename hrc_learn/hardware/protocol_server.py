@@ -19,6 +19,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.hardware.driver_process import imported
 from hrc_learn.hardware.franka_settings import CYCLE
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.world import World
@@ -71,15 +72,12 @@ class ArmServer:
         """
         self.world = world
         self.cycles = self.missed = self._gap = 0
-        try:
-            from hrc_learn.hardware.served_robot import PunctualServer, ServedRobot
-        except ImportError as error:
-            raise ImportError(
-                "the protocol of the arm is spoken by the package franky-sim: pip install "
-                "'hrc-learn[hardware]'."
-            ) from error
-        self.robot = ServedRobot(world)
-        self.link: Any = PunctualServer(self.robot, loopback_addresses())
+        served = imported(
+            "hrc_learn.hardware.served_robot",
+            "franky-sim speaks the protocol of the arm: pip install 'hrc-learn[hardware]'",
+        )
+        self.robot = served.ServedRobot(world)
+        self.link = served.PunctualServer(self.robot, loopback_addresses())
         self.link.init()
         self.address: str = self.link.hostname
         self.link.process_commands()  # none yet, but a step needs a command before it

@@ -375,11 +375,9 @@ class Page:
 
     def _told(self) -> dict[str, Any]:
         """Status for the bar at the top of the page."""
-        words = ""
+        words = slow_words(*self.control.slow, self._config)
         if self._error is not None:
             words = "The page does not follow the arm any more: see the terminal."
-        else:
-            words = slow_words(*self.control.slow, self._config)
         feedback, status = self.human.feedback, self._status
         return {
             "words": words,

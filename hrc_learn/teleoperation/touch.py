@@ -315,11 +315,13 @@ class Touch(Human):
         above, hand = arm.explained(self._felt, unknown)
         self._look(above, hand, log_density(self._felt, unknown))
         self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
+        if self.place == "hand" and not meets:
+            self._pushed = self._time
         if self._nobody_touches():
             self._bias.follow(arm.jacobian, state.joint_velocity, state.external_torque, dt)
         return HumanInput(
             nullspace_input=self._nullspace_input(arm) if self.place == "elbow" else still,
-            pause=self._pauses(meets),
+            pause=self._time - self._pushed < config.released,
             stop=self._why,
         )
 
@@ -362,20 +364,13 @@ class Touch(Human):
             self.place = "hand"
         else:
             self.place = "nothing"
-        forces = {"nothing": np.zeros(3), "elbow": above.force, "hand": hand.force}
-        self.force = forces[self.place]
+        self.force = {"elbow": above.force, "hand": hand.force}.get(self.place, np.zeros(3))
 
     def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
         """Null-space torques [N m], faded in above the dead band."""
         beyond = float(np.linalg.norm(self.force)) / self._config.elbow_force - 1.0
         gain = self._config.gain * min(max(beyond, 0.0), 1.0)
         return gain * (arm.null @ (arm.null.T @ self._felt))
-
-    def _pauses(self, meets: bool) -> bool:
-        """True while the task is paused."""
-        if self.place == "hand" and not meets:
-            self._pushed = self._time
-        return self._time - self._pushed < self._config.released
 
     def _watch_for_collision(
         self,
