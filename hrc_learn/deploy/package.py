@@ -13,7 +13,6 @@ import platform
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +21,7 @@ from typing import Any, NamedTuple, Protocol, final, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from llvmlite import binding
 from torch import Tensor, nn
 from torch.utils import _pytree
 
@@ -311,21 +311,11 @@ def _layouts(metadata: Mapping[str, str]) -> StepLayouts:
 def machine() -> str:
     """Description of the machine that compiled code depends on: torch and processor."""
     capability = torch.backends.cpu.get_cpu_capability()
+    extensions = binding.get_host_cpu_features().flatten()
     return (
         f"torch {torch.__version__} on {platform.machine()} with {capability}, "
-        f"instructions {_instructions()}"
+        f"instructions {hashlib.sha256(extensions.encode()).hexdigest()[:8]}"
     )
-
-
-@cache
-def _instructions() -> str:
-    """Short hash of the instruction-set extensions of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return "unknown"
-    flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    return hashlib.sha256(flags.encode()).hexdigest()[:8]
 
 
 def _text(vector: Tensor) -> str:

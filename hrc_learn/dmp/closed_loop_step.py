@@ -69,6 +69,7 @@ def step(
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
     scale: Callable[[Tensor], Tensor],
+    gain: Float[Tensor, "*#batch 1 1"] | None,
     goal_filter: float | None,
     push: Float[Tensor, "*#batch D"] | None,
     pace: Float[Tensor, "*batch"],
@@ -81,6 +82,7 @@ def step(
         response: Response of the primitive.
         weights: Weights of the unscaled forcing term.
         scale: Scaling of states (*batch, K, D) that the forcing term causes.
+        gain: Factor on them.
         goal_filter: Rate in dg/ds = -rate (g - target); None: the goal jumps to its target.
         push: Constant second derivative by s added to the motion.
         pace: Speed of the clock, stored for the velocity.
@@ -92,12 +94,14 @@ def step(
     else:
         ds = ds if isinstance(ds, Tensor) else torch.full_like(s, ds)
         forced = response.forced.to(s.device)(s)
-    E, coast = _propagators(spring, ds, response.coasting(now))
+    E, coast = spring.propagator(ds), response.coasting(now)
     forced = forced.to(target) @ weights.mT
-    if coast is not None:
-        forced = coast.to(target) @ forced
+    if isinstance(coast, Tensor) or coast > 0:  # past the end, the spring alone moves it
+        forced = spring.propagator(coast).to(target) @ forced
     # Motion caused by the forcing at both ends of the step; the difference to it decays.
     before, after = scale(state.forced), scale(forced)
+    if gain is not None:
+        before, after = gain * before, gain * after
     if response.approach:
         # Along the curve of an approach, start and goal act unscaled, next to the weights.
         fraction, displacement = response.approach, state.displacement[..., None, :]
@@ -209,16 +213,6 @@ def numpy_approach(
     """`approach_state` of one motion, times its displacement."""
     m, slope = minimum_jerk(s / fraction)
     return np.multiply.outer([m - 1.0, slope / fraction], displacement)
-
-
-def _propagators(
-    spring: SpringDamper, ds: Tensor | float, coast: Tensor | float
-) -> tuple[Tensor, Tensor | None]:
-    """Transition matrices of the step and since the end of the forcing; None: not ended yet."""
-    if isinstance(ds, Tensor) and isinstance(coast, Tensor):
-        over_step, since_end = spring.propagator(torch.stack([ds, coast]))  # both at once
-        return over_step, since_end
-    return spring.propagator(ds), spring.propagator(coast) if coast else None
 
 
 def _filtered(

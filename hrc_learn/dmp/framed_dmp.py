@@ -21,8 +21,6 @@ from hrc_learn.dmp._arguments import Mask, Points, Times
 from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive
-from hrc_learn.dmp.samples import check_samples
-from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
 from hrc_learn.geometry import Pose, quaternion
 
 PERSISTENCE = 0.3
@@ -204,9 +202,6 @@ def _smooth_deviations(
     values, vectors = torch.linalg.eigh(kernel)
     modes = vectors[:, -MODES:] * values[-MODES:].clamp(min=0).sqrt()
     motions = (size[:, :, None] * modes).mT.reshape(-1, len(s), 1)
-    samples = check_samples(s, motions)
-    weights, rate = fit_samples("trajectory", dmps.response, samples, REGULARIZATION)
-    ends = torch.stack([rate, samples.first, samples.last], dim=-1)
-    x = torch.cat([weights, ends], dim=-1).view(F, MODES, -1)
+    x = dmps.refit(s, motions).coordinates().detach().view(F, MODES, -1)
     eye = torch.eye(D).to(x)
     return torch.einsum("frm,de->fdmre", x, eye).flatten(-2)

@@ -197,6 +197,19 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             dmp.fit_report = recorded.compare(dmp.rollout().position, noise)
         return dmp
 
+    def refit(
+        self, time: Times, position: Points, scaling: str | Scaling = "none"
+    ) -> "JointDMP":
+        """Primitives of other motions, with the basis, spring and approach of this one."""
+        return JointDMP.fit(
+            time,
+            position,
+            scaling=scaling,
+            basis=self.basis,
+            spring=self.spring,
+            approach=self.response.approach,
+        )
+
     def admissible_duration(
         self,
         velocity: Vectors | Scalars | None = None,

@@ -7,6 +7,7 @@ values (see `motion_primitive.py`). Everything here is about columns.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
+from functools import partial
 from types import NoneType
 from typing import Any, NamedTuple
 
@@ -417,13 +418,17 @@ class LinearPrimitive(nn.Module):
                     f"{tuple(push.shape)}"
                 )
             push = push * state.duration[..., None] ** 2
+        gain = None
+        if forcing_gain is not None:
+            gain = finite("forcing_gain", self._as_tensor(forcing_gain))[..., None, None]
         attractor = state.target if goal_filter is None else state.goal
         return closed_loop_step.step(
             state,
             self._normalised_step(dt, duration),
             response=self.response,
             weights=self.weights,
-            scale=self._scaling_between(state.start, attractor, forcing_gain),
+            scale=partial(self._scaled, start=state.start, goal=attractor),
+            gain=gain,
             goal_filter=goal_filter,
             push=push,
             pace=pace,
@@ -539,20 +544,6 @@ class LinearPrimitive(nn.Module):
             )
         except ValueError as error:
             raise saved.invalid(error) from None
-
-    def _scaling_between(
-        self, start: Tensor, goal: Tensor, forcing_gain: Scalars | None
-    ) -> Callable[[Tensor], Tensor]:
-        """Scaling, for this start and goal, of states (*batch, K, D) caused by the forcing."""
-        gain = None
-        if forcing_gain is not None:
-            gain = finite("forcing_gain", self._as_tensor(forcing_gain))[..., None, None]
-
-        def scale(values: Tensor) -> Tensor:
-            values = self._scaled(values, start, goal)
-            return values if gain is None else values * gain
-
-        return scale
 
     def _scaled(self, values: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         if self.scaling == "none":

@@ -27,10 +27,8 @@ from hrc_learn.dmp._arguments import (
     to_tensor,
 )
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
-from hrc_learn.dmp.samples import FitReport, check_samples
-from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
+from hrc_learn.dmp.samples import FitReport
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.dmp.via_points import ViaPoints, through_via_points
 from hrc_learn.geometry import Pose
@@ -394,7 +392,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         Raises:
             ValueError: A rhythm, which has no end to start from.
         """
-        motion = self.motion
+        motion: Any = self.motion
         if motion.basis.periodic:
             raise ValueError("a rhythm cannot be reversed: it has no end to start from")
         s = torch.linspace(0, 1, REFIT_SAMPLES * motion.basis.count + 1, dtype=torch.float64)
@@ -402,16 +400,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         with torch.no_grad():
             time = s * motion.duration[..., None]
             shown = motion.rollout_columns(Boundary(), motion.duration, time)
-            samples = check_samples(s, shown.position.double().flip(-2))
-            weights, rate = fit_samples("trajectory", motion.response, samples, REGULARIZATION)
-            first, last = samples.first, samples.last
-            amplitude = motion.amplitude.reshape(first.shape).double()
-            backwards = Demonstrated(first, last, amplitude)
-            weights = motion.forcing_scale.unscale(weights.mT, backwards).mT
-            x = torch.cat([weights, torch.stack([rate, first, last], dim=-1)], dim=-1)
-        x = x.view(*motion.weights.shape[:-1], -1)
-        timestamps = 1 - motion.timestamps.flip(-1)
-        return self.with_motion(motion.with_coordinates(x, timestamps=timestamps))
+        back = motion.refit(s, shown.position.flip(-2), motion.forcing_scale)
+        x, timestamps = back.coordinates().detach(), 1 - motion.timestamps.flip(-1)
+        backwards = motion.with_coordinates(x, amplitude=back.amplitude, timestamps=timestamps)
+        return self.with_motion(backwards)
 
     def save(self, folder: str | FilePath) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""

@@ -86,7 +86,7 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
         return primitives
     own: Any = primitives.reference
     middle = intrinsic_mean(own.reshape(-1, 4))
-    motion = primitives.motion
+    motion: Any = primitives.motion
     if (to_error(own, middle).abs() < SAME_ORIENTATION).all():
         return primitives
     if motion.basis.periodic:
@@ -94,15 +94,9 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
     with torch.no_grad():
         shown: Any = primitives.rollout()
         errors = motion.rollout_columns(Boundary(), motion.duration).position[..., columns]
-    fitted = JointDMP.fit(
-        shown.time,
-        nearest_turn(to_error(shown.orientation, middle), errors),
-        basis=motion.basis,
-        spring=motion.spring,
-        approach=motion.response.approach,
-    )
+    errors = nearest_turn(to_error(shown.orientation, middle), errors)
     x = motion.coordinates().detach().clone()
-    x[..., columns, :] = fitted.coordinates().detach()
+    x[..., columns, :] = motion.refit(shown.time, errors).coordinates().detach()
     motion = motion.with_coordinates(x, motion.duration)
     return primitives.with_motion(motion, middle.expand_as(own))
 

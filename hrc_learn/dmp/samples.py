@@ -281,12 +281,9 @@ def demo_label(index: int, batch: Sequence[int]) -> str:
 
 def _floating(values: Points) -> Tensor:
     tensor = to_tensor(values)
-    if tensor.is_floating_point():
-        check_precision(tensor.dtype)
-    # Truth values are no positions.
-    return to_tensor(
-        tensor, tensor.dtype if tensor.is_floating_point() else torch.get_default_dtype()
-    )
+    dtype = tensor.dtype if tensor.is_floating_point() else torch.get_default_dtype()
+    check_precision(dtype)
+    return to_tensor(tensor, dtype)  # which refuses truth values: they are no positions
 
 
 def _expand(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:

@@ -235,11 +235,7 @@ class MotionTokenizer(nn.Module):
         q = integers[..., self._own :]
         z = (q + self.config["shift"] * q.sign()) * self.config["step"]
         z = z / self.components.spread[: q.shape[-1]]
-        state: list[Tensor | None] = [None, None]
-        for i, given in enumerate((start, start_velocity)):
-            if given is not None:
-                name = ("start", "start_velocity")[i]
-                state[i] = checked_vector(name, given, self._start())[..., self._smooth]
+        state = self._given("start", start), self._given("start_velocity", start_velocity)
         y = self.components(z, time, *state, order=order)
         if not self.steps:
             return y
@@ -294,12 +290,17 @@ class MotionTokenizer(nn.Module):
             raise ValueError(
                 f"motion must have {self.columns} columns, got {samples.position.shape[1]}"
             )
-        velocity = None
-        if start_velocity is not None:
-            velocity = checked_vector("start_velocity", start_velocity, self._start())
-            velocity = velocity.expand(*samples.batch, -1)[..., self._smooth]
+        velocity = self._given("start_velocity", start_velocity)
+        if velocity is not None:
+            velocity = velocity.expand(*samples.batch, -1)
         parts = replace(samples, position=samples.position[:, self._smooth])
         return self.components.encode(parts, velocity).reshape(*samples.batch, -1)
+
+    def _given(self, name: str, value: Vectors | None) -> Tensor | None:
+        """Columns of a given start or velocity that are no steps."""
+        if value is None:
+            return None
+        return checked_vector(name, value, self._start())[..., self._smooth]
 
     def _start(self) -> Float[Tensor, "D"]:
         """Mean start, the first value for steps."""
