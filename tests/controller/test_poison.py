@@ -21,7 +21,7 @@ from hrc_learn.controller import (
     SafetyFilter,
 )
 from hrc_learn.deploy import EagerRunner
-from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     CompositeEstimator,
     KalmanEstimator,
@@ -50,10 +50,6 @@ class Scene:
         self.target, _ = target_in(self.camera, rng=rng)
         J = self.camera.image_jacobian(Pose(CENTRE, DOWN))
         goals = Goals.at(CENTRE, DOWN, self.target).approached_by(POSTURE)
-        position = replace(
-            goals.position, rotation=quaternion.normalize(torch.ones(4).double())
-        )
-        goals = replace(goals, position=position)
         self.goals = _pytree.tree_map(lambda x: x.expand(batch, *x.shape).clone(), goals)
         self.controller = AdaptiveController(panda, estimator(network(J)), goals)
         self.start = (POSTURE + 0.1).expand(batch, 7).clone()
