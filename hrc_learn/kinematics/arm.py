@@ -23,7 +23,7 @@ from hrc_learn.geometry import MeshFile, Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor
 from hrc_learn.kinematics.capsule_fit import fit_body
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule, link_capsules
 from hrc_learn.kinematics.description import Shape
 from hrc_learn.kinematics.inverse import (
     TaskSpace,
@@ -458,13 +458,8 @@ def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:
         link: Number of that frame.
         size: Size relative to the Franka hand.
     """
-
-    def scaled(point: tuple[float, float, float]) -> tuple[float, float, float]:
-        x, y, z = point
-        return size * x, size * y, size * z
-
-    return tuple(
-        LinkCapsule(link=link, start=scaled(start), end=scaled(end), radius=size * radius)
+    return link_capsules(
+        (link, *np.multiply(size, (start, end)).tolist(), size * radius)
         for start, end, radius in _HAND
     )
 

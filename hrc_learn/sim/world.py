@@ -212,8 +212,7 @@ class World:
         Raises:
             KeyError: If there is no object of that name.
         """
-        self._object(name)
-        _put(self.model, self.data, name, self.arm.tcp_pose() @ _IN_HAND)
+        self.carry(name, self.arm.tcp_pose() @ _IN_HAND)
 
     def carry(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
         """Place an object at rest, as a person does by hand.
