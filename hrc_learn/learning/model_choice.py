@@ -123,11 +123,9 @@ def best_models(folder: Path) -> dict[str, str]:
 
 def _choice(folder: Path) -> _Choice:
     path = folder / CHOICE
-    return (
-        read_json(path, _Choice, "fit again")
-        if path.is_file()
-        else _Choice(models={}, context=())
-    )
+    if not path.is_file():
+        return _Choice(models={}, context=())
+    return read_json(path, _Choice, "fit again")
 
 
 def predict(

@@ -22,7 +22,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from hrc_learn.demos.read.dataset_folder import read_info
-from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     CameraCorrection,
     CameraMotion,
@@ -104,7 +104,7 @@ class CameraWatchStep(ProcessorStep):
         vector = state[self.pose_columns]
         if marker[2] < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
             return None
-        pose = Pose(vector[:3], quaternion.exp(vector[3:]))
+        pose = Pose.from_vector(vector)
         seen = self._watch.update(self._calls / self.fps, pose, marker[:2])
         if seen is not None:
             if self.correct:
@@ -159,20 +159,24 @@ def add_camera_watch(
     path = checkpoint / PREPROCESSOR
     content = read_pipeline(path, without=(CAMERA_WATCH,))
     info = read_info(dataset)
-    names = [name.removesuffix(".pos") for name in info["features"][OBS_STATE]["names"]]
-    index = {name: i for i, name in enumerate(names)}
-    pose_names, marker_names, object_names = (
-        [name.removesuffix(".pos") for name in wanted] for wanted in (HAND, MARKER, PIXELS)
-    )
-    if missing := [name for name in pose_names + marker_names if name not in index]:
+    names = info["features"][OBS_STATE]["names"]
+    index = {f"{name.removesuffix('.pos')}.pos": i for i, name in enumerate(names)}
+    if missing := [name for name in (*HAND, *MARKER) if name not in index]:
         raise ValueError(
             f"{dataset}: {OBS_STATE} has no {', '.join(missing)}: record the tool's pose and "
             "its marker's pixel (robot.hand=true, robot.marker=true)."
         )
-    pose_columns, marker_columns = ([index[n] for n in x] for x in (pose_names, marker_names))
-    object_columns = [index[name] for name in object_names if name in index] or None
+    pose_columns, marker_columns = ([index[n] for n in x] for x in (HAND, MARKER))
+    object_columns = [index[name] for name in PIXELS if name in index] or None
     states = [episode[OBS_STATE].double() for episode in read_episodes(dataset, [OBS_STATE])]
-    watched = [_watched(x[:, pose_columns], x[:, marker_columns]) for x in states]
+    watched = [
+        ImageDemonstration(
+            pose=Pose.from_vector(x[:, pose_columns]),
+            feature=x[:, marker_columns[:2]],
+            visible=x[:, marker_columns[2]] > 0.5,
+        )
+        for x in states
+    ]
     fps = float(info["fps"])
     reference = CameraReference.fit(watched, fps, image_size)
     height = 0.0
@@ -192,13 +196,3 @@ def add_camera_watch(
     content["steps"].insert(0, {"registry_name": CAMERA_WATCH, "config": step.get_config()})
     write_json(path, content)
     return reference
-
-
-def _watched(
-    pose: Float[Tensor, "frames 6"], marker: Float[Tensor, "frames 3"]
-) -> ImageDemonstration:
-    return ImageDemonstration(
-        pose=Pose(pose[:, :3], quaternion.exp(pose[:, 3:])),
-        feature=marker[:, :2],
-        visible=marker[:, 2] > 0.5,
-    )
