@@ -72,14 +72,11 @@ class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        return {"config": self.robot_config(), "max_episode_steps": self._length()}
-
-    def _length(self) -> int:
-        if self.episode_length is not None:
-            return self.episode_length
-        robot = self.robot_config()
-        duration = make_scenario(robot.scenario, robot.shelf, robot.work_arm()).duration
-        return round(_MORE_TIME * duration * self.fps)
+        robot, length = self.robot_config(), self.episode_length
+        if length is None:
+            scenario = make_scenario(robot.scenario, robot.shelf, robot.work_arm())
+            length = round(_MORE_TIME * scenario.duration * self.fps)
+        return {"config": robot, "max_episode_steps": length}
 
 
 _PICTURE = (240, 180)
