@@ -40,12 +40,25 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.model_files import SavedModel
 
 
-class OrientationTrajectory(ArrayOutputs):
+class ErrorColumns:
+    """Error of an orientation among the columns of a motion, over time or in one state."""
+
+    error_columns: ClassVar[slice] = slice(0, 3)
+    motion: Any
+
+    @property
+    def _error(self) -> Tensor:
+        return self.motion.position[..., self.error_columns]
+
+    @property
+    def _rate(self) -> Tensor:
+        return self.motion.velocity[..., self.error_columns]
+
+
+class OrientationTrajectory(ErrorColumns, ArrayOutputs):
     """Orientation over time; each output is computed on first access."""
 
     outputs = ("time", "orientation", "angular_velocity", "angular_acceleration")
-
-    error_columns: ClassVar[slice] = slice(0, 3)
 
     def __init__(self, motion: Trajectory, reference: Float[Tensor, "*batch 4"]):
         """Describe the motion of columns with an error to the reference."""
@@ -74,20 +87,11 @@ class OrientationTrajectory(ArrayOutputs):
         second = self.motion.acceleration[..., self.error_columns]
         return orientation_error.angular_acceleration(self._error, self._rate, second)
 
-    @property
-    def _error(self) -> Tensor:
-        return self.motion.position[..., self.error_columns]
-
-    @property
-    def _rate(self) -> Tensor:
-        return self.motion.velocity[..., self.error_columns]
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class OrientationState:
+class OrientationState(ErrorColumns):
     """State of an orientation primitive in closed loop."""
 
-    error_columns: ClassVar[slice] = slice(0, 3)
     motion: DMPState
     """State of the columns, the error to the reference among them."""
     reference: Float[Tensor, "*batch 4"]
@@ -96,15 +100,12 @@ class OrientationState:
     @property
     def orientation(self) -> Float[Tensor, "*batch 4"]:
         """Unit quaternion (w, x, y, z)."""
-        return to_orientation(self.motion.position[..., self.error_columns], self.reference)
+        return to_orientation(self._error, self.reference)
 
     @property
     def angular_velocity(self) -> Float[Tensor, "*batch 3"]:
         """Angular velocity in the base frame [rad/s]."""
-        columns = self.error_columns
-        return orientation_error.angular_velocity(
-            self.motion.position[..., columns], self.motion.velocity[..., columns]
-        )
+        return orientation_error.angular_velocity(self._error, self._rate)
 
 
 torch.export.register_dataclass(

@@ -217,12 +217,10 @@ def check_samples(
     """
     position = _floating(position)
     time = to_tensor(time, torch.float64, position.device)
-    if position.ndim == 0 or time.ndim == 0:
-        raise ValueError("time and position need a sample axis, got a single number")
     if position.shape == time.shape:
         position = position[..., None]
         velocity = None if velocity is None else to_tensor(velocity)[..., None]
-    if position.ndim < 2:
+    if position.ndim < 2 or time.ndim == 0:
         raise ValueError(
             f"time has shape {tuple(time.shape)}, position {tuple(position.shape)}: expected "
             "(T,) and (T, D)"
@@ -359,10 +357,7 @@ def smoothed(samples: Samples) -> tuple[Samples, Float[Tensor, "B D"]]:
     position = samples.position.double()
     smooth, noise = position.clone(), torch.zeros_like(position[..., 0])
     if samples.shared_grid:
-        flat = position.flatten(0, 1)
-        smooth, noise = (
-            x.view(*position.shape[:2], *x.shape[1:]) for x in _smooth(samples.s[0], flat)
-        )
+        smooth, noise = _smooth(samples.s[0], position)
     else:
         for i, valid in enumerate(samples.mask):
             smooth[i, :, valid], noise[i] = _smooth(samples.s[i, valid], position[i, :, valid])
@@ -371,7 +366,7 @@ def smoothed(samples: Samples) -> tuple[Samples, Float[Tensor, "B D"]]:
     return replace(samples, position=smooth.to(samples.position)), noise
 
 
-def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "C T"]) -> tuple[Tensor, Tensor]:
+def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]) -> tuple[Tensor, Tensor]:
     return _spline(s.cpu().numpy().tobytes(), s.device).smooth(y)
 
 
@@ -437,7 +432,7 @@ class _Spline:
     strengths: Float[Tensor, "L"]
     """Penalties to choose from."""
 
-    def smooth(self, y: Float[Tensor, "C T"]) -> tuple[Float[Tensor, "C T"], Tensor]:
+    def smooth(self, y: Float[Tensor, "*batch T"]) -> tuple[Float[Tensor, "*batch T"], Tensor]:
         """Most likely motion and the standard deviation of the noise, for each column."""
         T = y.shape[-1]
         middle = y.mean(-1, keepdim=True)
@@ -449,7 +444,7 @@ class _Spline:
         free = r < 1e-9
         n = T - int(free.sum())
         # Penalty plus squared distance to the samples, at their minimum.
-        misfit = y.square().sum(-1)[:, None] - c.square() @ (1 / total).mT
+        misfit = y.square().sum(-1, keepdim=True) - c.square() @ (1 / total).mT
         misfit = misfit.clamp(min=torch.finfo(y.dtype).tiny)
         prior = torch.where(free, 1.0, self.strengths[:, None] * r)
         known = torch.where(free, 1.0, total)
@@ -458,7 +453,7 @@ class _Spline:
         likely = score <= score.amin(-1, keepdim=True) + LIKELIHOOD_MARGIN
         best = (likely * torch.arange(1, STRENGTHS + 1, device=y.device)).argmax(-1)
         fitted = (c / total[best]) @ self.U.mT
-        noise = (misfit.gather(-1, best[:, None])[:, 0] / n).sqrt()
+        noise = (misfit.gather(-1, best[..., None])[..., 0] / n).sqrt()
         return fitted + middle, noise
 
 

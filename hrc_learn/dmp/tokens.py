@@ -46,7 +46,6 @@ STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
 are left out), and largest number of times at which it can switch."""
 OF_SCALE = 0.07
 """Tolerance times FAST's scale at equal error, on five teleoperated datasets."""
-KIND = "MotionTokenizer"
 
 
 class MotionTokenizer(nn.Module):
@@ -261,7 +260,7 @@ class MotionTokenizer(nn.Module):
         config = {"vocabulary_size": self.vocabulary_size, "tokens": self.config}
         config |= {"components": self.components.config}
         tensors = dict(self.state_dict()) | {"code": torch.from_numpy(self._code.table)}
-        write_model(folder, KIND, config, tensors)
+        write_model(folder, type(self).__name__, config, tensors)
 
     @classmethod
     def load(cls, folder: str | Path) -> "MotionTokenizer":
@@ -271,7 +270,7 @@ class MotionTokenizer(nn.Module):
             FileNotFoundError: There is none.
             ValueError: A file is not valid.
         """
-        saved = SavedModel(folder, KIND)
+        saved = SavedModel(folder, cls.__name__)
         parts = {name: saved.tensor(name) for name in saved.tensors}
         buffers = {k.partition(".")[2]: v for k, v in parts.items() if k.startswith("compo")}
         try:

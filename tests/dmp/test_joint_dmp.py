@@ -300,7 +300,7 @@ def broken(values, index, value):
         (TIME, POSITION, {"scaling": "cubic"}, "unknown scaling 'cubic'"),
         (TIME, POSITION, {"method": "magic"}, "unknown method 'magic'"),
         (TIME, torch.zeros(20, 0), {}, "nothing to fit"),
-        (TIME, torch.tensor(1.0), {}, "sample axis"),
+        (TIME, torch.tensor(1.0), {}, r"expected \(T,\) and \(T, D\)"),
         (
             TIME,
             broken(POSITION, (-1, 1), POSITION[0, 1]),
