@@ -3,7 +3,6 @@
 import functools
 import gc
 import json
-import logging
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from hrc_learn.lerobot.smoothing import (
     add_smoothing,
     remove_smoothing,
 )
-from hrc_learn.lerobot.smoothing.processor import POSTPROCESSOR, WatchStateStep
+from hrc_learn.lerobot.smoothing.processor import POSTPROCESSOR, Changes, WatchStateStep
 
 SETTINGS = {
     "fps": 50.0,
@@ -120,8 +119,10 @@ def test_single_actions_start_where_the_robot_is_and_keep_the_limits(checkpoint)
         assert np.abs(np.diff(path, n=order)).max() * 50**order <= limit + 0.05
     assert a[60] == pytest.approx(0.5, abs=5e-3)
     assert a[-1] == pytest.approx(0.8, abs=5e-3)
-    assert smooth.counts["actions"] == 120
-    assert smooth.largest[0] == pytest.approx(0.3, abs=0.02)
+    changes = smooth.changes
+    assert changes.steps == 120
+    assert changes.largest[0] == pytest.approx(0.3, abs=0.02)
+    assert "120 actions changed" in str(changes)
 
 
 def test_a_robot_that_was_put_somewhere_begins_an_episode(checkpoint):
@@ -231,9 +232,9 @@ def test_a_reset_begins_where_the_robot_then_is():
     smooth = SmoothActionsStep(**SETTINGS)
     send = functools.partial(sent_by, watch, smooth)
     send(0.0, torch.tensor([[0.9, 0.0]], dtype=torch.float64))
-    assert smooth.counts["actions"] == 1
+    assert smooth.changes.steps == 1
     smooth.reset()
-    assert smooth.counts["actions"] == 0
+    assert smooth.changes.steps == 0
     here = torch.tensor([[0.05, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(send(0.05, here), here)
 
@@ -274,17 +275,18 @@ def test_settings_that_do_not_fit_are_refused():
         sent_by(watch, smooth, 0.0, action)
 
 
-def test_changes_add_up_until_the_reset(caplog):
-    smooth = SmoothActionsStep(**SETTINGS)
-    for a in (0.0, 0.5, 0.5):
-        smooth({TransitionKey.ACTION: torch.tensor([[a, 0.0]])})
-    assert smooth.counts["actions"] == 3
-    assert smooth.counts["changed"] == 2
-    with caplog.at_level(logging.INFO):
-        smooth.reset()
-    assert "2 of 3 actions changed, by at most 0.4997 (a.pos)" in caplog.text
-    assert not smooth.counts["actions"]
-    assert not smooth.largest.any()
+def test_changes_add_up():
+    changes = Changes(["a", "b"])
+    change = np.array([[[0.0, 2e-6], [-0.3, 0.0], [1e-7, 0.0]]])
+    changes.add(change)
+    assert (changes.steps, changes.changed) == (3, 2)
+    np.testing.assert_allclose(changes.largest, [0.3, 2e-6])
+    changes.add(change[..., ::-1] / 3)
+    assert (changes.steps, changes.changed) == (6, 3)
+    np.testing.assert_allclose(changes.largest, [0.3, 0.1])
+    assert "3 of 6 actions changed, by at most 0.3 (a)" in str(changes)
+    changes.clear()
+    assert (changes.steps, changes.changed, changes.largest.any()) == (0, 0, False)
 
 
 @pytest.mark.parametrize("whole", [False, True])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -37,6 +36,39 @@ _SAME = 1e-6
 """Changes below this are rounding."""
 
 _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
+
+
+class Changes:
+    """Counts and the largest changes, over many actions.
+
+    Attributes:
+        steps: Actions handed out.
+        changed: Number of actions that were changed.
+        largest: Largest change of each value, in its unit.
+    """
+
+    def __init__(self, names: list[str]):
+        self.names = tuple(names)
+        self.clear()
+
+    def clear(self) -> None:
+        """Start over."""
+        self.steps = self.changed = 0
+        self.largest = np.zeros(len(self.names))
+
+    def add(self, change: Float[np.ndarray, "*batch D"]) -> None:
+        """Count the differences between returned and requested actions."""
+        change = np.abs(change).reshape(-1, len(self.names))
+        self.steps += len(change)
+        self.changed += int((change > _SAME).any(-1).sum())
+        self.largest = np.maximum(self.largest, change.max(0))
+
+    def __str__(self) -> str:
+        most = int(self.largest.argmax())
+        return (
+            f"{self.changed} of {self.steps} actions changed, by at most "
+            f"{self.largest[most]:.4g} ({self.names[most]})"
+        )
 
 
 @dataclass
@@ -77,6 +109,9 @@ class WatchStateStep(ProcessorStep):
     def reset(self) -> None:
         self.state = None
 
+    def get_config(self) -> dict[str, Any]:
+        return {}
+
     def transform_features(self, features: _Features) -> _Features:
         return features
 
@@ -93,8 +128,7 @@ class SmoothActionsStep(ProcessorStep):
     Attributes:
         limits: Limits of the actions.
         watch: Step that reports the robot's state, built before; None: there is none.
-        counts: Numbers of `actions` handed out and `changed` since the last reset.
-        largest: Largest change of each value since the last reset, in its unit.
+        changes: Report of changes since the last reset.
     """
 
     def __init__(self, **limits: Any):
@@ -108,11 +142,10 @@ class SmoothActionsStep(ProcessorStep):
         self._filter = self.limits.motion_filter(1.0 / self.limits.fps)
         self._columns = np.array(self.limits.state_columns)
         self.watch = WatchStateStep.take_newest()
-        self.counts: Counter[str] = Counter()
-        self.largest = np.zeros(len(self.limits.names))
+        self.changes = Changes(self.limits.names)
         self._state: MotionState | None = None
         self._chunk: np.ndarray | None = None
-        weakref.finalize(self, _log, self.counts, self.largest, self.limits.names)
+        weakref.finalize(self, _log, self.changes)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         action = transition.get(TransitionKey.ACTION)
@@ -132,9 +165,7 @@ class SmoothActionsStep(ProcessorStep):
             state = self._filter.step(state, asked[..., k, :])
             made.append(state.position)
         self._state, chunk = state, np.stack(made, axis=-2)
-        change = np.abs(np.nan_to_num(chunk - asked)).reshape(-1, len(self.largest))
-        self.counts.update(actions=len(change), changed=int((change > _SAME).any(-1).sum()))
-        np.maximum(self.largest, change.max(0), out=self.largest)
+        self.changes.add(np.nan_to_num(chunk - asked))
         # An acceleration takes three actions; with fewer the next chunk goes on from the state.
         self._chunk = chunk if whole and len(made) > 2 else None
         smooth = torch.from_numpy(chunk).to(action)
@@ -142,9 +173,8 @@ class SmoothActionsStep(ProcessorStep):
 
     def reset(self) -> None:
         """Forget the motion: the next one begins where the robot then is."""
-        _log(self.counts, self.largest, self.limits.names)
-        self.counts.clear()
-        self.largest[:] = 0.0
+        _log(self.changes)
+        self.changes.clear()
         self._state = self._chunk = None
 
     def get_config(self) -> dict[str, Any]:
@@ -226,14 +256,9 @@ def _restarted(
     return MotionState(**{k: np.where(restarted, rest[k], x) for k, x in vars(state).items()})
 
 
-def _log(
-    counts: Counter[str], largest: Float[np.ndarray, " values"], names: Sequence[str]
-) -> None:
-    """Report how many actions were changed, and the value that was changed most."""
-    if counts["actions"]:
-        text = "smooth actions: %d of %d actions changed, by at most %.4g (%s)"
-        most = int(largest.argmax())
-        logging.info(text, counts["changed"], counts["actions"], largest[most], names[most])
+def _log(changes: Changes) -> None:
+    if changes.steps:
+        logging.info("smooth actions: %s", changes)
 
 
 ProcessorStepRegistry.register(WATCH)(WatchStateStep)
