@@ -147,7 +147,9 @@ def test_without_answers_the_arm_goes_on_with_its_acceleration():
         server = served.server
         # States that are lost count: the driver's clock does not fall behind.
         assert np.ptp(times) == pytest.approx(124 * DT, abs=5 * CYCLE)
-        assert link.lost <= server.missed == sum(not cycle.answered for cycle in cycles)
+        assert link.lost <= server.missed
+        # The log notes a cycle as the next one begins.
+        assert server.missed - sum(not cycle.answered for cycle in cycles) in (0, 1)
         # Of a state or of the answer to it.
         assert link.lost / len(cycles) == pytest.approx(1 - 0.9**2, rel=0.15)
     velocities = np.array([cycle.velocity for cycle in cycles])
