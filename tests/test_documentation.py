@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from hrc_learn.viz.evidence import clauses
+
 ROOT = Path(__file__).parents[1]
 SPEC = importlib.util.spec_from_file_location("build_docs", ROOT / "tools" / "build_docs.py")
 assert SPEC is not None
@@ -16,6 +18,12 @@ builder = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in ("zensical", "mkdocstrings")),
     reason="the extra `docs` is not installed: `make docs` installs it",
 )
+
+
+def test_tests_that_the_evidence_page_names_exist():
+    for clause in clauses():
+        assert (ROOT / clause.test).is_file(), clause.test
+
 
 CHECKOUT = {
     "CHANGELOG.md": "# Changes\n",

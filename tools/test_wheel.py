@@ -42,8 +42,10 @@ TESTED = (
 # Not with a lowest version of their own: no user installs them with us.
 TOOLS = (
     *("pytest>=8.3", "hypothesis>=6.100", "beartype>=0.19", "playwright>=1.49"),
-    "pytorch-kinematics>=0.7.6",
+    *("pytorch-kinematics>=0.7.6", "franky-sim>=1.0.4"),
 )
+# Descriptions of arms, whose package asks for much more than them.
+DESCRIPTIONS = ("robosuite==1.5.2",)
 REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[(?P<extras>[^]]*)\])?(?P<bounds>[^;]*)")
 ENVIRONMENTS = ("lowest", "newest", "edges")
 
@@ -108,7 +110,7 @@ def install(uv: str, wheel: Path, environment: str, python: str, folder: Path) -
     inside = folder / "venv" / "bin" / "python"
     into = (uv, "pip", "install", "--quiet", "--python", str(inside))
     run(*into, "--requirement", str(resolved), "--constraint", str(resolved), *TOOLS)
-    run(*into, "--no-deps", str(wheel))
+    run(*into, "--no-deps", str(wheel), *DESCRIPTIONS)
     # The wheel's own metadata has the last word on what it needs.
     run(uv, "pip", "check", "--quiet", "--python", str(inside))
     names = {
@@ -134,10 +136,11 @@ def test(python: Path, folder: Path, tests: list[str]) -> int:
         here, there = ROOT / "tests" / name, folder / "tests" / name
         there.parent.mkdir(exist_ok=True)
         shutil.copytree(here, there) if here.is_dir() else shutil.copy(here, there)
-    (folder / "benchmarks").mkdir()
-    for helper in (*(ROOT / "tests").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")):
+    for helper in (ROOT / "tests").glob("*.py"):
         if not helper.name.startswith("test_"):
-            shutil.copy(helper, folder / helper.parent.name)
+            shutil.copy(helper, folder / "tests")
+    for name in ("benchmarks", "plugins"):
+        shutil.copytree(ROOT / name, folder / name)
     shutil.copy(ROOT / "pyproject.toml", folder)
     # Nothing of the caller's environment may put the checkout back on the path.
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}

@@ -167,7 +167,8 @@ def finite(name: str, values: Tensor) -> Tensor:
     if not values.is_cpu or not readable(values):
         return values
     # For a few numbers Python's sum takes half the time.
-    few = values.ndim == 1 and values.numel() <= 32
+    # PyTorch 2.8 makes no list inside a transform, not even of tensors from outside.
+    few = values.ndim == 1 and values.numel() <= 32 and not transforming()
     if not math.isfinite(sum(values.tolist()) if few else values.detach().sum().item()):
         wrong = values[~values.isfinite()]
         if len(wrong):  # finite values may overflow in the sum
