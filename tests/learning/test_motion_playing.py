@@ -1,6 +1,7 @@
 """Models of a Panda and of an SO-101 carried out to goals, judged by Pinocchio."""
 
 import re
+from dataclasses import replace
 from importlib.metadata import distribution
 
 import numpy as np
@@ -101,14 +102,28 @@ def test_an_arm_reaches_a_position_within_its_limits(name, models):
     assert motion.joints[0] == pytest.approx(arm(name).ready.numpy(), abs=1e-3)
 
 
+def is_reached(motion, goal):
+    end = panda.forward(torch.from_numpy(motion.joints[-1]))
+    assert end.position.tolist() == pytest.approx(goal.position.tolist(), abs=1e-3)
+    assert abs(float(end.orientation @ goal.orientation)) == pytest.approx(1, abs=1e-5)
+    assert motion.goal_errors["goal_turn_error_deg"] < 0.5
+
+
 def test_a_pose_is_reached_with_its_orientation(models):
     turned = panda.forward(panda.ready + 0.1)
     goal = Target(position=turned.position + 0.05, orientation=turned.orientation)
-    motion = moved(models["panda"], "panda", goal)
-    end = panda.forward(torch.from_numpy(motion.joints[-1]))
-    assert end.position.tolist() == pytest.approx(goal.position.tolist(), abs=1e-3)
-    assert abs(float(end.orientation @ turned.orientation)) == pytest.approx(1, abs=1e-5)
-    assert motion.goal_errors["goal_turn_error_deg"] < 0.5
+    is_reached(moved(models["panda"], "panda", goal), goal)
+
+
+def test_a_model_of_joints_alone_reaches_positions_and_poses(models):
+    joint = models["panda"].primitives["joint"]
+    model = replace(models["panda"], primitives={"joint": joint})
+    motion = moved(model, "panda", at(GOALS["panda"]))
+    position = tool_by_pinocchio("panda", motion.joints[-1])
+    assert position == pytest.approx(GOALS["panda"], abs=1e-3)
+    turned = panda.forward(panda.ready + 0.1)
+    goal = Target(position=turned.position, orientation=turned.orientation)
+    is_reached(moved(model, "panda", goal), goal)
 
 
 def test_fewer_joints_turn_the_tool_as_far_as_they_can(models):
