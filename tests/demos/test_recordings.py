@@ -543,6 +543,13 @@ def test_a_table_of_lerobot_has_joints_commands_and_grippers(tmp_path):
     np.testing.assert_allclose(one.demonstration.gripper, TIME)
     np.testing.assert_allclose(one.demonstration.command_position, joint_path(40, 2) + 0.01)
     assert made.meaning.kept["action"][1] == ("gripper.pos",)
+    assert "no commands were recorded" not in "\n".join(made.lines())
+    # The same table without its commands.
+    text = "t," + ",".join(head[:3])
+    np.savetxt(tmp_path / "b.csv", rows[:, :4], delimiter=",", header=text, comments="")
+    bare = plan(tmp_path / "b.csv")
+    for actions, made_of in ((True, "next states are the actions"), (False, "has no actions")):
+        assert made_of in "\n".join(bare.lines(actions))
 
 
 def test_rx_ry_rz_may_be_angles(tmp_path):
