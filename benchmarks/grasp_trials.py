@@ -159,11 +159,7 @@ class TrialArm:
         half = ((limits.upper - limits.lower) / 2).clamp(max=math.pi)
         share = torch.rand(_STARTS, len(half), generator=rng, dtype=torch.float64)
         start = limits.middle + (2 * share - 1) * half
-        # Five joints meet a pose as exactly as their axes are parallel in the description.
-        tolerance = 1e-9 if self.task == "pose" else 1e-3
-        found = solutions_from(
-            self.chain, Pose(self.centre, self.down), start, task=task, tolerance=tolerance
-        )
+        found = solutions_from(self.chain, Pose(self.centre, self.down), start, task=task)
         return found[found.isfinite().all(-1)]
 
     def scaled(self, lengths: tuple[float, ...]) -> Float[Tensor, " n"]:

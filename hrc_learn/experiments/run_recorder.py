@@ -296,7 +296,7 @@ def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str,
         path = _polyline(run.plan_path, palette.GREEN)
         drawn.append(("learned motion, planned", palette.GREEN, path))
     elif run.region is not None:
-        edges = [_line(*ends, palette.YELLOW, width=0.004) for ends in run.region.edges()]
+        edges = [_line(a, b, palette.YELLOW, width=0.004) for a, b in run.region.edges()]
         drawn.append(("region of visual servoing", palette.YELLOW, edges))
     first = int(np.searchsorted(run.time, run.time[step] - _TRAIL))
     trail = _polyline(run.position[first : step + 1], palette.BLUE)

@@ -43,15 +43,19 @@ class GripperDriver(Protocol):
 
     def read_width(self) -> float:
         """Return the opening [m]; waits for the next reading."""
+        ...
 
     def move(self, width: float) -> bool:
         """Move the fingers to an opening [m] and wait; False if they do not reach it."""
+        ...
 
     def squeeze(self) -> bool:
         """Close the fingers on an object and wait; False if they do not press on one."""
+        ...
 
     def close(self) -> None:
         """Close the connection; a call in progress may fail."""
+        ...
 
 
 @final

@@ -119,5 +119,6 @@ class PunctualServer(FrankaRobotServer):
 
     def _handle_udp_command(self, command_data: bytes) -> None:
         # An answer names its state; the package has counted on since it was sent.
-        if int.from_bytes(command_data[:8], "little") == self._FrankaServer__message_id - 1:
+        counted = self._FrankaServer__message_id  # pyright: ignore[reportAttributeAccessIssue]
+        if int.from_bytes(command_data[:8], "little") == counted - 1:
             super()._handle_udp_command(command_data)

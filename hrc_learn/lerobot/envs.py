@@ -158,7 +158,7 @@ class ArmEnv(gym.Env):
         return observation
 
 
-gym.register(_GYM_ID, ArmEnv)
+gym.register(_GYM_ID, f"{__name__}:{ArmEnv.__name__}")
 
 
 def _unbounded(size: int) -> gym.spaces.Box:

@@ -12,7 +12,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import numpy as np
@@ -20,7 +20,6 @@ import torch
 
 from hrc_learn.geometry import Box, Pose
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.sim import MovingBodies, World
 from hrc_learn.store import json_text
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
 from hrc_learn.teleoperation.gate import AddressConfig, Gate, messages
@@ -43,6 +42,9 @@ from hrc_learn.teleoperation.page_sockets import (
 from hrc_learn.teleoperation.panel import PageStatus as PageStatus
 from hrc_learn.teleoperation.panel import Panel, felt_words
 from hrc_learn.viz.palette import followed_colour
+
+if TYPE_CHECKING:
+    from hrc_learn.sim import World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +143,9 @@ class Page:
         """
         import viser
 
+        # With MuJoCo, which nothing else of the page needs.
+        from hrc_learn.sim import MovingBodies
+
         self._config = config = config or PageConfig()
         self._world, self._bodies = world, MovingBodies(world)
         self._poses = self._bodies.poses()
@@ -192,7 +197,7 @@ class Page:
         self._drawing: Future[None] | None = None
         self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
 
-    def __enter__(self) -> Page:
+    def __enter__(self) -> Self:
         self._thread.start()
         self._gate.start()
         return self
@@ -238,6 +243,8 @@ class Page:
             world: World with the same bodies that has taken the place of the last one; None: it
                 is the same.
         """
+        from hrc_learn.sim import MovingBodies
+
         if world is not None and world is not self._world:
             self._world, self._bodies = world, MovingBodies(world)
         self._poses = self._bodies.poses()

@@ -179,7 +179,8 @@ class CameraModel:
             return np.zeros((*p.shape[:-1], 2, 6))
         # The derivative over a shift of all points is that over each point.
         _, slope = cv2.projectPoints(p.reshape(-1, 3), still, still, self.matrix, lens)
-        J_point = slope[:, 3:6].reshape(*p.shape[:-1], 2, 3) @ self.pose[:3, :3].T
+        slope = np.asarray(slope[:, 3:6], dtype=float).reshape(*p.shape[:-1], 2, 3)
+        J_point = slope @ self.pose[:3, :3].T
         arm = np.zeros_like(point) if origin is None else point - origin
         # (omega x arm) . j = omega . (arm x j) for each row j of J_point.
         return np.concatenate([J_point, np.cross(arm[..., None, :], J_point)], axis=-1)

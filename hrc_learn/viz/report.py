@@ -308,7 +308,7 @@ class _ReportFile(Report):
 
     format: Literal["hrc_learn report"] = "hrc_learn report"
     version: Literal[1] = 1
-    table: Sequence[_Row]
+    table: Sequence[_Row]  # pyright: ignore[reportGeneralTypeIssues]
     film: str | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Caption of the film; None without one."""
 

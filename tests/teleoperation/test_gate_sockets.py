@@ -33,7 +33,7 @@ async def echo(connection, visitor):
 
 
 @contextmanager
-def served(data=None, most_clients=2):
+def served(data=lambda path: None, most_clients=2):
     routes = {"session": echo, "view": echo}
     content = {"/page": Content.of("page.html", b"a page")}
     config = AddressConfig(port=0, most_clients=most_clients)

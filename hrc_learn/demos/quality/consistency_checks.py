@@ -1,7 +1,7 @@
 """Checks of one episode against the others: sizes, rests, noise, columns and commands."""
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -322,7 +322,7 @@ def command_offsets(
         profiles: Profiles of the episodes that have commands.
         features: Profiles of all features.
     """
-    place = {"key": command.columns[0][0]}
+    place: dict[str, Any] = {"key": command.columns[0][0]}
     spans = {feature.key: feature.median("span") for feature in features}
     offsets = np.stack([profile.tracking["command_position"].offset for profile in profiles])
     for own, name, (key, index) in zip(offsets.T, command.labels, state.columns, strict=True):
