@@ -12,7 +12,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -197,7 +197,7 @@ class Page:
         self._drawing: Future[None] | None = None
         self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
 
-    def __enter__(self) -> Self:
+    def __enter__[Shown: Page](self: Shown) -> Shown:
         self._thread.start()
         self._gate.start()
         return self
