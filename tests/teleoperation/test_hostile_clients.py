@@ -224,22 +224,20 @@ def test_viser_is_touched_in_its_own_loop_while_many_watch(session, monkeypatch)
 
     monkeypatch.setattr(AsyncMessageBuffer, "push", noted)
 
-    async def watch(stop):
+    async def watch():
         async with viewer(page) as (one, view):
             drain = asyncio.create_task(until_closed(view))
             await one.send(json.dumps({"type": "hello", "wants": "scene"}))
             states = 0
-            while not stop.is_set():
+            while states < 6:
                 states += bool(json.loads(await one.recv()).get("scene"))
             drain.cancel()
-        return states
 
     async def lead(stop):
         async with viewer(page) as (one, view):
             drain = asyncio.create_task(until_closed(view))
             await one.send(json.dumps({"type": "region", **REGION}))
-            end = time.monotonic() + 1.5
-            while time.monotonic() < end:
+            while not stop.is_set() or len(delays) < 6:
                 sent = time.monotonic()
                 side = 0.1 * math.sin(5 * sent)
                 grips = json.loads(hands(pointer=(0.3, side, 0.9)))["grips"]
@@ -249,21 +247,20 @@ def test_viser_is_touched_in_its_own_loop_while_many_watch(session, monkeypatch)
                     pass
                 if told["status"]["sent"]:
                     delays.append(time.monotonic() - told["status"]["sent"])
-            stop.set()
             drain.cancel()
 
     async def go():
         stop = asyncio.Event()
         leading = asyncio.create_task(lead(stop))
         await asyncio.sleep(0.3)
-        states = await asyncio.gather(*(watch(stop) for _ in range(24)))
+        # As long as it takes: a busy machine shows fewer states a second.
+        async with asyncio.timeout(30):
+            await asyncio.gather(*(watch() for _ in range(24)))
+        stop.set()
         await leading
-        return states
 
-    states = asyncio.run(go())
+    asyncio.run(go())
     assert page.alive
-    assert min(states) > 5
-    assert len(delays) > 5
     assert len(threads) == 1, threads
     wait_until(lambda: page.control.people == 0, "everybody gone")
 
