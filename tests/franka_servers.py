@@ -26,9 +26,11 @@ needs_franka_sim = pytest.mark.skipif(
 
 def loopback() -> str:
     """An address that nobody else is likely to use."""
-    # By the process too: tests that run side by side draw from generators seeded alike.
-    rng = random.Random(f"{os.getpid()} {random.random()}")
-    return f"127.{rng.randrange(16, 240)}.{rng.randrange(1, 250)}.{rng.randrange(1, 250)}"
+    # Of the system: the generators of tests are seeded alike, so that they would draw the same.
+    chance = random.SystemRandom()
+    return (
+        f"127.{chance.randrange(16, 240)}.{chance.randrange(1, 250)}.{chance.randrange(1, 250)}"
+    )
 
 
 class Trace(NamedTuple):
