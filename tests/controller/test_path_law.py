@@ -419,3 +419,30 @@ def test_a_direct_return_begins_after_twenty_seconds_unless_something_is_in_the_
     request = FollowPath(paths=PATHS, path=torch.tensor([1, 1]))
     _, later = law().follow(state, reading_at(q), request)
     assert later.path.direct_return.active.tolist() == [begins, False]
+
+
+@pytest.mark.parametrize(
+    ("off", "pushed", "lost", "after"),
+    [
+        (1.6, False, False, False),  # 1.8 rad are too far
+        (1.9, False, False, True),
+        (1.6, True, True, False),
+        (1.6, False, True, True),  # once lost and let go, it is lost until 1.4 rad
+        (1.3, False, True, False),
+    ],
+)
+def test_joints_that_were_lost_have_to_come_nearer_before_they_count_as_found(
+    off, pushed, lost, after
+):
+    unit = null_unit(Q)
+    state = state_of(1)
+    state = replace(
+        state,
+        aside=torch.tensor([True]),
+        lost=torch.tensor([lost]),
+        null_velocity=pushed * 0.1 * unit[None],
+    )
+    reading = reading_at((Q - off * unit)[None])
+    reading = replace(reading, jacobian=panda.jacobian(Q)[None])  # aligned all the way
+    _, later = law().follow(state, reading, FollowPath(paths=PATHS, path=torch.tensor([0])))
+    assert bool(later.lost) == after

@@ -1,6 +1,7 @@
 """Models chosen by held-out errors, against models that are fitted without each."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -125,7 +126,7 @@ def test_a_context_decides_where_start_and_goal_do_not():
         model.at(context=[0.5, 0.1])
 
 
-def test_frames_are_chosen_where_they_determine_the_motion():
+def test_frames_are_chosen_where_they_determine_the_motion(tmp_path):
     rng = torch.Generator().manual_seed(5)
     places = 2 * torch.rand(6, 2, generator=rng).double()
     turns = 2 * torch.rand(6, generator=rng).double()
@@ -143,6 +144,38 @@ def test_frames_are_chosen_where_they_determine_the_motion():
     assert (made - shown[5][1]).abs().max() < 0.1
     with pytest.raises(ValueError, match="give the 2 frames"):
         model.at()
+    with pytest.raises(ValueError, match="a model of frames has no contexts"):
+        model.at_contexts(torch.zeros(1, 2).double())
+    model.save(tmp_path / "model")
+    again = LearnedMotion.load(tmp_path / "model")
+    other = again.rollout(2 * S, frames=Frames(frames.A[5], frames.b[5])).position
+    torch.testing.assert_close(other, made)
+
+
+def test_demonstrations_of_a_dataset_are_read_by_their_fields():
+    """Joints before poses; a position with its orientation is a pose."""
+    time, way = demonstrations(by_goal)[0]
+    point = torch.cat([way, torch.zeros_like(way[:, :1])], -1)
+    turn = quaternion.exp(0.3 * M * torch.tensor([0.0, 0.6, 0.8]).double())
+    shown = {"joint_position": way, "position": point, "orientation": turn}
+    for names, expected in (
+        (("joint_position", "position", "orientation"), way),
+        (("position",), point),
+        (("position", "orientation"), Pose(point, turn)),
+    ):
+        fields = {name: shown[name] if name in names else None for name in shown}
+        read = learn([SimpleNamespace(time=time, **fields)], n_basis=10).rollout(time)
+        same = learn([(time, expected)], n_basis=10).rollout(time)
+        torch.testing.assert_close(read.position, same.position)
+        assert hasattr(read, "orientation") == isinstance(expected, Pose)
+    with pytest.raises(ValueError, match="neither joint positions nor positions"):
+        learn([SimpleNamespace(time=time)])
+
+
+def test_few_samples_have_few_functions():
+    time, way = demonstrations(by_goal)[0]
+    model = learn([(time[::5], way[::5])] * 2)
+    assert model.each.motion.basis.count == 10
 
 
 @pytest.mark.parametrize("kind", ["joint", "pose"])

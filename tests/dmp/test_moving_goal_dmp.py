@@ -115,3 +115,13 @@ def test_lists_are_taken_at_full_precision():
 def test_forcing_that_scales_with_the_start_is_refused():
     with pytest.raises(ValueError, match="a moving goal needs"):
         MovingGoalDMP(primitive(scaling="paper"))
+
+
+def test_a_saved_primitive_is_the_same(tmp_path):
+    moving = MovingGoalDMP(primitive())
+    moving.save(tmp_path / "model")
+    loaded = MovingGoalDMP.load(tmp_path / "model")
+    torch.testing.assert_close(loaded.start, moving.rollout(end_velocity=END).position[0])
+    torch.testing.assert_close(loaded.goal, primitive().goal)
+    there, here = (dmp.rollout(end_velocity=END).position for dmp in (loaded, moving))
+    torch.testing.assert_close(there, here, rtol=0, atol=0)

@@ -218,6 +218,13 @@ def test_saved_tokenizers_decode_alike(gripping, tmp_path):
     assert torch.equal(ids, tokenizer.encode(TIME, position))
     made = tokenizer.decode(ids, TIME, position[:, 0])
     assert torch.equal(loaded.decode(ids, TIME, position[:, 0]), made)
+    config = tmp_path / "tokens" / "config.json"
+    config.write_text(
+        config.read_text().replace('"components": {', '"components": {}, "old": {')
+    )
+    (config.parent / ".manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"not a complete tokenizer \(.*fit it again"):
+        MotionTokenizer.load(config.parent)
 
 
 def test_batches_equal_single_motions(gripping):

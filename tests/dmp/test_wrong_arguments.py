@@ -8,7 +8,17 @@ import torch
 from demo_motions import arm_motion, turning_motion
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import JointDMP, MotionHead, OrientationDMP, Stepper
+from hrc_learn.dmp import (
+    JointDMP,
+    MotionHead,
+    OrientationDMP,
+    PoseDMP,
+    ProbabilisticDMP,
+    Stepper,
+    fit_rhythmic_orientation,
+    fit_shared,
+)
+from hrc_learn.geometry import Pose, quaternion
 
 TIME, POSITION = arm_motion(n_joints=3)
 BAD = [math.nan, math.inf, -math.inf]
@@ -95,6 +105,67 @@ def test_a_coupling_of_another_size_and_a_bad_ridge_are_named():
     for ridge in (math.nan, -1.0):
         with pytest.raises(ValueError, match="regularization must be finite, not negative"):
             JointDMP.fit(TIME, POSITION, 8, regularization=ridge)
+
+
+def window_of_unequal_durations():
+    both = JointDMP.fit(torch.stack([TIME, 2 * TIME]), torch.stack([POSITION] * 2), 8)
+    both.condition([1.0], POSITION[None, 100], within=(0.5, 1.5))
+
+
+def rhythms_about_different_centres():
+    turn = torch.linspace(0, 2 * torch.pi, 200, dtype=torch.float64)
+    axis = torch.stack([torch.sin(turn), torch.cos(turn), torch.zeros_like(turn)], -1)
+    wave = quaternion.exp(0.2 * axis)
+    away = quaternion.multiply(quaternion.exp(torch.tensor([0.0, 0.0, 1.0]).double()), wave)
+    ProbabilisticDMP.fit(fit_rhythmic_orientation(turn, torch.stack([wave, away]), period=6.2))
+
+
+def distribution():
+    both = torch.stack([POSITION, 1.1 * POSITION])
+    return ProbabilisticDMP.fit(JointDMP.fit(TIME, both, 8))
+
+
+REFUSED = [
+    (lambda: JointDMP.fit(TIME, POSITION, 8)[0], TypeError, "a single primitive cannot be ind"),
+    (
+        lambda: JointDMP.fit(TIME, POSITION, 8).condition(
+            [1.0], Pose.from_vector(torch.ones(6))
+        ),
+        ValueError,
+        "of joints or an orientation must be an array, got a Pose",
+    ),
+    (
+        lambda: PoseDMP.fit(TIME, torch.stack([POSITION] * 2), turning_motion(len(TIME))[1]),
+        ValueError,
+        r"position, orientation error and body differ: \(2, \d+, 3\), \(\d+, 3\)",
+    ),
+    (
+        window_of_unequal_durations,
+        ValueError,
+        "a window in seconds needs primitives of one dur",
+    ),
+    (rhythms_about_different_centres, ValueError, "rhythms about different centres have no"),
+    (lambda: distribution().position([[0.1, 0.2]]), ValueError, r"time must be \(n,\), got"),
+    (
+        lambda: distribution().condition([0.5], POSITION[None, None, 100].repeat(2, 1, 1)),
+        ValueError,
+        r"via points must be \(n, D\), got \(2, 1, 3\)",
+    ),
+    (
+        lambda: fit_shared([(TIME, POSITION), (TIME, torch.stack([POSITION] * 2))], 8),
+        ValueError,
+        r"demonstration 1: position must be \(T, D\), without a batch",
+    ),
+]
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize(
+    ("use", "kind", "message"), REFUSED, ids=lambda x: x if isinstance(x, str) else ""
+)
+def test_what_has_no_meaning_is_named(use, kind, message):
+    with pytest.raises(kind, match=message):
+        use()
 
 
 def test_autocast_changes_nothing():

@@ -203,6 +203,11 @@ def test_a_reference_survives_json(reference):
 def test_one_demonstration_is_not_enough(demonstrations):
     with pytest.raises(ValueError, match="two demonstrations"):
         CameraReference.fit(demonstrations[:1], FPS, IMAGE)
+    with pytest.raises(ValueError, match=r"fps must be positive, got 0\.0"):
+        CameraReference.fit(demonstrations, 0.0, IMAGE)
+    with pytest.raises(ValueError, match="camera must have 13 numbers, but has 2"):
+        CameraReference(camera=(0.0, 1.0), threshold=1.0, lower=(0,) * 3, upper=(1,) * 3)
+    assert camera_placements(demonstrations[:1], IMAGE) == []
 
 
 def test_a_marker_never_seen_is_said(demonstrations):

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -31,6 +32,10 @@ def record(demos=4, *, frames=200, noise=0.1, seed=0):
     x = CAMERA.project(poses)
     x = x + noise * torch.randn(x.shape, generator=rng, dtype=x.dtype)
     return image_demonstrations([poses[i] for i in range(demos)], list(x))
+
+
+def unseen(demonstration):
+    return replace(demonstration, visible=torch.zeros_like(demonstration.visible))
 
 
 def relative_error(network):
@@ -108,6 +113,14 @@ def test_learning_keeps_what_was_best_on_demonstrations_held_out():
 def test_too_few_demonstrations_are_refused():
     with pytest.raises(ValueError, match="every 4th demonstration is held out"):
         maximize_evidence(record(3), RBFCenters.paper())
+    demonstrations = record(4)
+    *others, last = map(unseen, demonstrations)
+    for given, message in (
+        ([*demonstrations[:3], last], "in every 4th demonstration: there is nothing to judge"),
+        ([*others, demonstrations[3]], "in those but every 4th .*: there is nothing to learn"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            maximize_evidence(given, RBFCenters.paper())
 
 
 def test_neurons_around_stand_where_the_tool_was():
@@ -155,6 +168,9 @@ def test_held_out_errors_by_place_add_up():
     loaded = RBFImageJacobian(paper_grid(), 0.1)
     with pytest.raises(ValueError, match="just fitted"):
         cross_validate(demonstrations, loaded, config)
+    one_seen = demonstrations[:1] + [unseen(demo) for demo in demonstrations[1:]]
+    with pytest.raises(ValueError, match="held-out errors need pairs in at least two folds"):
+        cross_validate(one_seen, network, config)
 
 
 def test_cells_lie_where_their_edges_say():

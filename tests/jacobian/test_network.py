@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 from pinhole import wander
+from safetensors.torch import load_file, save_file
 from sampling import generator
 from torch.testing import assert_close
 
 from hrc_learn.jacobian import RBFImageJacobian, grid, paper_grid
+from hrc_learn.jacobian.perspective import CameraFit
 
 # (eq_js0): the paper's first guess.
 J0 = torch.tensor(
@@ -138,6 +140,23 @@ def test_save_refuses_a_folder_of_something_else(tmp_path):
     with pytest.raises(ValueError, match="choose another"):
         random_network().save(tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").read_text() == "words"
+
+
+def test_a_saved_camera_of_another_size_is_refused(tmp_path):
+    fit = CameraFit(camera=torch.zeros(13), covariance=torch.eye(13), noise=1.0)
+    RBFImageJacobian(paper_grid(), 0.1, camera=fit).save(tmp_path / "model")
+    assert RBFImageJacobian.load(tmp_path / "model").camera is not None
+    file = tmp_path / "model" / "model.safetensors"
+    tensors = load_file(file)
+    save_file(tensors | {"camera": tensors["camera"][:12].clone()}, file)
+    (tmp_path / "model" / ".manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"must have 13 rows, but have shapes \(12,\) and"):
+        RBFImageJacobian.load(tmp_path / "model")
+
+
+def test_a_network_without_a_fit_has_no_uncertainty():
+    with pytest.raises(ValueError, match="without a fit has no uncertainty: fit it to"):
+        random_network().uncertainty(pose_vectors(1))
 
 
 def test_load_names_what_is_wrong(tmp_path):

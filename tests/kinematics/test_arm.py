@@ -1,12 +1,14 @@
 """Arms from descriptions, against MuJoCo; their inverses, and what is said of bad files."""
 
 import sys
+from importlib.metadata import PackageNotFoundError
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 from sampling import generator
+from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from hrc_learn.kinematics import (
@@ -18,9 +20,16 @@ from hrc_learn.kinematics import (
     null_space_dimension,
     panda,
     registered_arms,
+    registry,
     solve_inverse,
 )
-from hrc_learn.kinematics.capsule_fit import fit_body, fit_link, hull_of, shape_points
+from hrc_learn.kinematics.capsule_fit import (
+    capsule_volume,
+    fit_body,
+    fit_link,
+    hull_of,
+    shape_points,
+)
 from hrc_learn.kinematics.chain import transform_and_jacobian
 from hrc_learn.kinematics.description import Shape, turn_to
 
@@ -240,6 +249,24 @@ def test_a_description_that_nobody_prepared_is_taken(file, base, tip, joints):
     assert solve_inverse(a.chain, pose).found.double().mean() >= 0.95
 
 
+def test_choices_that_an_arm_does_not_offer_are_named(monkeypatch):
+    with pytest.raises(ValueError, match="panda is written in this package: tip cannot be"):
+        arm("panda", tip="panda_link7")
+    other = installed("ur5e")
+    pose = other.forward(other.ready)
+    with pytest.raises(ValueError, match=r"ur5e has no closed-form inverse, so q7 does not"):
+        other.inverse(pose, q7=0.1)
+    with pytest.raises(ValueError, match="ur5e has no closed-form inverse: use `postures`"):
+        other.solutions(pose)
+
+    def missing(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(registry, "distribution", missing)
+    with pytest.raises(MissingModelError, match=r"description of ur5e is in .* pip install "):
+        arm("ur5e", tip="tool0")
+
+
 def test_unknown_names_are_answered_with_those_there_are():
     with pytest.raises(ValueError, match="no arm 'unicorn': there are panda, fr3"):
         arm("unicorn")
@@ -259,18 +286,77 @@ def test_null_space_that_tasks_leave():
     assert [int(null_space_dimension(chain, chain.ready, task)) for task in tasks] == [1, 2, 4]
 
 
-def test_capsules_contain_what_they_are_fitted_to():
-    shape = Shape(kind="box", pose=np.eye(4), size=(0.03, 0.05, 0.3))
-    hull = hull_of(shape)
-    rng = np.random.default_rng(0)
-    inside = (2 * rng.random((2000, 3)) - 1) * shape.size
-    distance = np.full(len(inside), np.inf)
-    for start, end, radius in fit_link([hull]):
+def gap(points, capsules):
+    """Distance of points to the nearest of some capsules; negative inside."""
+    distance = np.full(len(points), np.inf)
+    for start, end, radius in capsules:
         way = end - start
-        t = np.clip((inside - start) @ way / max(way @ way, 1e-30), 0, 1)
-        away = np.linalg.norm(inside - start - t[:, None] * way, axis=1) - radius
+        t = np.clip((points - start) @ way / max(way @ way, 1e-30), 0, 1)
+        away = np.linalg.norm(points - start - t[:, None] * way, axis=1) - radius
         distance = np.minimum(distance, away)
-    assert distance.max() <= 0
+    return distance
+
+
+def tilted(*position):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.5, 0.9]).as_matrix()
+    pose[:3, 3] = position
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        ("box", (0.03, 0.05, 0.3)),
+        ("box", (0.1, 0.1, 0.1)),
+        ("box", (0.1, 0.2, 0.0)),  # flat: it has no hull
+        ("cylinder", (0.04, 0.2)),
+        ("capsule", (0.04, 0.2)),
+        ("sphere", (0.04, 0.0)),
+    ],
+)
+def test_capsules_contain_what_they_are_fitted_to(kind, size):
+    shape, rng = (
+        Shape(kind=kind, pose=tilted(0.1, 0.2, -0.3), size=size),
+        np.random.default_rng(0),
+    )
+    if kind == "box":
+        inside = (2 * rng.random((2000, 3)) - 1) * size
+    else:
+        (radius, half), unit = size, rng.normal(size=(2000, 3))
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        if kind == "cylinder":
+            unit[:, :2] /= np.linalg.norm(unit[:, :2], axis=1, keepdims=True)
+            unit[:, 2] = 0.0
+        inside = radius * unit + [[0, 0, half]] * rng.uniform(-1, 1, (2000, 1))
+    inside = inside @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+    fitted = fit_link([hull_of(shape)])
+    assert gap(inside, fitted).max() <= 0
+    # A ball around a cube around a ball has 5.2 times its volume.
+    far = np.linalg.norm(inside - shape.pose[:3, 3], axis=1).max()
+    assert sum(map(capsule_volume, fitted)) < 6 * 4 / 3 * np.pi * far**3
+
+
+def test_a_bent_link_is_cut_into_its_bars():
+    bars = [
+        Shape(kind="box", pose=pose, size=(0.02, 0.02, 0.3))
+        for pose in (tilted(0, 0, 0), tilted(0, 0, 0) @ turned_up())
+    ]
+    hulls = [hull_of(shape) for shape in bars]
+    fitted = fit_link(hulls)
+    for hull in hulls:
+        assert gap(hull.points, fitted).max() <= 1e-9
+    alone = [capsule for hull in hulls for capsule in fit_link([hull])]
+    assert len(fitted) == len(alone) == 2
+    assert sum(map(capsule_volume, fitted)) < 1.1 * sum(map(capsule_volume, alone))
+
+
+def turned_up():
+    """A quarter turn at the end of a bar of 0.6 m, along which the next one stands."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("x", np.pi / 2).as_matrix()
+    pose[:3, 3] = (0.0, -0.28, 0.28)
+    return pose
 
 
 @pytest.mark.parametrize("name", ["ur5e", "so101"])

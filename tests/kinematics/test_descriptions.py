@@ -6,6 +6,7 @@ where one of them refuses it, ours does, too. Exceptions say why.
 
 import warnings
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -23,6 +24,7 @@ FAR = (
     '<collision><origin xyz="0 0 1e300"/><geometry><sphere radius="1"/></geometry></collision>'
 )
 HEAVY = '<inertial><mass value="1"/><inertia ixx="nan" iyy="1" izz="1"/></inertial>'
+LIGHT = '<inertial><mass value="-1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
 XMLNS = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 
 
@@ -64,7 +66,7 @@ def jaw(name: str, link: str, parent: str = "l6", kind: str = "revolute") -> str
     )
 
 
-def load(tmp_path: Path, text: str, suffix: str = ".urdf", **choice: str) -> Arm:
+def load(tmp_path: Path, text: str, suffix: str = ".urdf", **choice: Any) -> Arm:
     path = tmp_path / f"robot{suffix}"
     path.write_text(text, encoding="utf-8")
     with warnings.catch_warnings():
@@ -115,6 +117,9 @@ LOADED = {
     ),
     "undeclared prefix": robot('<xacro:property name="w" value="1"/>' + ARM + TOOL),
     "expressions of a simulator": robot('<gazebo><plugin name="${x}"/></gazebo>' + ARM + TOOL),
+    "visual without a shape": robot(
+        changed('<link name="l3"/>', '<link name="l3"><visual><geometry/></visual></link>')
+    ),
     "missing mesh": robot(changed('<link name="l3"/>', f'<link name="l3">{MESH}</link>')),
     "continuous joint with empty limits": robot(
         ARM.replace(
@@ -199,6 +204,13 @@ REFUSED = {
         changed(joint(3), joint(3, more='<mimic joint="j2"/>')),
         "j3 only follows j2",
     ),
+    "negative mass": (
+        changed('<link name="l2"/>', f'<link name="l2">{LIGHT}</link>'),
+        "link l2 has the negative mass -1 kg",
+    ),
+    "no parent": (changed('<parent link="l2"/>', ""), "joint j3 has no <parent>"),
+    "no child": (changed('<child link="l3"/>', ""), "joint j3 has no <child>"),
+    "unnamed parent": (changed('link="l2"/><c', '/><c'), "<parent> of joint j3 has no link"),
     "nothing": ("", "has no links"),
 }  # fmt: skip
 
@@ -209,6 +221,29 @@ def test_what_is_no_serial_arm_is_refused_in_a_line(tmp_path, kind):
     with pytest.raises(ValueError, match=message) as refusal:
         load(tmp_path, robot(content), tip="tool0" if content else None)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"base": "x"}, "has no link 'x' to be the base; its links are l0, l1, l2"),
+        ({"tip": "y"}, "has no link 'y' to be the tip"),
+        ({"base": "l3", "tip": "l1"}, "link 'l1' does not hang on 'l3', but on 'l0'"),
+        ({"base": "l6", "tip": "tool0"}, "no joint moves between 'l6' and 'tool0'"),
+        ({"base": "l6"}, "no joint moves a link that hangs on 'l6'"),
+        ({"limits": {"j9": {"velocity": 1.0}}}, "limits are given for 'j9', but the joints"),
+        ({"limits": {"j1": {"speed": 1.0}}}, "unknown limits of j1: speed; known are .*jerk"),
+    ],
+)
+def test_choices_that_the_file_does_not_offer_are_named(tmp_path, choice, message):
+    with pytest.raises(ValueError, match=message) as refusal:
+        load(tmp_path, robot(ARM + TOOL), **choice)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no robot description .*gone\.urdf"):
+        arm(tmp_path / "gone.urdf")
 
 
 @pytest.mark.parametrize(
@@ -406,6 +441,29 @@ def test_the_format_is_told_by_the_first_element(tmp_path):
 def test_unnamed_parts_of_mjcf_have_names_of_their_own(tmp_path):
     text = mjcf().replace('name="j2" ', "").replace('name="b2" ', "").replace('name="j4" ', "")
     assert load(tmp_path, text, ".xml").joints == 6
+
+
+def test_shapes_that_are_no_capsules_leave_the_arm_as_it_is(tmp_path):
+    """Vertices in the description itself and ellipsoids; MuJoCo moves with them alike."""
+    corners = "0 0 0 0.1 0 0 0 0.1 0 0 0 0.1"
+    text = mjcf().replace(
+        "<worldbody>", f'<asset><mesh name="m" vertex="{corners}"/></asset><worldbody>'
+    )
+    text = text.replace(
+        '<body name="b2" pos="0.1 0 0.2">',
+        '<body name="b2" pos="0.1 0 0.2"><geom type="mesh" mesh="m"/>'
+        '<geom type="ellipsoid" size="0.1 0.2 0.3"/>',
+    )
+    plain, shaped = load(tmp_path, mjcf(), ".xml"), load(tmp_path, text, ".xml")
+    assert len(shaped.shape.shapes) == len(plain.shape.shapes) == 6
+    q = within(plain.limits.lower, plain.limits.upper, 3, rng=generator(2), margin=0.0)
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    for joints in q:
+        data.qpos[:] = joints
+        mujoco.mj_kinematics(model, data)
+        tool = shaped.forward(joints).position
+        np.testing.assert_allclose(tool, data.site("tcp").xpos, rtol=0, atol=1e-9)
 
 
 def test_limits_of_motion_have_to_be_positive(tmp_path):

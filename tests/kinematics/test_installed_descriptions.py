@@ -3,7 +3,7 @@
 import pytest
 from urdf_text import to_urdf
 
-from hrc_learn.kinematics import arm, panda
+from hrc_learn.kinematics import ArmChoice, arm, panda
 from hrc_learn.kinematics.registry import arm_of_robot, installed_descriptions
 
 
@@ -50,3 +50,6 @@ def test_robot_types_of_lerobot_are_registered_arms():
         assert arm_of_robot(kind) is panda
     for kind in (None, "", "unknown", "koch_follower", "bi_so101_follower", "heron"):
         assert arm_of_robot(kind) is None
+    assert arm_of_robot("mujoco_panda") is panda
+    # Our simulated robots carry the hand of the work cell.
+    assert arm_of_robot("mujoco_ur5e") is ArmChoice("ur5e").work_arm()
