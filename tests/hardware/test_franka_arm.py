@@ -14,18 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from franka_servers import franky_sim, loopback
 from loop_on_franka import loop_of
 from programs_as_modules import load_program
 
-from hrc_learn.controller import SafetyConfig
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
-from hrc_learn.hardware.franka_arm import step_of
-from hrc_learn.hardware.franka_settings import CYCLE
 from hrc_learn.hardware.protocol_server import ServedArm, serve_world
-from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.kinematics import fr3 as FR3
+from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Arm, Gripper
 from hrc_learn.sim import SceneConfig, World
 
@@ -67,28 +63,6 @@ def wait_until(reached) -> None:
 def test_it_is_an_arm_and_a_gripper(arm):
     assert isinstance(arm, Arm)
     assert isinstance(arm, Gripper)
-
-
-def test_the_far_end_of_a_load_keeps_the_cap_on_the_tool():
-    """By finite differences of the point, 0.5 m beyond the flange, as the wrist turns."""
-    far_end = torch.tensor([0.1, 0.0, 0.5, 1.0], dtype=torch.float64)
-
-    def fastest(load):
-        safety = SafetyConfig(tcp_speed=0.25)
-        runner = step_of(FR3, replace(CONFIG, safety=safety, load=load))()
-        q, points = FR3.ready.clone(), []
-        runner.start(q.numpy())
-        runner.observation["stop"][...] = False
-        runner.observation["joint_velocity"][:] = 2.0 * np.eye(7)[5]
-        for _ in range(400):
-            runner.observation["joint_position"][:] = q.numpy()
-            q = q + CYCLE * torch.from_numpy(np.array(runner.step()))
-            flange = FR3.forward(q).matrix() @ FR3.tcp.inverse()
-            points.append((flange @ far_end)[:3])
-        return float(torch.stack(points).diff(dim=0).norm(dim=-1).max()) / CYCLE
-
-    assert fastest(Load(far_end=tuple(far_end[:3].tolist()))) == pytest.approx(0.25, rel=0.02)
-    assert fastest(Load()) > 0.4
 
 
 def test_joints_move_as_they_are_told_and_rest_once_nobody_tells(arm):
@@ -255,25 +229,6 @@ def test_an_arm_that_is_not_there_is_named():
 def test_realtime_that_is_missing_is_named(host):
     with pytest.raises(DriverError, match="realtime=False"):
         FrankaArm(host, FR3, replace(CONFIG, realtime=True))
-
-
-def test_only_arms_of_seven_joints_are_driven():
-    short = SerialChain(
-        joint_names=panda.joint_names[:6],
-        mounts=panda.mounts[:6],
-        flange=panda.flange,
-        tcp=panda.tcp,
-        limits=replace(
-            panda.limits,
-            **{
-                name: getattr(panda.limits, name)[:6]
-                for name in ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
-            },
-        ),
-        ready=panda.ready[:6],
-    )
-    with pytest.raises(ValueError, match="7 joints"):
-        FrankaArm("127.0.0.1", short, CONFIG)
 
 
 def pauses_missed(**settings) -> int:

@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from unchecked import shapes_unchecked
 
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.hardware import CollisionConfig, FrankaConfig, Load, franka_loop
 from hrc_learn.hardware.franka_arm import step_of
 from hrc_learn.hardware.franka_memory import Orders, Phase, Shared
@@ -376,3 +378,25 @@ def test_the_process_ends_on_a_signal_and_says_why_it_cannot_begin(box, monkeypa
     assert box.answers[-1][2]
     assert 220 < box.cycle < 300
     assert collector == list(names)
+
+
+def test_the_far_end_of_a_load_keeps_the_cap_on_the_tool():
+    """By finite differences of the point, 0.5 m beyond the flange, as the wrist turns."""
+    far_end = torch.tensor([0.1, 0.0, 0.5, 1.0], dtype=torch.float64)
+
+    def fastest(load):
+        safety = SafetyConfig(tcp_speed=0.25)
+        runner = step_of(fr3, replace(CONFIG, safety=safety, load=load))()
+        q, points = fr3.ready.clone(), []
+        runner.start(q.numpy())
+        runner.observation["stop"][...] = False
+        runner.observation["joint_velocity"][:] = 2.0 * np.eye(7)[5]
+        for _ in range(400):
+            runner.observation["joint_position"][:] = q.numpy()
+            q = q + CYCLE * torch.from_numpy(np.array(runner.step()))
+            flange = fr3.forward(q).matrix() @ fr3.tcp.inverse()
+            points.append((flange @ far_end)[:3])
+        return float(torch.stack(points).diff(dim=0).norm(dim=-1).max()) / CYCLE
+
+    assert fastest(Load(far_end=tuple(far_end[:3].tolist()))) == pytest.approx(0.25, rel=0.02)
+    assert fastest(Load()) > 0.4

@@ -7,8 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from unchecked import shapes_unchecked
 
-from hrc_learn.hardware import FrankaConfig
+from hrc_learn.hardware import CollisionConfig, FrankaConfig, FrankyConfig, Load
 from hrc_learn.hardware.franka_loop import Punctuality, answer_was_lost
 from hrc_learn.hardware.franka_memory import Mailbox, Numbers, Orders, Phase, Report, Shared
 
@@ -32,7 +33,7 @@ def write_lines(mailbox: Mailbox, seconds: float) -> None:
 def test_a_line_is_read_whole_while_another_process_writes():
     mailbox = Mailbox(Long())
     writer = multiprocessing.get_context("fork").Process(
-        target=write_lines, args=(mailbox, 1.0)
+        target=write_lines, args=(mailbox, 0.3)
     )
     writer.start()
     seen = set()
@@ -169,16 +170,38 @@ class TestPunctuality:
 
 
 @pytest.mark.parametrize(
-    ("make", "named"),
+    ("make", "message"),
     [
-        (lambda: FrankaConfig(timeout=0.0), "timeout"),
-        (lambda: FrankaConfig(timeout=np.inf), "timeout"),
-        (lambda: FrankaConfig(dynamics=1.1), "dynamics"),
-        (lambda: FrankaConfig(dynamics=0.0), "dynamics"),
-        (lambda: FrankaConfig(grip_force=-1.0), "grip_force"),
-        (lambda: FrankaConfig(grip_speed=np.nan), "grip_speed"),
+        (lambda: FrankaConfig(timeout=0.0), "timeout must be positive"),
+        (lambda: FrankaConfig(timeout=np.inf), "timeout must be positive"),
+        (lambda: FrankaConfig(dynamics=1.1), "dynamics must be in"),
+        (lambda: FrankaConfig(dynamics=0.0), "dynamics must be in"),
+        (lambda: FrankaConfig(grip_force=-1.0), "grip_force must be positive"),
+        (lambda: FrankaConfig(grip_speed=np.nan), "grip_speed must be positive"),
+        (lambda: FrankyConfig(timeout=0.0), "timeout must be positive"),
+        (lambda: Load(far_end=(0.0, np.nan, 0.0)), "far_end of a load must be finite"),
+        (lambda: Load(mass=np.inf), "mass of a load must not be negative"),
+        (lambda: CollisionConfig(torque=(20.0,) * 6), "torque of a collision must be 7"),
+        (lambda: CollisionConfig(force=(0.0,) * 6), "force of a collision must be 6 positive"),
+        (lambda: Load(mass=-0.1), "mass of a load"),
+        (lambda: Load(centre=(0.0, 0.0, float("inf"))), "centre of a load"),
+        (
+            lambda: Load(inertia=((1.0, 0.0, 0.0), (0.1, 1.0, 0.0), (0.0, 0.0, 1.0))),
+            "symmetric matrix",
+        ),
+        (
+            lambda: Load(inertia=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))),
+            "not be negative about",
+        ),
+        (lambda: Load(inertia=((1.0, 0.0), (0.0, 1.0))), "3 by 3"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(make, named):
-    with pytest.raises(ValueError, match=named):
+def test_settings_that_make_no_sense_are_refused(make, message):
+    with shapes_unchecked(), pytest.raises(ValueError, match=message):
         make()
+
+
+def test_settings_at_their_ends_are_taken():
+    FrankaConfig(dynamics=1.0)
+    rod = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0))  # without a width
+    assert Load(mass=0.0, inertia=rod, far_end=(0.0, 0.0, 0.3)).centre == (0.0, 0.0, 0.0)

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from franky_servers import READY, served_world, simulated_arm
-from unchecked import shapes_unchecked
 
 from hrc_learn.hardware import (
     ArmFaultError,
@@ -20,8 +19,6 @@ from hrc_learn.hardware import (
     FrankyConfig,
     GripperError,
     Load,
-    RealtimeError,
-    franky_arm,
 )
 from hrc_learn.sim import Imperfections, SceneConfig, World
 
@@ -344,14 +341,6 @@ def test_external_torques_are_the_arms_own_estimate():
         np.testing.assert_allclose(torque, world.arm.read().external_torque, atol=0.02)
 
 
-def test_without_real_time_scheduling_the_cure_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(franky_arm, "_REALTIME_KERNEL", tmp_path / "realtime")
-    with pytest.raises(RealtimeError, match=r"PREEMPT_RT.*rtprio 99.*realtime=False"):
-        FrankyArm("127.0.0.1")
-    (tmp_path / "realtime").write_text("1\n")
-    franky_arm.require_realtime()
-
-
 def test_where_no_arm_answers_the_address_is_named():
     with pytest.raises(ConnectionError, match=r"arm at 127\.255\.0\.1.*cable.*FCI"):
         FrankyArm("127.255.0.1", CONFIG)
@@ -366,33 +355,6 @@ def test_an_arm_without_its_gripper_says_so(simulator, monkeypatch):
     monkeypatch.setattr(franky, "Gripper", refuse)
     with pytest.raises(GripperError, match=r"Connection refused.*end effector"):
         FrankyArm(simulator.ip, CONFIG)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: FrankyConfig(dynamics=0.0), "dynamics must be in"),
-        (lambda: FrankyConfig(dynamics=1.1), "dynamics must be in"),
-        (lambda: FrankyConfig(timeout=0.0), "timeout must be positive"),
-        (lambda: FrankyConfig(grip_force=float("nan")), "grip_force must be positive"),
-        (lambda: CollisionConfig(torque=(20.0,) * 6), "torque of a collision must be 7"),
-        (lambda: CollisionConfig(force=(0.0,) * 6), "force of a collision must be 6 positive"),
-        (lambda: Load(mass=-0.1), "mass of a load"),
-        (lambda: Load(centre=(0.0, 0.0, float("inf"))), "centre of a load"),
-        (
-            lambda: Load(inertia=((1.0, 0.0, 0.0), (0.1, 1.0, 0.0), (0.0, 0.0, 1.0))),
-            "symmetric matrix",
-        ),
-        (
-            lambda: Load(inertia=((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))),
-            "not be negative about",
-        ),
-        (lambda: Load(inertia=((1.0, 0.0), (0.0, 1.0))), "3 by 3"),
-    ],
-)
-def test_settings_are_checked(make, message):
-    with shapes_unchecked(), pytest.raises(ValueError, match=message):
-        make()
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import sys
 import threading
 import time
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -237,18 +236,3 @@ def test_an_arm_whose_loop_falls_silent_stops(settings, bus, chain):
         pause(0.7)
         assert STEP * (bus.servos[1].word(GOAL) - before) < 0.5 * 0.25
     assert until(lambda: not bus.servos[1].memory[TORQUE])  # as LeRobot leaves it
-
-
-def test_robots_without_a_calibration_need_their_unit(chain):
-    from hrc_learn.hardware.lerobot_device import JointUnits
-
-    features = {f"{name}.pos": float for name in chain.joint_names}
-    bare = SimpleNamespace(name="bare", action_features=features)
-    with pytest.raises(ValueError, match=r"the unit of shoulder_pan\.pos is in no calibration"):
-        JointUnits.of(bare, chain.joint_names)
-    units = JointUnits.of(bare, chain.joint_names, "deg")
-    values = {f"{name}.pos": 90.0 for name in chain.joint_names}
-    q, share = units.observed(values)
-    assert q == pytest.approx(math.pi / 2)
-    assert share == 0.0
-    assert units.action(q, 0.5) == pytest.approx(values)
