@@ -29,6 +29,11 @@ def plain_text(text: str, longest: int = _LONGEST_TEXT) -> str:
     return shown if len(shown) <= longest else f"{shown[: longest - _END]} ... {shown[-_END:]}"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words, such as "1 warning" and "2 warnings"."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def aligned(rows: Sequence[tuple[str, ...]], side: Literal["<", ">"] = "<") -> Iterator[str]:
     """A table as text; the last column is not padded.
 
@@ -175,8 +180,9 @@ class ValidationReport:
             if len(kinds) > _KINDS_SHOWN:
                 yield f"{level}: and {len(kinds) - _KINDS_SHOWN} more kinds (--full)"
         yield (
-            f"{self.path}: {self.episodes} episodes, {self.frames} frames, "
-            f"{len(self.errors)} errors, {len(self.warnings)} warnings"
+            f"{self.path}: {counted(self.episodes, 'episode')}, "
+            f"{counted(self.frames, 'frame')}, {counted(len(self.errors), 'error')}, "
+            f"{counted(len(self.warnings), 'warning')}"
         )
 
     def records(self) -> list[dict]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -30,7 +29,7 @@ from hrc_learn.deploy.package import (
 )
 from hrc_learn.deploy.scalar_program import UnknownOperationError, scalar_program
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.store import EXPORT, Claim, replacing, write_json, write_text
+from hrc_learn.store import EXPORT, Claim, cache_home, replacing, write_json, write_text
 
 
 def export_step(
@@ -61,7 +60,7 @@ def export_step(
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
     if folder is None:
-        folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hrc_learn"
+        folder = cache_home() / "hrc_learn"
     step = PackedStep(controller, observation)
     try:
         key = content_hash(machine(), controller, _structure(observation))

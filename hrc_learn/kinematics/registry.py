@@ -24,7 +24,7 @@ from hrc_learn.kinematics.collision import link_capsules
 from hrc_learn.kinematics.described_arm import FittedBody, LimitsGiven, arm_from_file
 from hrc_learn.kinematics.description import turn_to
 from hrc_learn.kinematics.franka import fr3, panda
-from hrc_learn.store import read_toml
+from hrc_learn.store import cache_home, read_toml
 
 
 class MissingModelError(ModuleNotFoundError):
@@ -170,8 +170,7 @@ def _description_folders() -> Iterator[Path]:
             yield Path(str(distribution(package).locate_file(place)))
         except PackageNotFoundError:
             continue
-    cache_home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    menagerie = os.environ.get("MENAGERIE_CACHE_DIR") or cache_home / "mujoco_menagerie"
+    menagerie = os.environ.get("MENAGERIE_CACHE_DIR") or cache_home() / "mujoco_menagerie"
     yield Path(os.environ.get("MENAGERIE_ROOT") or Path(menagerie) / "models")
     fetched = os.environ.get("ROBOT_DESCRIPTIONS_CACHE") or "~/.cache/robot_descriptions"
     yield Path(fetched).expanduser()

@@ -36,6 +36,11 @@ DISK_ERRORS = {
 """Errors of a full, read-only, protected or broken disk."""
 
 
+def cache_home() -> Path:
+    """Folder of the user's caches: `XDG_CACHE_HOME`, or `~/.cache`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
 def try_lock(file: TextIO) -> bool:
     """Lock an open file; False if another process holds the lock."""
     try:

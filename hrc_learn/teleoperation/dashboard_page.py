@@ -7,7 +7,6 @@ hands over the files of the viewer once, and the gate serves these.
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.error import URLError
 from urllib.request import urlopen
 
-from hrc_learn.store import new_file
+from hrc_learn.store import cache_home, new_file
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.gate import Visitor, first_of
 from hrc_learn.teleoperation.gate.messages import MessageError
@@ -114,8 +113,7 @@ def _viewer_contents() -> dict[str, Content]:
     """Files of Rerun's web viewer by path, from the cache folder."""
     import rerun
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    folder = cache / "hrc_learn" / f"rerun_viewer_{rerun.__version__}"
+    folder = cache_home() / "hrc_learn" / f"rerun_viewer_{rerun.__version__}"
     if not all((folder / name).is_file() for name in _VIEWER_FILES):
         folder.mkdir(parents=True, exist_ok=True)
         for name, body in _fetched_viewer().items():

@@ -629,7 +629,7 @@ def test_the_report_reads_as_text(root):
     (root / DATA).unlink()
     text = str(check_dataset(root))
     assert text.startswith(f"error: {DATA}, episode 0: not found")
-    assert text.endswith("0 episodes, 0 frames, 1 errors, 0 warnings")
+    assert text.endswith("0 episodes, 0 frames, 1 error, 0 warnings")
 
 
 def test_the_fixture_is_at_the_rate_the_findings_assume(root):

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.issues import DatasetError, counted
 from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.read.columns import MappingSpec
@@ -83,8 +83,9 @@ class RepairReport:
             lines.append(f"{name}: {'; '.join(changes) or 'unchanged'}")
         lines += [f"episode {old}: left out: {why}" for old, why in self.left_out.items()]
         lines.append(
-            f"{self.path}{' (nothing written)' * self.dry_run}: {len(self.changes)} episodes, "
-            f"{self.frames} of {self.frames_before} frames, {self.changed} episodes changed, "
+            f"{self.path}{' (nothing written)' * self.dry_run}: "
+            f"{counted(len(self.changes), 'episode')}, {self.frames} of "
+            f"{counted(self.frames_before, 'frame')}, {self.changed} changed, "
             f"{len(self.left_out)} left out"
         )
         return "\n".join(lines)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import ipaddress
-import os
 import secrets
 import shutil
 import socket
@@ -12,6 +11,8 @@ import ssl
 import subprocess
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from hrc_learn.store import cache_home
 
 _FIRST_PORTS = range(8080, 8180)  # tried in turn where none was asked for
 _VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
@@ -150,8 +151,7 @@ def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
 
 
 def _own_certificate(name: str) -> tuple[Path, Path]:
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    folder = cache / "hrc_learn" / "tls"
+    folder = cache_home() / "hrc_learn" / "tls"
     certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
     openssl = shutil.which("openssl")
     if certificate.is_file() and key.is_file() and (openssl is None or _lasts(certificate)):
