@@ -160,7 +160,7 @@ def dataset_card(
         card = DatasetCard(own.read_text(encoding="utf-8"), ignore_metadata_errors=True)
     else:
         shown = Counter(task for entry in folder.episodes for task in entry.tasks)
-        *findings, _ = report.lines()
+        *findings, counts = report.lines()
         card = DatasetCard.from_template(
             DatasetCardData(),
             template_path=str(_TEMPLATE),
@@ -171,6 +171,7 @@ def dataset_card(
             cameras=[feature for feature in folder.features.values() if feature.is_picture],
             report=report,
             findings=findings,
+            counts=counts.removeprefix(f"{report.path}: "),
             cell=_cell,
         )
     head: Any = card.data
