@@ -1,0 +1,236 @@
+"""An arm of ROS 2 message by message: graph and clock are the test's, not the middleware's."""
+
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from ros2_graph import Graph, stamp
+
+from hrc_learn.hardware import ArmFaultError, Ros2Arm, Ros2Config, ros2_arm
+from hrc_learn.kinematics import panda
+
+NAMES = panda.chain.joint_names
+READY = panda.chain.ready.numpy()
+LIMITS = panda.chain.limits
+COMMANDS, STATES = Ros2Config().command, Ros2Config().joint_states
+
+
+@pytest.fixture
+def guards():
+    return []
+
+
+@pytest.fixture
+def graph(monkeypatch, guards):
+    graph = Graph()
+    monkeypatch.setattr(ros2_arm, "time", graph)
+    monkeypatch.setattr(ros2_arm, "Watchdog", graph.Watchdog)
+    monkeypatch.setattr(ros2_arm, "Ros2Session", lambda name: graph)
+
+    def start_guard(*numbers):
+        guards.append(numbers)
+        end = lambda word: lambda: guards.append(word)  # noqa: E731
+        return SimpleNamespace(kill=end("killed"), wait=end("waited"))
+
+    monkeypatch.setattr(ros2_arm, "start_guard", start_guard)
+    return graph
+
+
+def position_arm(graph, **settings):
+    return Ros2Arm(panda.chain, Ros2Config(interface="position", **settings))
+
+
+def test_a_velocity_controller_has_a_guard_and_ends_at_rest(graph, guards):
+    graph.listeners = 3
+    with Ros2Arm(panda.chain, Ros2Config(timeout=0.2)) as arm:
+        assert guards == [(COMMANDS, 7, pytest.approx(0.3), 3)]
+        arm.command(np.full(7, 0.1))
+    (first, moved), (last, rest) = graph.sent
+    assert first == last == COMMANDS
+    np.testing.assert_array_equal(moved.data, np.full(7, 0.1))
+    np.testing.assert_array_equal(rest.data, np.zeros(7))
+    assert graph.trips == [0.2, "start", "feed", "close"]
+    assert guards[1:] == ["killed", "waited"]
+    assert graph.closed
+
+
+def test_a_position_controller_needs_no_guard(graph, guards):
+    position_arm(graph)
+    assert guards == []
+
+
+def test_the_robot_that_is_silent_and_the_controller_that_is_missing_are_named(graph):
+    graph.listeners, begun = 0, graph.now
+    with pytest.raises(ConnectionError, match=f"no controller listens on {COMMANDS}: is it"):
+        position_arm(graph, startup=3.0)
+    assert graph.now == pytest.approx(begun + 3, abs=0.05)
+    assert graph.closed
+    graph.greeting = []
+    with pytest.raises(ConnectionError, match=r"on /states for 0\.01 s: is its driver running"):
+        position_arm(graph, startup=0.01, joint_states="/states")
+    graph.greeting = [(1.0, READY[:5], (), (*NAMES[:4], "finger"))]
+    missing = "panda_joint5, panda_joint6, panda_joint7 are not among panda_joint1, .*, finger"
+    with pytest.raises(ConnectionError, match=missing):
+        position_arm(graph, startup=0.01)
+
+
+def test_joints_are_found_by_name_and_speeds_measured_where_none_are_sent(graph):
+    arm, rng = position_arm(graph), np.random.default_rng(0)
+    np.testing.assert_array_equal(arm.read().joint_velocity, np.zeros(7))
+    other, speed = READY + rng.normal(size=7), rng.normal(size=7)
+    names = ["finger", *NAMES[::-1]]
+    graph.state(10.1, [0.02, *other[::-1]], [0.5, *speed[::-1]], names)
+    state = arm.read()
+    assert state.time == pytest.approx(10.1)
+    np.testing.assert_array_equal(state.joint_position, other)
+    np.testing.assert_array_equal(state.joint_velocity, speed)
+    for at, velocity in ((10.3, ()), (10.5, [np.nan, *speed[1:]]), (10.7, speed[:6])):
+        before, after = arm.read(), READY + rng.normal(size=7)
+        graph.state(at, after, velocity)
+        slope = (after - before.joint_position) / 0.2
+        np.testing.assert_allclose(arm.read().joint_velocity, slope)
+
+
+def test_states_that_are_old_or_partial_are_not_used_and_a_new_clock_is(graph):
+    arm = position_arm(graph)
+    graph.state(10.5, READY)
+    for at, position, ignored in (
+        (10.5, READY + 1, 1),  # sent again
+        (10.4, READY + 1, 2),
+        (9.6, READY + 1, 3),
+        (10.6, [np.inf, *READY[1:]], 4),
+    ):
+        graph.state(at, position)
+        assert arm.ignored == ignored
+    graph.state(10.7, READY[:6], (), NAMES[:6])  # of another part of the robot
+    assert arm.ignored == 4
+    np.testing.assert_array_equal(arm.read().joint_position, READY)
+    graph.now += 100
+    graph.state(9.4, READY + 1)  # a second back: a clock that was set anew
+    assert arm.ignored == 4
+    assert arm.read().time == pytest.approx(9.4)
+    np.testing.assert_array_equal(arm.read().joint_velocity, np.zeros(7))
+    graph.state(9.9, READY + 2)
+    np.testing.assert_allclose(arm.read().joint_velocity, np.full(7, 2.0))
+
+
+def test_the_age_of_a_state_counts_from_its_stamp_by_the_quickest_message(graph):
+    arm = position_arm(graph)  # 40 s between the clocks
+    graph.now += 1.0
+    graph.state(11.1, READY)  # quicker than the first by 0.1 s
+    assert arm.received == graph.now
+    graph.now += 0.19
+    arm.read()
+    graph.now += 0.02
+    text = r"the newest joint state on /joint_states is 0\.21 s old: the arm is stopped"
+    with pytest.raises(ArmFaultError, match=text):
+        arm.read()
+    with pytest.raises(ArmFaultError, match=text):
+        arm.recover()
+    graph.state(11.12, READY)  # late by 0.19 s
+    arm.read()
+    graph.now += 0.02
+    with pytest.raises(ArmFaultError, match=text):
+        arm.command(np.zeros(7))
+    assert graph.trips.count("feed") == 0
+    np.testing.assert_allclose(graph.sent[-1][1].data, READY)  # it is held there
+
+
+def test_commands_are_integrated_for_their_time_and_led_by_the_measured_arm(graph):
+    arm = position_arm(graph, timeout=0.15, lag=0.1)
+    velocity = 0.5 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0])
+    arm.command(velocity)
+    np.testing.assert_allclose(graph.sent[-1][1].data, READY)
+    for passed, moved in ((0.02, 0.02), (0.03, 0.05), (1.0, 0.2)):  # 0.15 s at most
+        graph.now += passed
+        graph.state(10.0 + graph.now - 50, READY)
+        arm.command(velocity)
+        goal = READY + np.clip(moved * velocity, -0.1, 0.1)
+        np.testing.assert_allclose(graph.sent[-1][1].data, goal)
+    arm.stop()
+    np.testing.assert_allclose(graph.sent[-1][1].data, READY + 0.1 * np.sign(velocity))
+    arm.recover()
+    arm.command(velocity)
+    np.testing.assert_allclose(graph.sent[-1][1].data, READY)
+    with pytest.raises(ValueError, match=r"panda_joint7: 9\.000 rad/s is beyond its limit"):
+        arm.command(np.array([*np.zeros(6), 9.0]))
+
+
+@pytest.mark.parametrize("end", ["lower", "upper"])
+def test_commanded_positions_stay_within_the_limits(graph, end):
+    limit, sign = getattr(LIMITS, end).numpy(), 1.0 if end == "upper" else -1.0
+    graph.greeting = [(10.0, limit - sign * 0.02)]
+    arm = position_arm(graph)
+    for _ in range(3):
+        arm.command(np.full(7, 0.5 * sign))
+        graph.now += 0.06
+    np.testing.assert_allclose(graph.sent[-1][1].data, limit)
+
+
+def test_a_trajectory_goes_on_with_the_velocity_and_ends_at_rest(graph):
+    config = Ros2Config(interface="trajectory", timeout=0.2)
+    arm, velocity = Ros2Arm(panda.chain, config), np.linspace(-0.3, 0.3, 7)
+    for passed, step in ((0.0, 0.2), (0.05, 0.05), (0.0, 1e-3)):
+        graph.now += passed
+        arm.command(velocity)
+        message = graph.sent[-1][1]
+        assert tuple(message.joint_names) == NAMES
+        assert message.header.stamp == stamp(graph.now)
+        ahead, end = message.points
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in (ahead, end)]
+        assert times == pytest.approx([step, step + 0.2])
+        np.testing.assert_allclose(ahead.velocities, velocity)
+        np.testing.assert_array_equal(end.velocities, np.zeros(7))
+        # At constant deceleration to rest the way is half of what the velocity would go.
+        way = np.array(end.positions) - np.array(ahead.positions)
+        np.testing.assert_allclose(way, 0.5 * 0.2 * velocity)
+    np.testing.assert_allclose(ahead.positions, READY + 0.05 * velocity)
+
+
+def test_a_gripper_is_read_from_its_joint_and_led_within_its_travel(graph):
+    hand = {"gripper": "/hand", "gripper_joint": "knuckle", "opening": 0.08}
+    hand |= {"gripper_open": 0.1, "gripper_closed": 0.9}  # it closes as it turns
+    names = (*NAMES, "knuckle")
+    graph.greeting = [(10.0, [*READY, 0.3], (), names)]
+    arm = position_arm(graph, **hand)
+    assert arm.read().gripper_width == pytest.approx(0.06)
+    graph.state(10.1, READY)
+    assert arm.read().gripper_width == pytest.approx(0.06)
+    for width, angle in ((0.02, 0.7), (0.2, 0.1), (-1.0, 0.9)):
+        arm.move(width)
+        topic, message = graph.sent[-1]
+        assert topic == "/hand"
+        assert list(message.data) == pytest.approx([angle])
+    bare = position_arm(graph)
+    bare.move(0.05)
+    assert graph.sent[-1] == (topic, message)
+
+
+def test_a_newer_state_is_waited_for(graph):
+    arm = position_arm(graph)
+    assert not arm.wait(10.0, 0.01)
+    assert arm.wait(9.9, 0.01)
+    came = []
+    waiting = threading.Thread(target=lambda: came.append(arm.wait(10.0, 20.0)))
+    waiting.start()
+    graph.state(10.1, READY)
+    waiting.join(20)
+    assert came == [True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        *(({name: 0.0}, f"{name} must be positive") for name in ("timeout", "lag", "startup")),
+        ({"silence": np.inf}, "silence must be positive"),
+        ({"gripper": "/g"}, "belong together"),
+        ({"gripper_joint": "g"}, "belong together"),
+    ],
+)
+def test_settings_are_checked(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Ros2Config(**settings)

@@ -1,0 +1,359 @@
+"""The controller's node message by message: its arm, its clock and its graph are the test's."""
+
+import threading
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from ros2_graph import READY, Graph, stamp
+from unchecked import shapes_unchecked
+
+from hrc_learn.deploy import EagerRunner
+from hrc_learn.hardware import ArmFaultError, Ros2Config, ros2_node
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState
+
+pytestmark = pytest.mark.simulation
+
+POSE = panda.chain.forward(panda.chain.ready)
+CENTRE, TURN = POSE.position.numpy(), POSE.orientation.numpy()
+DT = 0.02
+PATIENCE = 20.0
+
+
+class Arm:
+    """An arm that does what it is commanded, and lets the node on for one state at a time.
+
+    Attributes:
+        fault: Raised by reading.
+    """
+
+    def __init__(self, clock):
+        self.q, self.velocity, self.time = READY.copy(), np.zeros(7), 100.0
+        self.clock, self.fault, self.ignored, self.received = clock, None, 3, clock.now
+        self.calls, self.commands, self.waits = [], [], threading.Condition()
+        self.waiting = self.new = False
+
+    def read(self):
+        if self.fault is not None:
+            raise self.fault
+        return ArmState(
+            time=self.time,
+            joint_position=self.q.copy(),
+            joint_velocity=self.velocity.copy(),
+            gripper_width=0.0,
+        )
+
+    def wait(self, after, timeout):
+        with self.waits:
+            self.waiting = True
+            self.waits.notify_all()
+            self.waits.wait_for(lambda: self.new, 0.05)
+            self.waiting, self.new = not self.new, False
+
+    def turn(self, dt=DT):
+        """Let the node answer a state that is newer by so much [s]."""
+        with self.waits:
+            assert self.waits.wait_for(lambda: self.waiting, PATIENCE)
+            self.q, self.time = self.q + dt * self.velocity, self.time + dt
+            self.clock.now += dt
+            self.received = self.clock.now - 2e-3
+            self.new, self.waiting = True, False
+            self.waits.notify_all()
+            self.waits.wait_for(lambda: self.waiting or "stop" in self.calls, PATIENCE)
+
+    def command(self, velocity):
+        self.velocity = np.array(velocity)
+        self.commands.append(self.velocity)
+
+    def stop(self):
+        with self.waits:
+            self.velocity = np.zeros(7)
+            self.calls.append("stop")
+            self.waits.notify_all()
+
+    def recover(self):
+        self.calls.append("recover")
+
+    def close(self):
+        self.calls.append("close")
+
+
+@pytest.fixture
+def graph():
+    return Graph()
+
+
+@pytest.fixture
+def arm(graph):
+    return Arm(graph)
+
+
+@pytest.fixture
+def node(graph, arm, monkeypatch):
+    monkeypatch.setattr(ros2_node, "Ros2Session", lambda name, make: graph)
+    monkeypatch.setattr(ros2_node, "Ros2Arm", lambda chain, config: arm)
+    monkeypatch.setattr(ros2_node, "time", graph)
+    runners = []
+
+    def make(controller, observation):
+        runners.append(EagerRunner(controller, observation))
+        return runners[-1]
+
+    with shapes_unchecked():
+        node = ros2_node.ControllerNode(panda.chain, Ros2Config(silence=0.2), None, make)
+        node.runners = runners
+        yield node
+        node.close()
+
+
+@pytest.fixture
+def values(node):
+    """What the step observes, of a node that is active."""
+    assert node.start()
+    return node.runners[-1].observation
+
+
+def xyz(values):
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def goal_at(position, turn=TURN, frame="base_link"):
+    from geometry_msgs.msg import Point, PoseStamped, Quaternion
+
+    message = PoseStamped()
+    message.header.frame_id = frame
+    message.pose.position = Point(**xyz(position))
+    w, x, y, z = map(float, turn)
+    message.pose.orientation = Quaternion(w=w, x=x, y=y, z=z)
+    return message
+
+
+def marked(x, y, at=0.0):
+    from geometry_msgs.msg import Point, PointStamped
+
+    message = PointStamped(point=Point(x=x, y=y, z=0.0))
+    message.header.stamp = stamp(at)
+    return message
+
+
+def sent(graph, topic):
+    return [message for name, message in graph.sent if name == topic]
+
+
+def test_the_tool_goes_to_the_box_of_a_goal_within_the_caps_that_are_parameters(
+    graph, arm, node
+):
+    graph.parameters["region_size"].value = 0.01
+    graph.parameters["linear_speed"].value = 0.08
+    assert node.start()
+    assert arm.calls == ["recover"]
+    for _ in range(3):
+        arm.turn()
+    np.testing.assert_allclose(arm.q, READY, atol=1e-4)  # it holds the tool where it was
+    goal = CENTRE + np.array([0.04, -0.05, 0.03])
+    graph.takers["~/goal"](goal_at(goal, 2 * TURN))
+    tool = [CENTRE]
+    for _ in range(70):
+        arm.turn()
+        tool.append(panda.chain.forward(arm.q).position.numpy())
+    assert np.abs(tool[-1] - goal).max() < 0.011
+    speed = np.linalg.norm(np.diff(tool, axis=0), axis=1) / DT
+    assert 0.05 < speed.max() < 0.085
+    turned = panda.chain.forward(arm.q).orientation.numpy()
+    assert abs(turned @ TURN) > 0.999
+    assert len(arm.commands) == 73
+    figures = node.figures()
+    assert figures["commands"] == 73
+    assert figures["safety_invalid"] == 0
+    # The clock of the machine stands still while the step is computed.
+    assert figures["latency_p50_ms"] == pytest.approx(2.0)
+    box, path = sent(graph, "~/markers")[-1].markers
+    assert (box.header.frame_id, box.ns, path.ns) == ("base_link", "hrc_learn", "hrc_learn")
+    assert (box.scale.x, box.scale.y, box.scale.z) == (0.02, 0.02, 0.02)
+    at = box.pose.position
+    np.testing.assert_allclose([at.x, at.y, at.z], goal)
+    assert box.type == box.CUBE
+    assert path.type == path.LINE_STRIP
+    assert box.id != path.id
+    assert box.color.b > box.color.r
+    assert path.color.r > path.color.b
+    assert 0 < box.color.a < path.color.a == 1
+    shown = len(sent(graph, "~/markers"))
+    assert 12 <= shown <= 15  # one in 0.1 s of 1.46 s
+    assert len(path.points) == shown
+    np.testing.assert_allclose(
+        [path.points[-1].x, path.points[-1].y, path.points[-1].z], tool[-1], atol=0.01
+    )
+    last = sent(graph, "/diagnostics")[-1].status[0]
+    assert len(sent(graph, "/diagnostics")) == 2  # at once, and after a second
+    assert (last.level, last.message) == (b"\0", "active")
+    rows = {row.key: row.value for row in last.values}
+    assert rows["ignored_states"] == "3"
+    assert rows["latency_p99_ms"] == "2"
+
+
+def test_goals_and_regions_that_make_no_sense_change_nothing(graph, node, values):
+    from visualization_msgs.msg import Marker
+
+    box = lambda: (  # noqa: E731
+        *values["goals.position.centre"],
+        *values["goals.position.half_size"],
+        *values["goals.orientation.goal"],
+    )
+    held = box()
+    np.testing.assert_allclose(held, (*CENTRE, 0.02, 0.02, 0.02, *TURN), atol=1e-12)
+    wrong = [
+        goal_at(CENTRE + 1, frame="camera"),
+        goal_at([np.nan, 0, 0]),
+        goal_at([0, 0, 0], [0, 0, 0, 0]),
+        goal_at([0, 0, 0], [np.nan, 0, 0, 0]),
+    ]
+    for message in wrong:
+        graph.takers["~/goal"](message)
+        assert box() == held
+    assert graph.log[0] == "a goal in frame camera is refused: give it in base_link"
+    assert graph.log[1:] == ["a goal with NaN or without orientation is refused"] * 3
+    region = Marker()
+    region.pose.position = goal_at([0.4, 0.1, 0.5]).pose.position
+    for edges in ([0.1, 0.0, 0.1], [0.1, 0.2, -0.1], [np.nan, 0.1, 0.1]):
+        region.scale.x, region.scale.y, region.scale.z = edges
+        graph.takers["~/region"](region)
+        assert box() == held
+    region.scale.x, region.scale.y, region.scale.z = 0.1, 0.2, 0.3
+    graph.takers["~/region"](region)
+    np.testing.assert_allclose(box(), (0.4, 0.1, 0.5, 0.05, 0.1, 0.15, *TURN), atol=1e-12)
+    graph.takers["~/goal"](goal_at([0.3, 0.2, 0.6], [0, 0, 3, 0], frame=""))
+    np.testing.assert_allclose(box(), (0.3, 0.2, 0.6, 0.05, 0.1, 0.15, 0, 0, 1, 0), atol=1e-12)
+
+
+def test_a_feature_is_paired_with_the_posture_of_its_image(graph, arm, node, values):
+    graph.takers["~/goal"](goal_at(CENTRE + 0.05))
+    postures = {}
+    for _ in range(10):
+        arm.turn()
+        postures[round(arm.time, 3)] = arm.q
+    for at, age in ((100.0 + 7 * DT + 0.003, 3 * DT), (0.0, 0.0), (arm.time + 5, 0.0)):
+        graph.takers["~/feature"](marked(310.0, 220.0, at))
+        assert values["feature_visible"] == values["feature_new"] == 1
+        np.testing.assert_array_equal(values["feature"], [310.0, 220.0])
+        assert values["feature_age"] == pytest.approx(age)
+        posture = postures[round(arm.time - age, 3)]
+        np.testing.assert_array_equal(values["image_joint_position"], posture)
+    graph.takers["~/feature"](marked(np.nan, 220.0))
+    assert values["feature_visible"] == values["feature_new"] == 0
+    np.testing.assert_array_equal(values["feature"], [310.0, 220.0])
+    graph.takers["~/feature"](marked(310.0, 220.0))
+    arm.turn()
+    assert values["feature_new"] == 0  # it counts once
+    assert values["feature_visible"] == 1
+
+
+def test_a_target_switches_vision_on_and_none_off_and_pushes_have_their_size(
+    graph, node, values
+):
+    from std_msgs.msg import Float64MultiArray
+
+    assert values["goals.vision_enabled"] == 0
+    for x, enabled in ((320.0, 1), (np.nan, 0), (np.inf, 0)):
+        graph.takers["~/target"](marked(x, 240.0))
+        assert values["goals.vision_enabled"] == enabled
+        np.testing.assert_array_equal(values["goals.vision.target"], [x, 240.0])
+    push = np.arange(7.0)
+    graph.takers["~/push"](Float64MultiArray(data=push.tolist()))
+    graph.takers["~/push"](Float64MultiArray(data=[9.0] * 6))
+    np.testing.assert_array_equal(values["nullspace_input"], push)
+
+
+@pytest.mark.parametrize("marker", [7.0, -1.0])
+def test_a_marker_in_an_image_is_the_feature_if_one_is_looked_for(graph, arm, node, marker):
+    import cv2
+    from sensor_msgs.msg import CompressedImage
+
+    graph.parameters["marker"].value = marker
+    assert node.start()
+    values = node.runners[-1].observation
+    arm.turn()
+    drawn = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    for number, seen in ((7, True), (8, False)):
+        image = np.full((240, 320), 255, np.uint8)
+        image[100:180, 150:230] = cv2.aruco.generateImageMarker(drawn, number, 80)
+        data = cv2.imencode(".png", image)[1].tobytes()
+        graph.takers["~/image/compressed"](CompressedImage(format="png", data=data))
+        assert values["feature_visible"] == (seen and marker >= 0)
+    if marker >= 0:
+        np.testing.assert_allclose(values["feature"], [189.5, 139.5], atol=0.6)
+
+
+def test_steps_follow_the_clock_of_the_robot_within_bounds(arm, node, values):
+    for dt, taken in ((DT, None), (0.03, 0.03), (2e-4, 1e-3), (0.9, 0.2)):
+        arm.turn(dt)
+        if taken is not None:
+            assert values["dt"] == pytest.approx(taken)
+    commands = len(arm.commands)
+    arm.turn(0.0)  # no newer state
+    assert len(arm.commands) == commands
+
+
+@pytest.mark.parametrize("reason", ["silence", "heartbeat", "crash"])
+def test_whatever_goes_wrong_brings_the_arm_to_rest_and_is_told(graph, arm, node, reason):
+    graph.parameters["heartbeat"].value = 0.31 if reason == "heartbeat" else 0.0
+    assert node.start()
+    for _ in range(20):
+        arm.turn()
+        if reason == "heartbeat":
+            graph.takers["~/heartbeat"](None)
+    assert node.stopped == ""
+    text = {
+        "silence": "the newest joint state is old",
+        "heartbeat": r"no heartbeat for 0.32 s: send ~/heartbeat",
+        "crash": "a bug",
+    }[reason]
+    if reason == "heartbeat":
+        for _ in range(16):
+            arm.turn()
+    else:
+        arm.fault = (ArmFaultError if reason == "silence" else RuntimeError)(text)
+    for _ in range(2000):
+        if arm.calls.count("stop") >= 2:  # by the loop, and by the stage
+            break
+        threading.Event().wait(0.01)
+    assert node.stopped == text
+    assert arm.calls[:3] == ["recover", "stop", "stop"]
+    assert f"deactivated: {text}" in graph.log
+    status = sent(graph, "/diagnostics")[-1].status[0]
+    assert (status.level, status.message) == (b"\2", text)
+    arm.fault = None
+    arm.calls.clear()
+    assert graph.trigger_activate() is not None
+    assert node.stopped == ""
+    before = len(arm.commands)
+    arm.turn()
+    assert len(arm.commands) == before + 1
+
+
+def test_a_stage_that_fails_says_why(graph, arm, node):
+    arm.recover = lambda: (_ for _ in ()).throw(ArmFaultError("no joint states"))
+    assert not node.start()
+    assert graph.log == ["no joint states"]
+    assert np.isnan(node.figures()["latency_p50_ms"])
+    graph.trigger_deactivate()
+    assert arm.calls == ["stop"]
+    node.close()
+    assert arm.calls == ["stop", "stop", "close"]
+    assert graph.closed
+
+
+def test_parameters_are_described_with_their_range(graph, node):
+    from hrc_learn.hardware.ros2_node import PARAMETERS
+
+    assert graph.parameters.keys() == PARAMETERS.keys()
+    for name, (value, low, high, text) in PARAMETERS.items():
+        assert low <= value <= high
+        assert graph.parameters[name].value == value
+        form = graph.forms[name]
+        assert form.description == text
+        (bounds,) = form.floating_point_range
+        assert (bounds.from_value, bounds.to_value) == (low, high)
