@@ -220,10 +220,10 @@ class Claim:
         path = self.workspace / _LOCK
         while True:
             _require_ours(self.workspace)
-            self.workspace.mkdir(exist_ok=True)
             try:
+                self.workspace.mkdir(exist_ok=True)
                 file = path.open("a+", encoding="utf-8")
-            except FileNotFoundError:
+            except (FileExistsError, FileNotFoundError):
                 continue  # the last writer has just removed the workspace
             try:
                 if not disk.try_lock(file):
@@ -261,7 +261,7 @@ def _require_ours(workspace: Path) -> None:
     try:
         names = {place.name for place in workspace.iterdir()}
     except FileNotFoundError:
-        return
+        names = {"?"} if workspace.is_symlink() else set()
     except NotADirectoryError:
         names = {"?"}
     # Checked again: another process may just have removed its lock and the workspace.
@@ -294,7 +294,7 @@ def recover(path: str | os.PathLike[str]) -> list[str]:
 def settle(path: str | os.PathLike[str]) -> None:
     """Complete an interrupted replacement that left nothing at `path`, before it is read."""
     place = resolved(path)
-    while not place.exists() and place != place.parent:
+    while not place.exists():
         if _is_interrupted(place):
             # Without write access, or while it is being written, nothing is there to read.
             with contextlib.suppress(OSError):

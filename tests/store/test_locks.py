@@ -2,6 +2,7 @@
 
 import errno
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -129,10 +130,77 @@ def test_claims_that_wait_come_one_after_another(tmp_path):
     assert contents(tmp_path) == {"number": "30"}
 
 
-def test_a_folder_that_is_no_workspace_of_ours_is_left_alone(tmp_path):
-    (tmp_path / ".out.writing").mkdir()
-    (tmp_path / ".out.writing" / "thesis.tex").write_text("years")
+@pytest.mark.parametrize("name", [".out.writing/thesis.tex", ".out.writing"])
+def test_a_folder_that_is_no_workspace_of_ours_is_left_alone(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("years")
     with pytest.raises(FileExistsError, match="move it elsewhere"):
         fill(tmp_path / "out", "new")
     assert recover(tmp_path) == []
-    assert contents(tmp_path) == {".out.writing/thesis.tex": "years"}
+    assert contents(tmp_path) == {name: "years"}
+    (tmp_path / ".link.writing").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(FileExistsError, match="move it elsewhere"):
+        fill(tmp_path / "link", "new")
+
+
+@pytest.mark.parametrize(
+    ("signed", "said"),
+    [("", "another process"), ("12 far\n", "process 12 on far"), ("12 {here}\n", "process 12")],
+)
+def test_the_writer_in_the_way_is_named_with_its_host(tmp_path, signed, said):
+    """Also a writer that has locked the file and not signed it yet."""
+    with Claim(tmp_path / "out") as claim:
+        lock = claim.workspace / "lock"
+        lock.write_text(signed.format(here=socket.gethostname()))
+        with pytest.raises(BusyError, match=f"written by {said}: wait until that ends"):
+            Claim(tmp_path / "out")
+        lock.unlink()  # by hand, as a lock left over
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("gone", ["after a look", "before the lock", "with the lock"])
+def test_a_writer_that_comes_while_another_ends_takes_the_next_lock(
+    tmp_path, monkeypatch, gone
+):
+    """The other one removes the workspace at any moment in between."""
+    opened, path_open, mkdir = [], Path.open, os.mkdir
+
+    def look(path, *arguments):
+        mkdir(path, *arguments)
+        if gone == "after a look" and not opened:
+            opened.append(path)
+            os.rmdir(path)
+            raise FileExistsError(errno.EEXIST, "there", str(path))
+
+    def race(path, *arguments, **options):
+        if path.name == "lock" and not opened:
+            opened.append(path)
+            if gone == "before the lock":
+                path.parent.rmdir()
+            else:
+                file = path_open(path, *arguments, **options)
+                path.unlink()
+                return file
+        return path_open(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "mkdir", look)
+    monkeypatch.setattr(Path, "open", race)
+    with Claim(tmp_path / "out") as claim:
+        assert (claim.workspace / "lock").read_text().startswith(f"{os.getpid()} ")
+        with pytest.raises(BusyError):
+            Claim(tmp_path / "out")
+    assert opened
+
+
+def test_a_claim_that_cannot_be_prepared_holds_no_lock(tmp_path, monkeypatch):
+    """A full disk, for example, refuses the signature."""
+
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", refuse)
+        with pytest.raises(OSError, match="No space.*out"):
+            Claim(tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+    Claim(tmp_path / "out").release()

@@ -167,6 +167,21 @@ def test_everything_is_on_disk_before_it_takes_its_name(tmp_path, monkeypatch):
     assert names <= set(done[here:])
 
 
+def test_a_folder_inside_another_one_reaches_the_disk_with_it(tmp_path, monkeypatch):
+    synced = []
+    with store.new_folder(tmp_path / "out", {}) as folder:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", synced.append)
+            fill(folder / "inner", "once")
+        assert not synced
+    assert (tmp_path / "out" / "inner" / "result").read_text() == "once"
+
+
+def test_nothing_is_recovered_where_nothing_was_interrupted(tmp_path):
+    assert recover(tmp_path / "missing" / "out") == []
+    assert not list(tmp_path.iterdir())
+
+
 LOOP = """
 import sys
 sys.path.insert(0, sys.argv[2])

@@ -1,7 +1,9 @@
 """Files and folders are whole or not there at all, whatever happens to their writer."""
 
+import errno
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +53,8 @@ def test_a_file_replaces_no_folder(tmp_path):
 def test_the_folder_of_a_file_must_exist(tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no folder"):
         Claim(tmp_path / "missing" / "file")
+    with pytest.raises(FileExistsError, match="/ cannot be written: name a file"):
+        Claim("/")
 
 
 def test_a_device_is_written_to_and_not_replaced():
@@ -60,14 +64,14 @@ def test_a_device_is_written_to_and_not_replaced():
 
 
 def test_a_folder_appears_only_when_it_is_complete(tmp_path):
-    with replacing(tmp_path / "deep" / "out", KIND) as folder:
+    with replacing(tmp_path / "far" / "deep" / "out", KIND) as folder:
         assert not folder.exists()
         folder.mkdir()
         (folder / "result").write_text("new")
-        assert not (tmp_path / "deep" / "out").exists()
+        assert not (tmp_path / "far" / "deep" / "out").exists()
         # A rename is one step only within one file system.
-        assert folder.is_relative_to(tmp_path / "deep")
-    assert contents(tmp_path) == {"deep/out/result": "new"}
+        assert folder.is_relative_to(tmp_path / "far" / "deep")
+    assert contents(tmp_path) == {"far/deep/out/result": "new"}
 
 
 @pytest.mark.parametrize("error", [WorkFailedError, KeyboardInterrupt, SystemExit])
@@ -88,6 +92,36 @@ def test_work_that_made_nothing_leaves_the_old_folder(tmp_path):
     with pytest.raises(FileNotFoundError), replacing(tmp_path / "out", KIND, overwrite=True):
         pass
     assert contents(tmp_path) == cake("old")
+
+
+@pytest.mark.parametrize("before", [None, "old"])
+@pytest.mark.parametrize("taken", [False, True])
+def test_a_folder_that_cannot_take_its_name_leaves_what_was_there(
+    tmp_path, monkeypatch, before, taken
+):
+    """And if others took the name between the renames, both contents are kept aside."""
+    out, rename = tmp_path / "out", os.rename
+    if before is not None:
+        fill(out, before)
+    expected = contents(tmp_path)
+
+    def refuse(source, target):
+        if Path(source).name == "new" and Path(target) == out:
+            if taken:
+                out.mkdir()
+                (out / "thesis.tex").write_text("years")
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(target))
+        rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", refuse)
+        with pytest.raises(PermissionError):
+            fill(out, "new", overwrite=True)
+    if taken:
+        expected = {"out/thesis.tex": "years"}
+        if before is not None:
+            expected |= cake("old", "out.kept") | cake("new", "out.new")
+    assert contents(tmp_path) == expected
 
 
 def test_our_own_folder_is_overwritten_on_request(tmp_path):
@@ -142,6 +176,8 @@ def test_a_folder_remembers_the_identifier_of_its_source(tmp_path):
 def test_results_replace_older_results_only(tmp_path):
     out = tmp_path / "out"
     with new_folder(out, {"seed": 1}):
+        pass
+    with pytest.raises(FileExistsError, match="out exists"), new_folder(out, {"seed": 2}):
         pass
     with new_folder(out, {"seed": 2}, overwrite=True):
         pass
