@@ -134,7 +134,7 @@ def stamps(
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
         text = (
             f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
-            f"{fps:g}; hrc repair --fps {round(1 / usual)} resamples to the true rate"
+            f"{fps:g}; hrc repair --fps {1 / usual:.3g} resamples to the true rate"
         )
         yield entry.warning(text, key=key)
     gaps = np.flatnonzero(steps > _GAP * usual)
@@ -232,7 +232,7 @@ def spikes_and_jumps(
             name = demo.joint_names[joint]
             text = (
                 f"{name} {what} by {steps[frame, joint]:.3g}, "
-                f"{size[frame, joint]:.0f} times its usual fast step; "
+                f"{size[frame, joint]:.3g} times its usual fast step; "
                 f"{int(odd.any(1).sum())} such frames in the episode"
             )
             key, worst = f"{role} ({name})", float(size.max())

@@ -395,9 +395,10 @@ def _contradictions(
     for (entry, _), ratio in zip(known, ratios.tolist(), strict=True):
         if abs(abs(ratio) - _DEGREES) < _NEAR:
             seems = "deg" if ratio > 0 else "rad"
+            mixed = f"{seems} among {decision.unit}" if seems != decision.unit else "converted twice"
             yield entry.error(
                 f"{role} is about {math.exp(abs(ratio)):.0f} times as "
-                f"{'large' if seems == 'deg' else 'small'} as in the other episodes: {seems} "
-                f"among {decision.unit}? Leave the episode out, or record it again",
+                f"{'large' if seems == 'deg' else 'small'} as in the other episodes: {mixed}? "
+                f"Leave the episode out, or record it again",
                 key=selection.column_name(int(np.flatnonzero(moving)[0])),
             )
