@@ -200,7 +200,7 @@ def test_a_claim_that_cannot_be_prepared_holds_no_lock(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", refuse)
-        with pytest.raises(OSError, match="No space.*out"):
+        with pytest.raises(OSError, match=r"No space.*out"):
             Claim(tmp_path / "out")
     assert not list(tmp_path.iterdir())
     Claim(tmp_path / "out").release()
