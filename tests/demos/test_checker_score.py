@@ -57,7 +57,7 @@ def test_a_sound_set_has_no_errors(clean):
 
 
 def test_every_defect_is_found_with_level_place_and_figures(clean, name, tmp_path):
-    """Each kind in one of the sets; tools/score_checker.py tests all in all, on real sets too."""
+    """Each kind in one of the sets; tools/score_checker.py tests all in each, and real sets."""
     done = list(outcomes(clean, "set", FINDINGS[name], tmp_path, check_here))
     assert_found(done)
     assert len(done) == len(FINDINGS[name])

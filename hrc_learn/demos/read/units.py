@@ -395,7 +395,8 @@ def _contradictions(
     for (entry, _), ratio in zip(known, ratios.tolist(), strict=True):
         if abs(abs(ratio) - _DEGREES) < _NEAR:
             seems = "deg" if ratio > 0 else "rad"
-            mixed = f"{seems} among {decision.unit}" if seems != decision.unit else "converted twice"
+            twice = seems == decision.unit
+            mixed = "converted twice" if twice else f"{seems} among {decision.unit}"
             yield entry.error(
                 f"{role} is about {math.exp(abs(ratio)):.0f} times as "
                 f"{'large' if seems == 'deg' else 'small'} as in the other episodes: {mixed}? "
