@@ -89,7 +89,7 @@ def test_adaptation_finds_a_camera_turned_upside_down():
                 generator=sampling.generator(7),
             ),
             near_starts(30, rng=sampling.generator(8)),
-            steps=350,
+            steps=250,
             dt=0.02,
         )
         error = (camera.project(panda.forward(q))[0] - target).norm(dim=-1)
@@ -258,7 +258,7 @@ def off_its_way(rng: torch.Generator, **options) -> tuple[Tensor, Tensor]:
     controller = AdaptiveController(panda, FixedEstimator(network(J)), goals, config=config)
     state = controller.initial_state(q)
     off = fastest = torch.zeros(n, dtype=DOUBLE)
-    for _ in range(400):
+    for _ in range(250):
         unseen = torch.zeros(n, dtype=torch.bool)
         command, state = controller.step(state, observe(q, dt=dt, feature_visible=unseen))
         v, asked = command.joint_velocity, command.twist
@@ -319,10 +319,10 @@ def test_the_null_space_goes_back_to_rest_and_the_tool_stays(rests):
     state, unseen = controller.initial_state(q), torch.tensor(False)
     away, fastest = [(q - rest).norm()], torch.zeros((), dtype=DOUBLE)
     assert away[0] > 0.5
-    for _ in range(500 if rests else 100):
-        command, state = controller.step(state, observe(q, dt=0.01, feature_visible=unseen))
+    for _ in range(250 if rests else 50):
+        command, state = controller.step(state, observe(q, dt=0.02, feature_visible=unseen))
         fastest = torch.maximum(fastest, command.joint_velocity.norm())
-        q = q + 0.01 * command.joint_velocity
+        q = q + 0.02 * command.joint_velocity
         away.append((q - rest).norm())
     off = (panda.forward(q).position - pose.position).norm()
     assert off < 2e-3

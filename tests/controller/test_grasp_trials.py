@@ -2,19 +2,20 @@
 
 from dataclasses import replace
 
+import pytest
 from closed_loop import Imperfections
 from disturbance_trials import EffortConfig, run_effort_trials
 from grasp_trials import TrialConfig, run_trials
-from unchecked import shapes_unchecked
 
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
+
+pytestmark = pytest.mark.simulation
 
 QUICK = TrialConfig(
     count=20, duration=6.0, dt=0.02, imperfections=Imperfections(frame_steps=2, noise=0.5)
 )
 
 
-@shapes_unchecked()  # for speed
 def test_adaptation_succeeds_where_the_fixed_jacobian_cannot():
     adaptive = run_trials(KalmanEstimator, QUICK)
     fixed = run_trials(FixedEstimator, replace(QUICK, duration=4.0))
@@ -26,7 +27,6 @@ def test_adaptation_succeeds_where_the_fixed_jacobian_cannot():
     assert (adaptive.vision_time[adaptive.success] <= adaptive.time[adaptive.success]).all()
 
 
-@shapes_unchecked()  # for speed
 def test_a_pull_moves_the_elbow_far_and_the_tool_hardly():
     config = EffortConfig(count=6, force=12.0, dt=0.01, away=1.5, back=0.5)
     summary = run_effort_trials(config).summary()

@@ -342,6 +342,9 @@ def test_joints_off_their_path_are_pushed_and_return(name):
     kept = [float(limitation.kept) for limitation in wanted.limitations]
     bound = case.get("narrow", False) and not aside
     assert kept[0] == (0.0 if bound else 1.0)  # narrow_path
+    assert kept[1:3] == [1.0, 1.0]  # nothing is too far
+    # A return against the push leaves nothing of it.
+    assert kept[3] == pytest.approx(0.0 if name == "pushed while it waits" else 1.0)
     assert bool(wanted.limitations[3].mentioned) == (case.get("rate", 1.0) <= 0)
     if not aside:
         torch.testing.assert_close(wanted.joint_velocity, GAIN * (Q - q))

@@ -149,7 +149,7 @@ def fr3_step() -> tuple[AdaptiveController, Observation]:
 
 
 def test_the_controllers_step_brakes_before_an_fr3s_limits():
-    assert push_outwards(EagerRunner(*fr3_step()), 700) > 20
+    assert push_outwards(EagerRunner(*fr3_step()), 350) > 20
 
 
 @pytest.mark.slow

@@ -171,7 +171,7 @@ def test_an_arm_of_five_joints_servoes(five, task):
         camera=camera, imperfections=Imperfections(frame_steps=2, noise=0.5), generator=rng
     )
     with torch.inference_mode(), shapes_unchecked():
-        q = simulate_closed_loop(controller, eye, start, steps=350, dt=0.02)
+        q = simulate_closed_loop(controller, eye, start, steps=250, dt=0.02)
     tool = chain.forward(q)
     assert (camera.project(tool)[0] - target).norm(dim=-1).max() < 5
     box = goals.position.half_size

@@ -8,7 +8,6 @@ import torch
 from closed_loop import Imperfections
 from grasp_trials import CORNERS, TrialConfig, run_trials
 from pinhole_camera import PinholeCamera
-from unchecked import shapes_unchecked
 
 from hrc_learn.controller.resolved_rate import VisionBlending
 from hrc_learn.geometry import Pose
@@ -113,6 +112,7 @@ def test_a_feature_is_seen_where_all_of_its_points_are():
     assert state.feature[1].tolist() == [719.5, 539.5] * 2
 
 
+@pytest.mark.simulation
 def test_corners_are_brought_to_their_targets():
     """Their mean within 5 px from any camera, though the first guess knows one point only."""
     config = TrialConfig(
@@ -122,7 +122,6 @@ def test_corners_are_brought_to_their_targets():
         imperfections=Imperfections(frame_steps=2, noise=0.5),
         feature="corners",
     )
-    with shapes_unchecked():
-        result = run_trials(KalmanEstimator, config)
+    result = run_trials(KalmanEstimator, config)
     assert result.success.double().mean() >= 0.9
     assert not result.violations.any()

@@ -50,10 +50,10 @@ def test_the_exported_step_equals_the_eager_one(tmp_path):
     rng, q = np.random.default_rng(0), READY.copy()
     for runner in runners:
         runner.start(q)
-    for k in range(400):
-        if k % 40 == 0:
+    for k in range(200):
+        if k % 20 == 0:
             wanted, stop = rng.normal(size=7) * 3, rng.random() < 0.2
-        if k % 97 == 0:
+        if k % 47 == 0:
             velocity = rng.normal(size=7) * 0.1
             for runner in runners:
                 runner.state["safety.velocity"][:] = velocity

@@ -228,9 +228,8 @@ def test_a_marker_never_seen_is_said(demonstrations):
 def test_placements_tell_episodes_of_a_moved_camera_apart():
     rng = np.random.default_rng(10)
     knocked = moved(np.deg2rad([0.3, -0.4, 0.0]), np.array([0.004, 0.0, 0.0]))
-    demos = [demonstration(rng) for _ in range(6)]
-    demos += [demonstration(rng, knocked) for _ in range(4)]
-    demos += [demonstration(rng) for _ in range(2)]
+    places = 6 * [(ROTATION, SHIFT)] + 4 * [knocked] + 2 * [(ROTATION, SHIFT)]
+    demos = [demonstration(rng, place, frames=80) for place in places]
     first, second = camera_placements(demos, IMAGE)
     assert first.episodes == (0, 1, 2, 3, 4, 5, 10, 11)
     assert second.episodes == (6, 7, 8, 9)

@@ -174,6 +174,7 @@ def test_a_camera_comes_first_and_the_network_learns_the_rest(number, bound):
     np.testing.assert_allclose(eye_of(found.camera), EYE, atol=0.05)
 
 
+@pytest.mark.simulation
 def test_the_covariance_is_honest():
     """Deviations of fits to noise of other seeds, in standard deviations of each."""
     scores = []

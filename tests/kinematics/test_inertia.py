@@ -95,11 +95,11 @@ def test_masses_without_inertia_are_spread_over_the_capsules(tmp_path):
     bare = tmp_path / "bare.urdf"
     bare.write_text(
         '<robot name="bare"><link name="base"/><link name="rod"><inertial><mass value="3"/>'
-        '</inertial><collision><origin xyz="0 0 0.5"/><geometry><cylinder radius="0.001" '
+        '</inertial><collision><origin xyz="0 0 0.7"/><geometry><cylinder radius="0.001" '
         'length="1"/></geometry></collision></link><joint name="j" type="revolute">'
         '<parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>'
         '<limit lower="-1" upper="1" effort="10" velocity="1"/></joint></robot>'
     )
-    # A thin rod of 1 m and 3 kg about its end: m l^2/3.
+    # A thin rod of 1 m and 3 kg, its middle 0.7 m from the axis: m (l^2/12 + 0.7^2).
     M = MassMatrix(arm(bare))(torch.zeros(2, 1, dtype=torch.float64))
-    assert M.flatten().tolist() == pytest.approx([1.0, 1.0], rel=0.02)
+    assert M.flatten().tolist() == pytest.approx(2 * [3 * (1 / 12 + 0.49)], rel=0.02)
