@@ -1,5 +1,7 @@
 """Merged datasets: columns by name, units and tasks of the first, videos as they were."""
 
+import json
+
 import numpy as np
 import pytest
 from clean_sets import CAMERA, write_video
@@ -16,6 +18,7 @@ from hrc_learn.demos import (
 
 STATE, ACTION = "observation.state", "action"
 NAMES = ["shoulder.pos", "elbow.pos", "wrist.pos"]
+HOBBY = ["shoulder_pan.pos", "elbow_flex.pos", "wrist_roll.pos"]
 
 
 def write(root, motion, names=NAMES, **options):
@@ -72,6 +75,68 @@ def test_components_and_features_that_one_lacks(tmp_path):
     report = merge_datasets([tmp_path / "c", tmp_path / "a"], tmp_path / "new")
     assert any(note.startswith("observation.x: left out") for note in report.notes)
     assert "observation.x" not in read_info(tmp_path / "new")["features"]
+
+
+def sidecar(root, **units):
+    (root / "meta/hrc_learn.json").write_text(json.dumps({"format": 1, "units": units}))
+
+
+def in_between(root):
+    """Values of a hobby arm that may be degrees or fractions of the range."""
+    swing = np.sin(np.linspace(0, 6, 60))[:, None] * [95, 90, 80]
+    write(root, [swing], HOBBY)
+
+
+@pytest.mark.parametrize(
+    ("other", "fault"),
+    [
+        (
+            lambda r: write_folder(r, [{STATE: joint_path(60)}], {STATE: HOBBY}),
+            "has no action, as the others have",
+        ),
+        (
+            lambda r: write(
+                r, [*(joint_path(60, seed=k) for k in range(3)), 57.3 * joint_path(60)], HOBBY
+            ),
+            "deg among rad",
+        ),
+        (
+            in_between,
+            r"hrc check .*/b --units joint_position UNIT --keep-contract` declares it",
+        ),
+        (
+            lambda r: (write(r, [joint_path(60)], HOBBY), sidecar(r, joint_position="%")),
+            "joint_position in %, but joint_position in rad in .*/a: one does not follow",
+        ),
+        (
+            lambda r: write(r, [joint_path(60)], [HOBBY[0], HOBBY[0], HOBBY[2]]),
+            "one to one|no component",
+        ),
+    ],
+)
+def test_what_does_not_fit_the_first_is_refused(tmp_path, other, fault):
+    write(tmp_path / "a", [joint_path(60)], HOBBY)
+    other(tmp_path / "b")
+    with pytest.raises(DatasetError, match=fault):
+        merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_one_dataset_is_nothing_to_merge(tmp_path):
+    write(tmp_path / "a", [joint_path(60)])
+    with pytest.raises(ValueError, match="two datasets or more"):
+        merge_datasets([tmp_path / "a"], tmp_path / "new")
+
+
+def test_other_robots_and_columns_without_names_are_noted(tmp_path):
+    write(tmp_path / "a", [joint_path(60)])
+    write(tmp_path / "b", [joint_path(60)], None)
+    write_info(tmp_path / "b", read_info(tmp_path / "b") | {"robot_type": "other"})
+    notes = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new").notes
+    assert f"{tmp_path / 'b'}: robot other; the merged dataset names test" in notes
+    for key in (STATE, ACTION):
+        order = f"{tmp_path / 'b'}: {key} taken in its order, as not both datasets name it"
+        assert notes.count(order) == 1
 
 
 def test_other_rates_are_refused_or_resampled(tmp_path, capsys):

@@ -26,6 +26,8 @@ from hrc_learn.demos.read.units import decide_units, units_from_episodes
         ("left.arm.joint_2.vel", "joint_velocity", "left.arm.joint_2"),
         ("joint_1.obs_external_torque", "joint_effort", "joint_1"),
         ("joint_1.cmd_pos", "joint_position", "joint_1"),
+        ("joint_3_vel", "joint_velocity", "joint_3"),
+        ("motor_a_torque", "joint_effort", "motor_a"),
         ("qpos_3", "joint_position", "joint_3"),
         ("gripper.pos", "gripper", "gripper.pos"),
         ("ee.gripper_pos", "gripper", "ee.gripper_pos"),
@@ -58,6 +60,8 @@ def test_names_that_speak(name, role, slot):
             "motor_7",
             "gripper.vel",
             "gripper.torque",
+            "gripper_current",
+            "ee.gripper_force",
             "ee.vx",
             "left_waist",
             "reward",
@@ -251,6 +255,37 @@ def test_a_hobby_arm_beyond_100_is_in_degrees_and_its_gripper_in_percent():
     decision = joint_decision(swept(80, 140, 70, 60, 90, 50), robot_type="so100")
     assert decision.doubt is None
     assert decision.units == ("deg",) * 5 + ("%",)
+
+
+def test_names_from_before_fractions_were_introduced_are_of_degrees():
+    labels = [f"main_{name}" for name in SO101]
+    decision = joint_decision(swept(80, 95, 70, 60, 90, 50), labels, robot_type="so100")
+    assert (decision.unit, decision.doubt) == ("deg", None)
+    assert "before -100..100" in decision.evidence
+
+
+def test_commands_of_fewer_joints_tell_nothing_of_the_others():
+    """Commands are clipped at 100 where joints stop before, if they are of the same joints."""
+    near = np.array([95.0, 95.0])
+    no = np.zeros(2, bool)
+    joints = Sizes(near, np.zeros(2), no, no, no)
+
+    def unit(clipped):
+        count = len(clipped)
+        command = Sizes(near[:count], np.array(clipped), no[:count], no[:count], no[:count])
+        selections = {
+            role: ColumnSelection(
+                role=role,
+                columns=tuple((role, i) for i in range(n)),
+                labels=("wrist_roll", "elbow_flex")[:n],
+            )
+            for role, n in (("joint_position", 2), ("command_position", count))
+        }
+        sizes = {"joint_position": joints, "command_position": command}
+        return decide_units(selections, sizes, {}, 1.0)["joint_position"].unit
+
+    assert unit([0.4, 0.0]) == "%"
+    assert unit([0.4]) == "deg"
 
 
 def test_names_decide_whatever_the_values_reach():

@@ -1,13 +1,21 @@
 """Every version and naming convention reads into the same demonstrations."""
 
 import json
+import os
 
 import numpy as np
+import pyarrow as pa
 import pytest
-from lerobot_folders import FPS, joint_path, rewrite, write_folder
+from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, write_info
 from scipy.spatial.transform import Rotation
 
-from hrc_learn.demos import DatasetError, UnitsWarning, load_demos
+from hrc_learn.demos import (
+    DatasetError,
+    UnitsWarning,
+    check_dataset,
+    load_demos,
+    open_demos,
+)
 
 panda = [f"panda_joint{i}" for i in range(1, 4)]
 STATE = "observation.state"
@@ -17,6 +25,13 @@ def two_episodes(**columns):
     """Two episodes of these columns; each column is a function of the joint motion."""
     motions = [joint_path(60, seed=0), joint_path(45, seed=1)]
     return motions, [{key: make(q) for key, make in columns.items()} for q in motions]
+
+
+def damaged(number: np.ndarray, last: float) -> np.ndarray:
+    """Nine frames of the same numbers; the last one of frame 3 is another."""
+    values = np.tile(number.ravel(), (9, 1))
+    values[3, -1] = last
+    return values
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1", "v2.0"])
@@ -183,6 +198,7 @@ def test_orientations_turn_continuous_in_every_encoding(tmp_path, names, encode)
         ("euler_xyz", lambda r: r.as_euler("xyz")),
         ("euler_intrinsic_xyz", lambda r: r.as_euler("XYZ")),
         ("rotation_6d", lambda r: 3 * two_columns(r)),
+        ("rotation_matrix", lambda r: r.as_matrix().reshape(-1, 9)),
     ],
 )
 def test_orientations_are_mapped_in_every_encoding(tmp_path, role, encode):
@@ -193,11 +209,155 @@ def test_orientations_are_mapped_in_every_encoding(tmp_path, role, encode):
     assert_same_rotation(demo.orientation, turn)
 
 
-def test_columns_that_are_no_rotation_are_told(tmp_path):
-    columns = np.ones((50, 6))
-    root = write_folder(tmp_path / "set", [{"observation.tcp_rot6d": columns}], {})
-    with pytest.raises(DatasetError, match="frame 0 span no plane"):
+@pytest.mark.parametrize(
+    ("role", "columns", "fault"),
+    [
+        ("rotation_6d", np.ones((9, 6)), "frame 0 span no plane"),
+        ("rotation_matrix", damaged(np.eye(3), 1.01), "9 numbers at frame 3 are no rotation"),
+        ("pose_matrix", damaged(np.eye(4), 1.001), "16 numbers are no 4x4 transform"),
+        ("quaternion_xyzw", damaged(np.eye(4)[-1], 1.2), "frame 3"),
+    ],
+)
+def test_columns_that_are_no_rotation_are_told(tmp_path, role, columns, fault):
+    episode = {STATE: joint_path(9), "observation.tool": columns}
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, dtype="float64")
+    with pytest.raises(DatasetError, match=fault) as raised:
+        load_demos(root, mapping={role: "observation.tool"})
+    assert raised.value.key == role
+
+
+@pytest.mark.parametrize(
+    ("role", "number", "last"),
+    [("rotation_matrix", np.eye(3), 1.004), ("pose_matrix", np.eye(4), 1 + 5e-5)],
+)
+def test_rounded_digits_are_no_damage(tmp_path, role, number, last):
+    episode = {STATE: joint_path(9), "observation.tool": damaged(number, last)}
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, dtype="float64")
+    (demo,) = load_demos(root, mapping={role: "observation.tool"})
+    assert demo.orientation is not None
+    np.testing.assert_allclose(demo.orientation[3], [1, 0, 0, 0], atol=1e-2)
+
+
+def test_a_feature_that_was_not_seen_need_not_be_a_number(tmp_path):
+    pixels = 100 * np.ones((9, 3))
+    pixels[:, 2] = 1
+    pixels[4] = [np.nan, np.nan, 0]
+    episode = {STATE: joint_path(9), "observation.marker": pixels}
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, dtype="float64")
+    mapping = {
+        "feature": "observation.marker[0:2]",
+        "feature_visible": "observation.marker[2:3]",
+    }
+    (demo,) = load_demos(root, mapping=mapping)
+    assert demo.feature_visible is not None
+    assert np.flatnonzero(~demo.feature_visible).tolist() == [4]
+    np.testing.assert_array_equal(np.delete(demo.feature, 4, axis=0), 100)
+    assert demo.feature[4].tolist() == [0, 0]
+    pixels[5, 1] = np.nan
+    episode["observation.marker"] = pixels
+    root = write_folder(tmp_path / "bad", [episode], {STATE: panda}, dtype="float64")
+    with pytest.raises(DatasetError, match="feature is nan there") as raised:
+        load_demos(root, mapping=mapping)
+    assert (raised.value.frame, raised.value.key) == (5, "observation.marker (joint_2)")
+
+
+def test_columns_of_tensors_are_read_like_lists(tmp_path):
+    """Hugging Face's datasets keep arrays as an extension type of Arrow."""
+    q = joint_path(60)
+    root = write_folder(tmp_path / "set", [{STATE: q}], {STATE: panda})
+    tensors = pa.FixedShapeTensorArray.from_numpy_ndarray(q[:, None, :])
+
+    def as_tensors(table):
+        return table.set_column(table.schema.get_field_index(STATE), STATE, tensors)
+
+    rewrite(root / "data/chunk-000/file-000.parquet", as_tensors)
+    np.testing.assert_array_equal(load_demos(root)[0].joint_position, q)
+
+
+def test_the_hubs_cache_links_out_of_the_dataset(tmp_path):
+    """Files are links to blobs next to the snapshots, which are no foreign place."""
+    q = joint_path(60)
+    root = write_folder(tmp_path / "hub" / "snapshots" / "1f", [{STATE: q}], {STATE: panda})
+    data = root / "data/chunk-000/file-000.parquet"
+    for name in ("blobs", "elsewhere"):
+        blob = tmp_path / "hub" / name / "a0"
+        blob.parent.mkdir()
+        data.rename(blob)
+        data.symlink_to(blob)
+        if name == "blobs":
+            np.testing.assert_allclose(load_demos(root)[0].joint_position, q, atol=1e-6)
+            data = blob
+    with pytest.raises(DatasetError, match="leads out of the dataset"):
         load_demos(root)
+
+
+def test_a_task_is_found_by_its_number_where_episodes_name_none(tmp_path):
+    root = write_folder(
+        tmp_path / "set",
+        [{STATE: joint_path()}] * 2,
+        {STATE: panda},
+        tasks=("a", "b"),
+        version="v2.1",
+    )
+    listed = [{"episode_index": k, "length": 60} for k in range(2)]
+    text = "".join(json.dumps(line) + "\n" for line in listed)
+    (root / "meta/episodes.jsonl").write_text(text)
+    source = open_demos(root)
+    assert [demo.task for demo in source] == ["a", "b"]
+    assert repr(source).endswith(
+        "2 demonstrations, 120 frames, joints: panda_joint1, panda_joint2, panda_joint3)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("damage", "fault"),
+    [
+        (lambda root: rewrite_info(root, without="fps"), "lacks fps"),
+        (lambda root: os.truncate(root / "meta/info.json", 2**30), "too large to be metadata"),
+        (lambda root: (root / "meta/episodes.jsonl").write_text(""), "holds no episodes"),
+    ],
+)
+def test_metadata_that_cannot_be_used_are_named(tmp_path, damage, fault):
+    episode = {STATE: joint_path()}
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, version="v2.1")
+    damage(root)
+    with pytest.raises(DatasetError, match=fault):
+        load_demos(root)
+    assert any(fault in str(error) for error in check_dataset(root).errors)
+
+
+def rewrite_info(root, without):
+    info = read_info(root)
+    del info[without]
+    write_info(root, info)
+
+
+@pytest.mark.parametrize(
+    ("units", "fault"),
+    [
+        ({"joints": "rad"}, "unknown quantity 'joints'; known are time, joint_position"),
+        ({"joint_position": "parsec"}, "joint_position.*parsec"),
+    ],
+)
+def test_units_that_do_not_exist_are_named(tmp_path, units, fault):
+    root = write_folder(tmp_path / "set", [{STATE: joint_path()}], {STATE: panda})
+    with pytest.raises(DatasetError, match=fault):
+        load_demos(root, units=units)
+    (root / "meta/hrc_learn.json").write_text(json.dumps({"format": 1, "units": units}))
+    with pytest.raises(DatasetError, match=fault) as raised:
+        load_demos(root)
+    assert str(raised.value.file).endswith("meta/hrc_learn.json")
+    assert raised.value.key == f"units.{next(iter(units))}"
+
+
+def test_an_episode_in_degrees_among_radians_is_refused(tmp_path):
+    motions = [joint_path(seed=k) for k in range(4)]
+    episodes = [{STATE: q} for q in [*motions[:3], np.rad2deg(motions[3])]]
+    root = write_folder(tmp_path / "set", episodes, {STATE: panda})
+    with pytest.raises(DatasetError, match=r"times as large.*deg among rad") as raised:
+        load_demos(root)
+    assert raised.value.episode == 3
+    assert len(load_demos(root, episodes=[0, 1, 2])) == 3
 
 
 def test_the_persons_effort_is_found_by_name_and_by_key(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from clean_sets import CAMERA, write_set
 from lerobot_folders import (
     FPS,
     joint_path,
@@ -114,6 +115,116 @@ def test_pauses_stay(tmp_path):
     report, (demo,) = repaired(tmp_path, [pausing], options)
     assert report.changes == {0: ("dropped 1 repeated frames: 80 -> 79",)}
     np.testing.assert_array_equal(demo.joint_position, np.delete(pausing, 60, axis=0))
+
+
+def without_tasks(root):
+    (root / "meta/tasks.jsonl").write_text("")
+    lines = [{"episode_index": k, "length": 60} for k in range(2)]
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    (root / "meta/episodes.jsonl").write_text(text)
+
+
+def set_rows(key, change):
+    """Change a column of the first episode by a function of its values."""
+
+    def damage(root):
+        def replace(table):
+            values = np.array(table.column(key).to_pylist())
+            column = pa.array(list(change(values)), table.schema.field(key).type)
+            return table.set_column(table.schema.get_field_index(key), key, column)
+
+        rewrite(root / "data/chunk-000/episode_000000.parquet", replace)
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "options", "fault", "place"),
+    [
+        (lambda r: (r / "meta/episodes.jsonl").write_text(""), {}, "holds no episodes", None),
+        (set_rows("task_index", lambda v: v + 99), {}, "task 99 is not in the list", 0),
+        (
+            set_rows(STATE, lambda v: np.nan * v),
+            {"drop_bad_frames": True},
+            "not finite: no two frames are left",
+            None,
+        ),
+        (
+            set_rows(STATE, lambda v: np.where(np.arange(60)[:, None] == 17, np.inf, v)),
+            {},
+            "holds values that are not finite in 1 frames",
+            17,
+        ),
+        (lambda _: None, {"fps": 0.5}, "1.18 s hold no two frames at 0.5 Hz", None),
+        (set_rows(STATE, np.rad2deg), {}, "deg among rad", None),
+    ],
+)
+def test_what_cannot_be_repaired_is_named_or_left_out(tmp_path, damage, options, fault, place):
+    motions = [joint_path(60, seed=k) for k in range(4)]
+    root = write(tmp_path / "old", motions, version="v2.1", tasks=("a", "b"))
+    damage(root)
+    with pytest.raises(DatasetError, match=fault) as raised:
+        repair_dataset(root, tmp_path / "new", RepairOptions(**options))
+    assert raised.value.frame == place
+    assert not (tmp_path / "new").exists()
+    if raised.value.episode is not None and "fps" not in options:
+        options |= {"drop_bad_episodes": True, "dry_run": True}
+        report = repair_dataset(root, tmp_path / "new", RepairOptions(**options))
+        assert [*report.left_out] == [raised.value.episode]
+        assert fault in report.left_out[0]
+
+
+def test_only_a_rate_above_zero_can_be_resampled_to():
+    with pytest.raises(ValueError, match="fps must be positive, got 0"):
+        RepairOptions(fps=0)
+
+
+def test_stamps_of_lerobot_that_stall_are_counted_anew(tmp_path):
+    root = write(tmp_path / "old", [joint_path(60)] * 2, version="v2.1")
+    set_rows("timestamp", lambda v: np.concatenate([v[:20], v[19:-1]]))(root)
+    report = repair_dataset(root, tmp_path / "new", QUIET)
+    assert report.changes[0] == ("renewed the stamps: 1 steps that did not increase -> 0",)
+    np.testing.assert_allclose(load_demos(tmp_path / "new")[0].time, np.arange(60) / FPS)
+
+
+def test_a_dataset_of_neither_joints_nor_poses_is_not_trimmed(tmp_path):
+    around = {"observation.environment_state": np.repeat(joint_path(2), 60, axis=0)}
+    names = {"observation.environment_state": ["height_map_1", "height_map_2", "light"]}
+    root = write_folder(tmp_path / "old", [around], names, version="v2.1")
+    assert repair_dataset(root, tmp_path / "new").frames == 120
+
+
+def test_card_licence_and_notes_of_others_are_copied(tmp_path):
+    root = write(tmp_path / "old", [joint_path(60)] * 2, version="v2.1")
+    without_tasks(root)
+    for name in ("README.md", "LICENSE.txt", "meta/robot.json"):
+        (root / name).write_text(name)
+    (root / "meta/scan.json").write_bytes(bytes(2**20))
+    (root / "meta/linked.json").symlink_to("robot.json")
+    report = repair_dataset(root, tmp_path / "new")
+    new = tmp_path / "new"
+    assert [(new / n).read_text() for n in ("README.md", "LICENSE.txt", "meta/robot.json")] == [
+        *("README.md", "LICENSE.txt", "meta/robot.json")
+    ]
+    assert not (new / "meta/scan.json").exists()
+    assert not (new / "meta/linked.json").exists()
+    assert read_info(new)["codebase_version"] == "v3.0"  # ours, not the old one
+    assert "no task is listed: every episode shows 'unnamed task' now" in report.notes
+    assert load_demos(new)[1].task == "unnamed task"
+
+
+def test_images_are_not_resampled(tmp_path):
+    with pytest.raises(DatasetError, match="its images cannot be resampled") as raised:
+        repair_dataset(with_others(tmp_path / "old"), tmp_path / "new", RepairOptions(fps=25))
+    assert raised.value.key == "observation.images.front"
+
+
+def test_an_episode_whose_video_is_missing_is_named(tmp_path):
+    root = write_set(tmp_path / "old", "v2.1", camera=True)
+    next((root / "videos").glob("**/episode_000002.mp4")).unlink()
+    with pytest.raises(DatasetError, match="video of this episode is missing") as raised:
+        repair_dataset(root, tmp_path / "new", QUIET)
+    assert (raised.value.episode, raised.value.key) == (2, CAMERA)
 
 
 def test_frames_stamped_no_later_go(tmp_path):

@@ -79,11 +79,12 @@ def path_in(root: Path, template: object, key: str, **places: int | str) -> str:
     Raises:
         DatasetError: The template does not fit the version, or leads out of the dataset.
     """
-    text = str(template)  # null fits no version
+    text = str(template)
+    absent = template is None and key == "data_path"  # videos may be declared without a file
     left = _FIELD.sub("", text)
     fields = {match[1] for match in _FIELD.finditer(text)}
     try:
-        if template is None or {"{", "}"} & set(left) or not fields <= places.keys():
+        if absent or {"{", "}"} & set(left) or not fields <= places.keys():
             raise ValueError("does not fit the dataset's version")
         file = text.format(**places)
         if not is_inside(root, file):

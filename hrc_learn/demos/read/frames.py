@@ -346,8 +346,6 @@ def to_numpy(
     if not any(is_kind(array.type) for is_kind in kinds):
         raise fault(0, f"holds {array.type}, not numbers")
     values = _without_pandas(array)
-    if rows and len(values) % rows:
-        raise fault(0, f"{len(values)} numbers cannot be divided among {rows} frames")
     return values.reshape(rows, len(values) // rows if rows else 0)
 
 

@@ -219,8 +219,6 @@ def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Sta
 
 
 def _column_statistics(values: np.ndarray) -> dict[str, list]:
-    if values.ndim == 1:
-        values = values[:, None]
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
     return {
         "min": values.min(0).tolist(),
