@@ -102,6 +102,20 @@ class TestTheLaw:
             rate = (J @ J.mT @ command.xi_x).norm() / (10**2 + 30**2) ** 0.5
             assert rate <= 4.1
 
+    def test_the_null_space_is_that_of_the_joints_after_the_delay(self):
+        delay, velocity = 0.05, torch.linspace(-0.8, 0.8, 7, dtype=DOUBLE)
+        config = replace(self.controller.config, command_delay=delay)
+        controller, _ = grasping(rng=sampling.generator(1), config=config)
+        state = controller.initial_state(self.q)
+        state = replace(state, safety=replace(state.safety, velocity=velocity))
+        command, _ = controller.step(state, observe(self.q, nullspace_input=self.d))
+        moved = [
+            float((panda.jacobian(q) @ command.null_velocity).norm())
+            for q in (self.q, self.q + delay * velocity)
+        ]
+        assert command.null_velocity.norm() > 0.05
+        assert moved[0] > 1e-4 > 1e-9 > moved[1]
+
     def test_goals_come_with_the_observation(self):
         elsewhere = self.controller.goals.moved_to(CENTRE + 0.3).with_vision(False)
         command, _ = self.controller.step(self.state, observe(self.q, goals=elsewhere))

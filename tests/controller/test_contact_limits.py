@@ -212,6 +212,24 @@ def test_each_mode_allows_its_speed():
 
 
 @pytest.mark.parametrize(
+    ("mode", "speed", "contact", "gentle"),
+    [
+        ("pfl", 0.8, 1.1, True),
+        ("ssm+pfl", 0.9, 1.1, True),
+        ("pfl", 0.95, 1.1, False),  # with 0.2 m/s of the person
+        ("pfl", -0.3, 0.0, False),
+        ("ssm", 0.1, 1.1, False),
+        ("pfl", 0.1, None, False),
+    ],
+)
+def test_a_contact_is_gentle_below_its_speed_where_one_is_allowed(mode, speed, contact, gentle):
+    given = [torch.tensor([x], dtype=DOUBLE) for x in (speed, 0.2)]
+    contact = None if contact is None else torch.tensor([contact], dtype=DOUBLE)
+    found = SeparationConfig(mode=mode).touches_gently(*given, contact)
+    assert found.tolist() == [gentle]
+
+
+@pytest.mark.parametrize(
     "wrong",
     [
         {"area": 0.0},

@@ -209,6 +209,31 @@ def test_a_request_is_followed_within_the_bounds():
     assert float((panda.jacobian(Q) @ velocity).norm()) < 1e-9
 
 
+@pytest.mark.parametrize(("before", "wanted"), [(0.0, 0.02), (0.02, 0.0), (-0.05, 0.1)])
+def test_a_push_rises_smoothly_and_ends_at_once(before, wanted):
+    """A first-order lag of 0.15 s on the way up; both within the acceleration of the arm."""
+    unit, J = self_motion(Q, 1.0), panda.jacobian(Q)
+    dt, config = 0.01, YieldingConfig()
+    found = eased_null_velocity(
+        panda, Q, J, before * unit, wanted * unit, FREE, dt, config
+    ).velocity
+    slows = abs(wanted) < abs(before)
+    change = (wanted - before) * (1.0 if slows else dt / 0.15)
+    reach = (0.6 if slows else 0.3) * dt * panda.limits.acceleration
+    expected = (before + change * min(1.0, float((reach / (change * unit).abs()).min()))) * unit
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("slowly", [False, True])
+def test_accelerations_of_a_push_leave_the_task_what_it_needs(slowly):
+    unit, J, dt = self_motion(Q, 1.0), panda.jacobian(Q), 0.01
+    before, wanted = (0.4, 0.0) if slowly else (0.0, 2.0)
+    arguments = panda, Q, J, before * unit, wanted * unit, FREE, dt, YieldingConfig()
+    eased = eased_null_velocity(*arguments)
+    a = (eased.velocity - before * unit).abs() / dt / panda.limits.acceleration
+    assert float(a.max()) == pytest.approx(0.6 if slowly else 0.3)
+
+
 def test_fractions_of_a_velocity_count_along_its_direction():
     v = torch.tensor([[3.0, 4.0], [0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
     after = torch.tensor([[1.5, 2.0], [1.0, 0.0], [-1.0, 5.0]], dtype=torch.float64)

@@ -1,5 +1,9 @@
 """Small matrices written out for compilers, against LAPACK, and constants."""
 
+import math
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import sampling
 import torch
@@ -9,8 +13,12 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.geometry.numerics import (
     Constant,
+    as_tensor,
+    check_settings,
     inverse_norm,
+    is_number,
     matmul,
+    minimum_jerk,
     null_projection,
     solve_positive,
 )
@@ -135,3 +143,43 @@ def test_it_is_converted_once():
     assert constant.like(x) is constant.like(x)
     assert constant.like(x).dtype == torch.float32
     assert Constant(torch.arange(2)).like(x).dtype == torch.int64
+
+
+@pytest.mark.parametrize(
+    ("rule", "good", "bad", "words"),
+    [
+        ("positive", [1e-9, 2.0], [0.0, -1.0], "x must be positive, but is"),
+        ("not_negative", [0.0, 2.0], [-1e-9], "x must not be negative, but is"),
+        ("below_one", [0.0, 0.99], [-1e-9, 1.0], r"x must be in \[0, 1\), but is"),
+        ("fraction", [1e-9, 1.0], [0.0, 1.01], r"x must be in \(0, 1\], but is"),
+    ],
+)
+def test_settings_are_held_to_their_range(rule, good, bad, words):
+    for value in good:
+        check_settings(SimpleNamespace(x=value), **{rule: ["x"]})
+    for value in (*bad, math.nan):
+        with pytest.raises(ValueError, match=f"{words} {value}"):
+            check_settings(SimpleNamespace(x=value), **{rule: ["x"]})
+
+
+def test_whole_numbers_and_lists_become_float64_and_floats_stay():
+    for values in (3, [1, 2], torch.arange(3), np.arange(3, dtype=np.int32), [[1.5]]):
+        assert as_tensor(values).dtype == torch.float64
+    assert as_tensor(np.zeros(2, np.float32)).dtype == torch.float32
+    assert as_tensor([1.0, 2.0], torch.zeros(1)).dtype == torch.float32
+
+
+def test_numbers_in_si_units_are_no_larger_than_a_million_millions():
+    x = torch.tensor([0.0, -9e11, 1.1e12, -1.1e12, math.inf, math.nan])
+    assert is_number(x).tolist() == [True, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("x", [-0.5, 0.0, 0.3, 1.0, 1.5])
+def test_a_minimum_jerk_motion_rests_before_and_after_it(x):
+    """Against NumPy's polynomial and its derivative."""
+    value, slope = minimum_jerk(torch.tensor([x], dtype=torch.float64))
+    inside = min(max(x, 0.0), 1.0)
+    curve = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
+    assert float(value) == pytest.approx(curve(inside))
+    assert float(slope) == pytest.approx(curve.deriv()(inside), abs=1e-12)
+    assert minimum_jerk(x) == pytest.approx((float(value), float(slope)))

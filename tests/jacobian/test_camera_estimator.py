@@ -22,7 +22,7 @@ from hrc_learn.jacobian import (
     fit_camera,
     paper_grid,
 )
-from hrc_learn.jacobian.perspective import marker_pixels
+from hrc_learn.jacobian.perspective import ROTATION, marker_pixels
 
 IMAGE, LEVER = (1440, 1080), np.array([-0.008, 0.145, -0.083])
 INTRINSICS = np.array([[1900.0, 0, 731.0], [0, 1900.0, 528.0], [0, 0, 1.0]])
@@ -217,6 +217,30 @@ def test_the_covariance_of_the_camera_covers_its_error(network):
         scores.append(float(np.linalg.norm(pixel[0].numpy() - truth)) / float(spread))
     assert np.median(scores) < 2.5
     assert np.max(scores) < 8
+
+
+def test_the_spread_is_the_covariance_and_the_other_hypotheses(network):
+    """Linear functions vary by the covariance; a hypothesis counts by its probability."""
+    estimator = CameraEstimator(network, CameraConfig(hypotheses=2))
+    state = estimator.initial_state()
+    rng = torch.Generator().manual_seed(0)
+    root = 1e-4 * torch.randn(13, 13, generator=rng).double()
+    other = state.best + 0.01
+    state = replace(
+        state,
+        covariance=root @ root.mT,
+        cameras=torch.stack([state.best, other]),
+        cost=torch.tensor([1.0, 2.5]).double(),
+    )
+    spread = state.spread()
+    assert_close(spread.samples[0], state.best)
+    away, weights = spread.samples[1:14] - state.best, spread.weights[:13]
+    parts = [k for k in range(13) if k not in range(*ROTATION.indices(13))]  # which add
+    found = (weights * away.mT) @ away
+    assert_close(found[parts][:, parts], state.covariance[parts][:, parts], rtol=1e-6, atol=0)
+    assert_close(spread.samples[14:], state.cameras)
+    odds = np.exp([-1.0, -2.5])
+    assert_close(spread.weights[13:], torch.from_numpy(odds / odds.sum()))
 
 
 def test_a_network_without_a_camera_is_refused():

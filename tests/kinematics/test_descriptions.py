@@ -474,6 +474,10 @@ def test_limits_of_motion_have_to_be_positive(tmp_path):
         (tmp_path / "robot.limits.toml").write_text(f"[default]\n{wrong}\n")
         with pytest.raises(ValueError, match=r"not positive and finite; set it with limits="):
             load(tmp_path, robot(ARM + TOOL))
+    for wrong in ('velocity = "fast"', "velocity = true"):
+        (tmp_path / "robot.limits.toml").write_text(f"[j1]\n{wrong}\n")
+        with pytest.raises(ValueError, match=r"limits.toml: \[j1\] must be a table of numbers"):
+            load(tmp_path, robot(ARM + TOOL))
     (tmp_path / "robot.limits.toml").unlink()
     limits = load(tmp_path, robot(changed('effort="50"', 'effort="0"'))).limits
     assert bool((limits.torque == torch.inf).all())

@@ -6,6 +6,7 @@ import pytest
 import sampling
 import torch
 
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import TOOL_LINK, GraspedBox, panda, separation
 from hrc_learn.kinematics.collision import nearest_on_segment_and_box
 
@@ -184,6 +185,35 @@ def test_points_of_a_box_nearest_to_a_segment_are_on_it():
     found = (segment[:, 0] + t[:, None] * (segment[:, 1] - segment[:, 0]) - point).norm(dim=-1)
     # It is found to a millionth of the segment's length.
     assert (found <= best + 1e-5).all()
+
+
+def test_the_distance_from_boxes_is_the_simulators():
+    """Of all links that move; inside a box it counts from the axis of the capsule."""
+    q = postures(12, seed=11)
+    centres = torch.tensor([[0.5, 0.2, 0.3], [-0.4, 0.0, 0.6], [0.2, -0.7, 0.1]]).double()
+    halves = torch.tensor([[0.1, 0.2, 0.05], [0.05, 0.05, 0.5], [0.3, 0.1, 0.1]]).double()
+    found = ARM.box_distance(q, centres, halves)
+    moving = [k for k, link in enumerate(ARM.links) if link > 0]
+    ends = ARM.segments(q)[:, moving]
+    for arm, distance in zip(ends, found.tolist(), strict=True):
+        nearest = np.inf
+        for centre, half in zip(centres, halves.tolist(), strict=True):
+            still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+            model, data = simulated(arm, ARM.radius[moving], (Pose(centre, still), half))
+            away = [measured(model, data, k, len(moving)) for k in range(len(moving))]
+            nearest = min(nearest, *away)
+        if nearest > 0:
+            assert distance == pytest.approx(nearest, abs=1e-5)
+        else:
+            assert distance <= 1e-5
+    one = ARM.box_distance(q.reshape(3, 4, 7), centres[0], halves[0])
+    torch.testing.assert_close(one.flatten(), ARM.box_distance(q, centres[:1], halves[:1]))
+    assert (found > 0.02).sum() > 3
+    assert (found < one.flatten() - 0.01).any()
+
+
+def test_a_held_box_ends_at_its_far_face():
+    assert BOX.end == pytest.approx((0.0, 0.005, 0.04))
 
 
 @pytest.mark.parametrize("bad", [-0.01, float("nan"), float("inf")])

@@ -4,10 +4,17 @@ import math
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down
-from hrc_learn.kinematics.tool_orientation import MAX_SPREAD, NEAR, Approach, tangent
+from hrc_learn.kinematics.tool_orientation import (
+    MAX_SPREAD,
+    NEAR,
+    Approach,
+    coarse_orientation,
+    tangent,
+)
 
 DOWN = gripper_down()
 
@@ -86,3 +93,16 @@ def test_what_is_no_approach_is_refused(tmp_path):
         Approach.load(tmp_path / "approach.json")
     with pytest.raises(ValueError, match="one demonstration or more"):
         Approach.fit([])
+
+
+@pytest.mark.parametrize(("y", "angle"), [(0.0, 0.0), (0.3, 0.2), (-0.15, -0.1), (0.9, 0.4)])
+def test_a_hand_to_the_side_points_to_that_side(y, angle):
+    """By the angle in proportion, up to the reach: about the base's x axis, as of SciPy."""
+    position = torch.tensor([[0.4, y, 0.2]], dtype=torch.float64)
+    found = coarse_orientation(position, reach=0.6, tilt=0.4)
+    axis = quaternion.rotate(found, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))[0]
+    expected = Rotation.from_rotvec([angle, 0, 0]).apply([0.0, 0.0, -1.0])
+    torch.testing.assert_close(axis, torch.from_numpy(expected))
+    assert float(axis[1]) * y >= 0
+    with pytest.raises(ValueError, match="orientation_wxyz is no unit quaternion"):
+        Approach(orientation_wxyz=(1.0, 0.1, 0.0, 0.0), spread_rad=0.0, turned_rad=0.0)
