@@ -65,6 +65,8 @@ _FEW_FRAMES, _SEARCHES, _FINALISTS = 100, 5, 3
 _CLEAR = 0.2
 # Residual, in robust standard deviations, beyond which a frame counts less.
 _OUTLIER = 2.5
+# Largest number of steps of a bundle adjustment, and relative gain of a step that ends it.
+_ADJUSTMENTS, _SETTLED = 60, 1e-6
 # Frames in a row whose errors are summed to measure how far neighbours share their errors.
 _BLOCK = 25
 
@@ -245,15 +247,8 @@ def fit_camera(
             f"the marker is visible in {len(pixel)} frames of the demonstrations, but a camera "
             "needs ten or more: record with the marker in view."
         )
+    prior, spread = _prior(image_size)
     width = image_size[0]
-    middle = pixel.new_tensor(image_size) / 2
-    prior = torch.cat([pixel.new_tensor([width]).log(), middle, pixel.new_zeros(10)])
-    spread = pixel.new_tensor(
-        [_FOCAL_SPREAD, *[_CENTER_SPREAD * width] * 2, _RADIAL_SPREAD]
-        + [_ANY_TURN] * 3
-        + [_ANY_PLACE] * 3
-        + [_MARKER_SPREAD] * 3
-    )
     few = slice(None, None, -(-len(pixel) // _FEW_FRAMES))
     cameras = _starts(pose[few], pixel[few], prior, width)
     everywhere = pixel.new_full((len(cameras), len(pixel[few])), (100 / width) ** 2)
@@ -289,6 +284,92 @@ def fit_camera(
         covariance=torch.linalg.inv(gram[best]),
         noise=float(noise[best]),
     )
+
+
+def _prior(image_size: tuple[int, int]) -> tuple[Float[Tensor, "13"], Float[Tensor, "13"]]:
+    """Mean and standard deviation of a camera before any image of this size [px]."""
+    width, height = image_size
+    spread = [_FOCAL_SPREAD, *[_CENTER_SPREAD * width] * 2, _RADIAL_SPREAD]
+    spread += [*[_ANY_TURN] * 3, *[_ANY_PLACE] * 3, *[_MARKER_SPREAD] * 3]
+    mean = [float(np.log(width)), width / 2, height / 2, *[0.0] * 10]
+    return torch.tensor(mean).double(), torch.tensor(spread).double()
+
+
+def adjust_bundle(
+    cameras: Float[Tensor, "points 13"],
+    pose: Pose,
+    pixel: Float[Tensor, "points frames 2"],
+    image_size: tuple[int, int],
+    reach: float,
+) -> Float[Tensor, "points 13"]:
+    """Fit one camera and many points of a link together (bundle adjustment).
+
+    Levenberg-Marquardt with the robust cost r^2 e^2 / (r^2 + e^2) of an error e. The Schur
+    complement of the points leaves ten equations for the camera (Triggs et al. 2000).
+
+    Args:
+        cameras: The same camera with each of the points as its marker.
+        pose: Poses of the link, (frames,).
+        pixel: Pixels of the points [px]; NaN: not seen.
+        image_size: Width and height of the image [px].
+        reach: Error r beyond which a pixel counts less [px].
+    """
+    known = pixel.isfinite().all(-1)
+    prior, spread = _prior(image_size)
+
+    def misfit(candidates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        seen, slope = marker_pixels(candidates, pose)
+        error = torch.where(known[..., None], pixel - seen, 0.0).nan_to_num()
+        return error, slope, error.square().sum(-1)
+
+    def cost_of(candidates: Tensor, square: Tensor) -> Tensor:
+        away = (_from_prior(candidates, prior) / spread).square()
+        robust = (reach**2 * square / (reach**2 + square)).sum()
+        return robust + away[0, : MARKER.start].sum() + away[:, MARKER].sum()
+
+    error, slope, square = misfit(cameras)
+    cost, damping = cost_of(cameras, square), 1e-3
+    for _ in range(_ADJUSTMENTS):
+        weight = known * (reach**2 / (reach**2 + square)).square()
+        step = _bundle_step(cameras, weight, slope, error, prior, spread, damping)
+        candidates = stepped(cameras, step)
+        parts = misfit(candidates)
+        new = cost_of(candidates, parts[-1])
+        if new < cost:
+            settled = bool(cost - new < _SETTLED * cost)
+            cameras, (error, slope, square), cost = candidates, parts, new
+            damping = damping / 5
+            if settled:
+                break
+        else:
+            damping = damping * 10
+    return cameras
+
+
+def _bundle_step(
+    cameras: Float[Tensor, "points 13"],
+    weight: Float[Tensor, "points frames"],
+    slope: Float[Tensor, "points frames 2 13"],
+    error: Float[Tensor, "points frames 2"],
+    prior: Float[Tensor, "13"],
+    spread: Float[Tensor, "13"],
+    damping: float,
+) -> Float[Tensor, "points 13"]:
+    """Damped Gauss-Newton step of one camera and of each point, the points eliminated."""
+    pull = -_from_prior(cameras, prior) / spread.square()
+    gram = torch.einsum("pf,pfij,pfik->pjk", weight, slope, slope)
+    towards = torch.einsum("pf,pfij,pfi->pj", weight, slope, error)
+    n = MARKER.start
+    whole = gram[:, :n, :n].sum(0) + spread[:n].square().reciprocal().diag()
+    points = gram[:, n:, n:] + spread[n:].square().reciprocal().diag()
+    points = points + damping * points.diagonal(dim1=-2, dim2=-1).diag_embed()
+    right = (towards + pull)[:, n:, None]
+    solved = torch.linalg.solve(points, torch.cat([gram[:, n:, :n], right], dim=-1))
+    reduced = torch.einsum("pij,pik->jk", gram[:, n:, :n], solved)
+    left = whole + damping * whole.diagonal().diag() - reduced[:, :-1]
+    camera = torch.linalg.solve(left, towards[:, :n].sum(0) + pull[0, :n] - reduced[:, -1])
+    rest = solved[..., -1] - solved[..., :-1] @ camera
+    return torch.cat([camera.expand(len(rest), n), rest], dim=-1)
 
 
 def _searched(

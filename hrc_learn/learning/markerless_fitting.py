@@ -27,7 +27,15 @@ from hrc_learn.demos.image_features import camera_key
 from hrc_learn.demos.images import ImageReader
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraFit, ImageDemonstration, fit_camera
-from hrc_learn.jacobian.perspective import FOCAL, SIZE, eye_of, marker_pixels, rays
+from hrc_learn.jacobian.perspective import (
+    FOCAL,
+    MARKER,
+    SIZE,
+    adjust_bundle,
+    eye_of,
+    marker_pixels,
+    rays,
+)
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.store import new_file
 from hrc_learn.vision.landmarks import (
@@ -54,6 +62,8 @@ _FRAMES, _STARTS, _USUAL = 72, 10, 31
 # fitted; tracks after which no further camera is tried; and largest error of a point that moves
 # with its link [px of 1440].
 _SHORTEST, _STILL, _TRIED, _ENOUGH, _AGREES = 10, 20.0, 12, 150, 4.0
+# Errors beyond which pixels count less, adjustment by adjustment [px of 1440].
+_CLOSER = (8.0, 4.0, 2.0)
 # Largest distance of a point from the origin of its link [m].
 _NEAR = 0.35
 # Frames of all demonstrations in which the tool is looked for at last.
@@ -140,12 +150,11 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
             "to the same time."
         )
     _, link, fit = best
-    tool = _tool(tracks, link, fit.camera, width)
+    tool = _tool(tracks, link, _adjusted(tracks, link, fit.camera, (width, height)), width)
     # The place on the tool, from all points at once, is seen better than one point.
     seen = [tool.find(one, width) for one in features]
     pixels = np.array([(np.nan, np.nan) if one is None else one.pixel for one in seen])
     fit = fit_camera([_as_demonstration(pixels, poses)], (width, height))
-    tool = _tool(tracks, link, fit.camera, width)
     landmarks = Landmarks(tool=tool, image_size=(width, height))
     found = search.follow(landmarks, fit)
     item = search.object(fit.camera)
@@ -324,6 +333,26 @@ def _points(
     count = agrees.sum(1)
     good = (count >= _SHORTEST) & (count > 0.5 * seen.sum(1))
     return point, good & (np.linalg.norm(point, axis=1) < _NEAR)
+
+
+def _adjusted(
+    tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], image_size: tuple[int, int]
+) -> Float[Tensor, "13"]:
+    """The camera that explains all points of a link together."""
+    for reach in _CLOSER:
+        points, agrees = _points(tracks, link.pose, camera, image_size[0])
+        places = torch.from_numpy(points[agrees])
+        bare = camera[: MARKER.start].expand(len(places), MARKER.start)
+        pixels = torch.from_numpy(tracks.pixels[agrees])
+        each = adjust_bundle(
+            torch.cat([bare, places], dim=-1),
+            link.pose,
+            pixels,
+            image_size,
+            reach * image_size[0] / 1440,
+        )
+        camera = each[0]
+    return camera
 
 
 def _tool(tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int) -> Tool:

@@ -77,7 +77,7 @@ _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
 # Features of a tool without markers are found less exactly than corners of a marker.
-_UNMARKED = CameraConfig(pixel_noise=0.6, bump=6.0)
+UNMARKED = CameraConfig(pixel_noise=0.6, bump=6.0)
 # Fractions of the height of a probe that are tried, and distance from joint limits there [rad]:
 # nearer to one the arm is slow.
 _PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
@@ -190,7 +190,7 @@ class Grasping:
             cell.chain,
             CameraEstimator(
                 copy.deepcopy(skill.jacobian).double(),
-                None if skill.landmarks is None else _UNMARKED,
+                None if skill.landmarks is None else UNMARKED,
             ),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=replace(config.controller, safety=cell.watchful(cell.config.safety)),

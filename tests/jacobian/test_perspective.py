@@ -23,6 +23,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.jacobian.perspective import (
     FOCAL,
     SHIFT,
+    adjust_bundle,
     camera_jacobian,
     eye_of,
     marker_pixels,
@@ -93,6 +94,72 @@ def test_motion_that_tells_nothing_leaves_the_width_of_the_image():
     found = fit_camera([demo], IMAGE)
     assert float(found.camera[0].exp()) == pytest.approx(IMAGE[0], rel=0.5)
     assert found.deviation(FOCAL) > 0.1
+
+
+def bundle(rng, points=12, noise=0.0):
+    """Points of a link that moves before a camera: true cameras, poses and pixels by OpenCV."""
+    rotation, shift = camera(rng)
+    pose = demonstration(rng, rotation, shift, 1500.0, np.zeros(3), frames=30).pose
+    places = rng.uniform(-0.08, 0.08, (points, 3))
+    pixels = np.stack(
+        [
+            seen(pose.apply(torch.from_numpy(m)).numpy(), rotation, shift, 1500.0)[0]
+            for m in places
+        ]
+    )
+    pixels += rng.normal(0, noise, pixels.shape)
+    pixels[rng.random(pixels.shape[:2]) < 0.3] = np.nan
+    optics = [np.log(1500.0), *CENTER, 0.0, *rotation, *shift]
+    true = np.concatenate([np.tile(optics, (points, 1)), places], axis=1)
+    return torch.from_numpy(true), pose, torch.from_numpy(pixels)
+
+
+# From a camera that one track alone found: some degrees, centimetres and per cent off.
+_OFF = torch.tensor(
+    [0.05, 8, -5, 0.02, 0.03, -0.02, 0.02, 0.02, -0.01, 0.04, 0, 0, 0], dtype=torch.float64
+)
+
+
+def test_many_points_give_the_camera_in_spite_of_wrong_matches():
+    rng = np.random.default_rng(3)
+    true, pose, pixels = bundle(rng, noise=0.3)
+    wrong = torch.from_numpy(rng.random(pixels.shape[:2]) < 0.15)
+    pixels[wrong] += 40.0
+    start = stepped(true, _OFF) + torch.from_numpy(rng.normal(0, 0.01, true.shape)) * (
+        torch.arange(13) >= 10
+    )
+    found = start
+    for reach in (16.0, 4.0):
+        found = adjust_bundle(found, pose, pixels, IMAGE, reach)
+    assert (found[:, :10] == found[0, :10]).all()
+    error = (marker_pixels(found, pose)[0] - marker_pixels(true, pose)[0]).norm(dim=-1)
+    before = (marker_pixels(start, pose)[0] - marker_pixels(true, pose)[0]).norm(dim=-1)
+    assert before.median() > 10
+    assert error.quantile(0.95) < 0.5
+
+
+def test_no_small_step_improves_an_adjusted_bundle():
+    """The gradient of the robust cost by autograd vanishes, by the camera and by each point."""
+    rng = np.random.default_rng(4)
+    true, pose, pixels = bundle(rng, points=6, noise=0.3)
+    known, reach = pixels.isfinite().all(-1), 3.0
+
+    def gradient(cameras):
+        shared = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+        own = torch.zeros(6, 3, dtype=torch.float64, requires_grad=True)
+        near = stepped(cameras, torch.cat([shared.expand(6, 10), own], dim=-1))
+        square = (marker_pixels(near, pose)[0] - pixels)[known].square().sum(-1)
+        cost = (reach**2 * square / (reach**2 + square)).sum()
+        cost = cost + ((near[0, 0] - np.log(1440)) / 0.5) ** 2
+        cost = cost + ((near[0, 1:3] - torch.from_numpy(CENTER)) / 28.8).square().sum()
+        cost = cost + (near[0, 3] / 0.2) ** 2 + (near[0, 7:10] / 10).square().sum()
+        cost = cost + (near[:, 10:] / 0.2).square().sum()
+        return torch.autograd.grad(cost, [shared, own])
+
+    start = stepped(true, 0.3 * _OFF)
+    found = adjust_bundle(start, pose, pixels, IMAGE, reach)
+    for before, after in zip(gradient(start), gradient(found), strict=True):
+        assert after.norm() < 1e-3 * before.norm()
 
 
 # A lens with tangential distortion, and a principal point off the middle: more than the model
