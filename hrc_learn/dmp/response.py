@@ -6,10 +6,11 @@ transition matrix of the spring. It is integrated piece by piece, accumulated, a
 table of polynomials.
 """
 
+import json
 import math
 from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any
 
@@ -19,7 +20,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import fits_numpy, transforming
-from hrc_learn.dmp.dynamics import Basis, SpringDamper, approach_state, minimum_jerk_curve
+from hrc_learn.dmp.dynamics import (
+    Basis,
+    SpringDamper,
+    approach_state,
+    basis_config,
+    minimum_jerk_curve,
+    restored_basis,
+)
 
 GAUSS_POINTS = 12
 """Points of Gauss-Legendre quadrature on a piece, on which no basis function changes much."""
@@ -162,6 +170,8 @@ class Response:
         self.spring = spring
         self.basis = basis
         self.approach = approach
+        self.name = json.dumps([asdict(spring), basis_config(basis), approach])
+        """The parts, for `named_response`."""
         self.size = basis.count + 3
         """M, the number of coordinates: N weights, start velocity, start, goal."""
         # Tensors made in inference mode cannot take part in a backward pass later.
@@ -330,6 +340,12 @@ class _StateAt(torch.autograd.Function):
 def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Response:
     """Shared `Response` of these parts: equal primitives use the same tables and matrices."""
     return Response(spring, basis, approach)
+
+
+def named_response(name: str) -> Response:
+    """The shared response with this name, for operators, which take no objects."""
+    spring, basis, approach = json.loads(name)
+    return response_of(SpringDamper(**spring), restored_basis(basis), approach)
 
 
 @cache

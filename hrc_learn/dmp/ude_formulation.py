@@ -15,7 +15,7 @@ continuously.
 """
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -33,6 +33,7 @@ from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dynamics import SpringDamper
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
+from hrc_learn.dmp.response import named_response
 from hrc_learn.dmp.samples import Samples
 from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
 from hrc_learn.dmp.trajectory import Trajectory
@@ -166,6 +167,14 @@ class UdeMotion(Trajectory):
 
     @cached_property
     def _state(self) -> Float[Tensor, "*batch T 2 3"]:
+        """State (e, v) at the requested times."""
+        if torch.compiler.is_compiling():
+            return _state_operator(
+                self._coordinates, self.s.expand(*self._batch, -1), self._response.name
+            )
+        return self.integrate()
+
+    def integrate(self) -> Float[Tensor, "*batch T 2 3"]:
         """State (e, v) at the requested times: one step from the knot before each."""
         # No longer than the interval on which the forcing is smooth.
         size = min(MAXIMUM_STEP, self._response.forced.interval / 2)
@@ -196,6 +205,44 @@ class UdeMotion(Trajectory):
     def _rolled_out(self, s: Tensor) -> Trajectory:
         unit = torch.ones_like(self.duration)
         return Trajectory(coordinates=self._given, s=s, duration=unit, response=self._response)
+
+
+# The number of steps depends on the times, which a compiler cannot follow: to compilers the
+# integration and its adjoint are one operator each.
+
+
+@torch.library.custom_op("hrc_learn::ude_state", mutates_args=())
+def _state_operator(x: Tensor, s: Tensor, response: str) -> Tensor:
+    return _integrated(x, s, response)
+
+
+@torch.library.custom_op("hrc_learn::ude_state_adjoint", mutates_args=())
+def _state_adjoint(grad: Tensor, x: Tensor, s: Tensor, response: str) -> tuple[Tensor, Tensor]:
+    by_x, by_s = torch.func.vjp(partial(_integrated, response=response), x, s)[1](grad)
+    return by_x, by_s
+
+
+def _integrated(x: Tensor, s: Tensor, response: str) -> Tensor:
+    """State (e, v) of the motion with coordinates `x` at normalised times `s`."""
+    unit = torch.ones_like(s[..., 0])
+    motion = UdeMotion(coordinates=x, s=s, duration=unit, response=named_response(response))
+    return motion.integrate().clone()
+
+
+def _differentiate(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    return *_state_adjoint(grad, *ctx.saved_tensors, ctx.response), None
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    *saved, ctx.response = inputs
+    ctx.save_for_backward(*saved)
+
+
+_state_operator.register_autograd(_differentiate, setup_context=_keep)
+_state_operator.register_fake(lambda x, s, response: x.new_empty(*s.shape, 2, 3))
+_state_adjoint.register_fake(
+    lambda grad, x, s, response: (torch.empty_like(x), torch.empty_like(s))
+)
 
 
 def deviation(

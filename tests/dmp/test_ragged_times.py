@@ -1,8 +1,5 @@
 """Motions each at times of their own: any grid gives what any other gives."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 from demo_motions import arm_motion
@@ -131,55 +128,6 @@ def test_maps_over_durations(batch, output):
     torch.testing.assert_close(rates[0], central, rtol=1e-6, atol=1e-5)
 
 
-COMPILED = """
-import torch
-from hrc_learn.dmp import (
-    JointDMP, OrientationDMP, PoseDMP, SplineBasis, fit_rhythmic
-)
-from hrc_learn.geometry import quaternion
-
-t = torch.linspace(0, 2, 60, dtype=torch.float64)
-y = torch.stack([torch.sin(t), t**2, torch.cos(t)], -1)
-kinds = (
-    (JointDMP.fit(t, y, 12), "acceleration"),
-    (OrientationDMP.fit(t, quaternion.exp(y), 12), "orientation"),
-    (JointDMP.fit(t, y, basis=SplineBasis(count=12)), "velocity"),
-    (JointDMP.fit(t, y, 12, approach=0.7, scaling="amplitude"), "position"),
-    (fit_rhythmic(t, torch.sin(2 * torch.pi * t)[:, None].repeat(1, 3), 9, 1.0), "position"),
-    (PoseDMP.fit(t, y, quaternion.exp(y), 12), "orientation"),
-)
-durations = torch.tensor([0.8, 1.0, 1.7], dtype=torch.float64)
-for dmp, output in kinds:
-    for times in (t, None):
-        def path(tau):
-            ends = {}
-            if isinstance(dmp.goal, torch.Tensor):
-                ends["goal"] = dmp.goal.expand(*tau.shape, -1)
-            return getattr(dmp.rollout(times, duration=tau, **ends), output)
-        torch._dynamo.reset()
-        compiled = torch.compile(path, fullgraph=True, backend="aot_eager")
-        for tau in (durations[1], durations):
-            torch.testing.assert_close(compiled(tau), path(tau))
-
-# A table that was made before is looked up, not made again in each call.
-dmp, sizes = JointDMP.fit(t, y, 13), []
-def counted(graph, inputs):
-    sizes.append(len(graph.graph.nodes))
-    return graph
-for _ in range(2):
-    torch._dynamo.reset()
-    compiled = torch.compile(lambda tau: dmp.rollout(t, duration=tau).position, backend=counted)
-    torch.testing.assert_close(compiled(durations), dmp.rollout(t, duration=durations).position)
-assert sizes[1] < 0.7 * sizes[0], sizes
-"""
-
-
-@pytest.mark.slow
-def test_compiles_without_a_break():
-    """In a process of its own: a compiler cannot follow the shape checks of these tests."""
-    subprocess.run([sys.executable, "-c", COMPILED], check=True)
-
-
 def recordings(n, lengths, velocity=False):
     """Motions with timestamps of their own, in lists."""
     rng = torch.Generator().manual_seed(3)
@@ -226,25 +174,3 @@ def test_samples_that_do_not_count_change_no_fit():
         alone = JointDMP.fit(time[i, kept], position[i, kept], 12, velocity[i, kept])
         torch.testing.assert_close(together[i].weights, alone.weights, rtol=1e-6, atol=1e-5)
         torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
-
-
-GRADIENT = """
-import sys
-import torch
-from hrc_learn.dmp import JointDMP
-
-t = torch.linspace(0, 2, 40, dtype=torch.float64)
-dmp = JointDMP.fit(t, torch.stack([torch.sin(t), t**2], -1), 6)
-path = lambda tau: dmp.rollout(t[::8], duration=tau).position.square().sum()
-tau = torch.tensor([1.7, 2.1], dtype=torch.float64, requires_grad=True)
-compiled = torch.compile(path, fullgraph=True, backend=sys.argv[1])
-found, expected = (torch.autograd.grad(f(tau), tau)[0] for f in (compiled, path))
-torch.testing.assert_close(found, expected)
-"""
-
-
-@pytest.mark.parametrize(
-    "backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)]
-)
-def test_a_compiled_rollout_has_the_gradient_by_its_duration(backend):
-    subprocess.run([sys.executable, "-c", GRADIENT, backend], check=True)
