@@ -59,6 +59,18 @@ def test_periods_are_found():
         assert fit_rhythmic(time, y).duration.item() == pytest.approx(PERIOD, rel=1e-3)
 
 
+def test_periods_are_found_in_noise():
+    """Of 0.3 of the amplitude, over five periods."""
+    rng, time = torch.Generator().manual_seed(0), torch.linspace(0, 8.3, 400).double()
+    found = []
+    for _ in range(10):
+        phase = 6 * torch.rand((), generator=rng).double()
+        noise = 0.3 * torch.randn(400, generator=rng).double()
+        wave = torch.sin(2 * torch.pi * time / 1.7 + phase) + noise
+        found.append(float(fit_rhythmic(time, wave[:, None], n_basis=10).duration))
+    assert np.sum(np.abs(np.array(found) - 1.7) < 0.03) >= 9
+
+
 def test_a_run_in_goes_over_to_the_rhythm():
     """Swelling from rest, the demonstration is met once it swings in full."""
     time, y = rhythm(duration=8.0, n_samples=900)

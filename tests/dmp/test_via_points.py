@@ -257,6 +257,11 @@ def test_what_cannot_be_is_refused():
     dmp = JointDMP.fit(time, position, n_basis=10)
     with pytest.raises(ValueError, match="too many for the 10 basis functions"):
         dmp.condition([0.3, 0.5, 1.0, 1.5, 2.0], torch.zeros(5, 1))
+    # Two equations for each point and two for the end: four of them it has functions for.
+    times = [0.6, 1.2, 1.8, 2.4]
+    there = dmp.rollout(time=times).position + 0.01
+    bent = dmp.condition(times, there).rollout(time=times).position
+    torch.testing.assert_close(bent, there, rtol=0, atol=1e-6)
     for times in ([3.0], [1.0, 1.0]):
         with pytest.raises(ValueError, match=r"between 0\.000 and 1\.000 of the duration"):
             dmp.condition(times, torch.zeros(len(times), 1))

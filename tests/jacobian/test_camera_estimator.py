@@ -22,7 +22,7 @@ from hrc_learn.jacobian import (
     fit_camera,
     paper_grid,
 )
-from hrc_learn.jacobian.perspective import ROTATION, marker_pixels
+from hrc_learn.jacobian.perspective import ROTATION, marker_pixels, stepped
 
 IMAGE, LEVER = (1440, 1080), np.array([-0.008, 0.145, -0.083])
 INTRINSICS = np.array([[1900.0, 0, 731.0], [0, 1900.0, 528.0], [0, 0, 1.0]])
@@ -197,6 +197,35 @@ def test_a_batch_is_its_elements_and_what_is_not_seen_teaches_nothing(network):
             frames[0], valid=torch.tensor(False), feature=torch.full((2,), torch.nan)
         )
         assert_close(estimator.update(alone, blind).cameras, alone.cameras)
+
+
+@pytest.mark.simulation
+def test_an_image_is_a_surprise_beyond_five_deviations_and_the_least_error(network):
+    config = CameraConfig(frames=12)
+    estimator, rng = CameraEstimator(network, config), np.random.default_rng(2)
+    position, orientation = path(rng, 0.06, 20)
+    frames = measurements(position, orientation, seen(VIEW, position, orientation, rng))
+    state = run(estimator, estimator.initial_state(), frames[:-1])
+    last = frames[-1]
+    at = Pose(last.pose.position[None], last.pose.orientation[None])
+
+    def pixel(step):
+        return marker_pixels(stepped(state.best, step), at)[0][0]
+
+    zero = torch.zeros(13, dtype=torch.float64)
+    steps = 1e-6 * torch.eye(13, dtype=torch.float64)
+    slope = torch.stack([(pixel(d) - pixel(-d)) / 2e-6 for d in steps], dim=-1)
+    deviation = (slope @ state.covariance @ slope.mT).diagonal().max().sqrt()
+    limit = 4.0 + 5 * (float(deviation) + 0.25)
+    towards = torch.tensor([0.6, -0.8]).double()
+    for far, surprises in ((0.98, 0), (1.02, 1)):
+        off = replace(last, feature=pixel(zero) + far * limit * towards)
+        assert int(run(estimator, state, [off]).surprises) == surprises
+    # An image without the marker says nothing.
+    surprised = replace(state, surprises=torch.tensor(2.0).double())
+    unseen = replace(last, valid=torch.tensor(False))
+    assert int(run(estimator, surprised, [unseen]).surprises) == 2
+    assert int(run(estimator, surprised, [last]).surprises) == 0
 
 
 @pytest.mark.simulation

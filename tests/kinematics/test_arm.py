@@ -337,6 +337,23 @@ def test_capsules_contain_what_they_are_fitted_to(kind, size):
     assert sum(map(capsule_volume, fitted)) < 6 * 4 / 3 * np.pi * far**3
 
 
+@pytest.mark.parametrize(
+    ("kind", "size", "extent", "points"),
+    [
+        ("box", (0.03, 0.05, 0.3), (0.03, 0.05, 0.3), 8),
+        # The prism of 16 corners around a cylinder is 2 % wider.
+        ("cylinder", (0.04, 0.2), (0.04 / np.cos(np.pi / 16),) * 2 + (0.2,), 32),
+        ("capsule", (0.04, 0.2), (0.04, 0.04, 0.24), 8),
+        ("sphere", (0.04, 0.0), (0.04, 0.04, 0.04), 8),
+    ],
+)
+def test_corners_of_shapes_lie_at_their_ends(kind, size, extent, points):
+    corners = shape_points(Shape(kind=kind, pose=np.eye(4), size=size))
+    assert corners.shape == (points, 3)
+    np.testing.assert_allclose(corners.max(0), extent, atol=1e-12)
+    np.testing.assert_allclose(corners.min(0), -np.array(extent), atol=1e-12)
+
+
 def test_a_bent_link_is_cut_into_its_bars():
     bars = [
         Shape(kind="box", pose=pose, size=(0.02, 0.02, 0.3))
