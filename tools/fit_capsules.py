@@ -7,7 +7,8 @@ coarsely, for files of users.
 
 What is contained are the convex hulls of a link's collision shapes, which is what MuJoCo takes
 for contacts as well. A link is cut into up to three parts by planes across one of its principal
-axes where this saves volume, each part of the hulls lies in one capsule.
+axes where this saves volume, each part of the hulls lies in one capsule. Capsules of a link of
+oblong section lie side by side; as they overlap, what counts is the volume of their union.
 """
 
 from __future__ import annotations
@@ -42,8 +43,11 @@ from hrc_learn.store import write_text
 _ROUNDING = 2e-6
 # Capsules hold every point with this much to spare [m]: far above rounding.
 _SLACK = 1e-6
-# One more capsule for a link has to save this part of the volume.
-_WORTH = 0.2
+# One more capsule for a link has to save this part of the volume. The wrists of a UR3 save 7 to
+# 9 % by a second one, which takes 14 mm off their radius; 1 % is the error of the estimate.
+_WORTH = 0.05
+# Points by which the volume of a union is estimated.
+_POINTS = 20_000
 # Cuts of a link, as fractions of its extent along an axis.
 _CUTS = ((), (0.25,), (0.35,), (0.5,), (0.65,), (0.75,), (0.2, 0.8), (0.3, 0.7))
 # Rounds of the search for a capsule's axis, tries in each, and how far the tries go [rad].
@@ -110,7 +114,7 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Fit]:
                 for a, b in pairwise(levels.tolist())
             ]
             parts = [part for part in parts if len(part)]
-            volume = sum(capsule_volume(fit_capsule(part, rng, rounds=1)) for part in parts)
+            volume = union_volume([fit_capsule(part, rng, rounds=1) for part in parts])
             if len(parts) not in best or volume < best[len(parts)][0]:
                 best[len(parts)] = volume, parts
     chosen = best[min(best)]
@@ -118,6 +122,25 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Fit]:
         if best[count][0] < (1 - _WORTH) * chosen[0]:
             chosen = best[count]
     return [fit_capsule(part, rng, rounds=_ROUNDS) for part in chosen[1]]
+
+
+def union_volume(capsules: Sequence[_Fit]) -> float:
+    """Volume that capsules fill together, estimated by a fixed set of points [m^3]."""
+    if len(capsules) == 1:
+        return capsule_volume(capsules[0])
+    starts, ends, radii = map(np.array, zip(*capsules, strict=True))
+    reach = radii[:, None]
+    low = np.minimum(starts, ends) - reach
+    high = np.maximum(starts, ends) + reach
+    low, edges = low.min(0), high.max(0) - low.min(0)
+    points = low + edges * np.random.default_rng(_SEED).random((_POINTS, 3))
+    inside = np.zeros(_POINTS, dtype=bool)
+    for start, end, radius in capsules:
+        way = end - start
+        fraction = ((points - start) @ way / max(float(way @ way), 1e-30)).clip(0, 1)
+        nearest = start + fraction[:, None] * way
+        inside |= np.linalg.norm(points - nearest, axis=1) < radius
+    return float(inside.mean() * edges.prod())
 
 
 def fit_capsule(
