@@ -71,13 +71,29 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
     simulated = (robot_type or "").removeprefix("mujoco_")
     if simulated != robot_type and simulated in registered_arms():
         return ArmChoice(simulated).work_arm()
-    name = _plain(_ROLES.sub("", (robot_type or "").lower().replace("_", "").replace("-", "")))
-    also = {other: arm for arm, row in _sources().items() for other in row.get("also", ())}
-    found = also.get(name, name)
+    name = _registered_name(robot_type or "")
     try:
-        return _registered(found) if found in registered_arms() else None
+        return None if name is None else _registered(name)
     except MissingModelError:
         return None
+
+
+def _registered_name(robot: str) -> str | None:
+    """Registered arm of a robot's name or type; None if unknown.
+
+    Capitals and punctuation do not count, nor do the maker in front and roles such as "follower".
+    """
+    sources = _sources()
+    names = {name: name for name in sources}
+    names |= {other: name for name, row in sources.items() for other in row.get("also", ())}
+    makers = {_plain(row["maker"]) for row in sources.values()}
+    makers |= {_plain(row["maker"].split()[0]) for row in sources.values()}
+    plain = _plain(robot)
+    for known in (plain, _ROLES.sub("", plain)):
+        for maker in ("", *sorted(makers, key=len, reverse=True)):
+            if found := names.get(known.removeprefix(maker)):
+                return found
+    return None
 
 
 def _plain(name: str) -> str:
@@ -97,9 +113,9 @@ def arm(
     """A robot arm by its name, or from a URDF or MJCF file.
 
     Args:
-        name_or_file: One of `registered_arms()`, the name of a description in an installed
-            package ("ur10e", "iiwa14"; see `installed_descriptions`), or a path that ends in
-            .urdf, .xml or .mjcf.
+        name_or_file: One of `registered_arms()` or another usual name of one ("xarm",
+            "Franka"), the name of a description in an installed package ("ur10e", "iiwa14"; see
+            `installed_descriptions`), or a path that ends in .urdf, .xml or .mjcf.
         base: Link or body to be the base, of files; None: the root.
         tip: Link, body or site to be the flange, of files; None: the only end besides a
             gripper's.
@@ -116,8 +132,8 @@ def arm(
     name, path = str(name_or_file), Path(name_or_file)
     choice = {"base": base, "tip": tip, "tool": tool, "limits": limits, "ready": ready}
     choice = {key: value for key, value in choice.items() if value is not None}
-    if name in registered_arms():
-        return _registered(name) if not choice else _described(name, choice)
+    if known := name if name in registered_arms() else _registered_name(name):
+        return _registered(known) if not choice else _described(known, choice)
     if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return arm_from_file(path, **choice)
     if found := installed_descriptions(name):
@@ -257,9 +273,11 @@ def _equipped(choice: ArmChoice) -> Arm:
     found = choice.arm()
     if found.is_franka:
         return found
-    hand, mount = _sources().get(choice.name, {}).get("hand", {}), None
+    hand, mount = {}, None
+    if choice.name in registered_arms() or _registered_name(choice.name):
+        hand = _sources()[found.name].get("hand", {})
     if "base" in hand:
-        found = _described(choice.name, {"base_turn": hand["base"]})
+        found = _described(found.name, {"base_turn": hand["base"]})
     if "origin" in hand:
         c, s = math.cos(hand["turn"]), math.sin(hand["turn"])
         mount = found.tcp.clone()

@@ -3,7 +3,7 @@
 import pytest
 from urdf_text import to_urdf
 
-from hrc_learn.kinematics import ArmChoice, arm, panda
+from hrc_learn.kinematics import ArmChoice, arm, fr3, panda
 from hrc_learn.kinematics.registry import arm_of_robot, installed_descriptions
 
 
@@ -46,10 +46,24 @@ def test_an_unknown_name_lists_what_there_is(menagerie):
 
 
 def test_robot_types_of_lerobot_are_registered_arms():
-    for kind in ("panda", "Franka", "franka_robot", "franka-emika-panda"):
+    for kind in ("panda", "Franka", "franka_robot", "franka-emika-panda", "franka_panda"):
         assert arm_of_robot(kind) is panda
     for kind in (None, "", "unknown", "koch_follower", "bi_so101_follower", "heron"):
         assert arm_of_robot(kind) is None
     assert arm_of_robot("mujoco_panda") is panda
     # Our simulated robots carry the hand of the work cell.
     assert arm_of_robot("mujoco_ur5e") is ArmChoice("ur5e").work_arm()
+    assert arm_of_robot("franka_research_3") is fr3
+
+
+@pytest.mark.skipif(arm_of_robot("xarm7") is None, reason="extra meshes")
+def test_people_type_names_as_they_know_them():
+    names = {"xarm": "xarm7", "ufactory_xarm7": "xarm7", "Universal-Robots UR5": "ur5"}
+    names |= {"unitree_z1": "z1", "SO-101": "so101", "so100": "so100", "xarm_robot": "xarm7"}
+    for typed, name in names.items():
+        assert arm(typed).name == name
+        typed_arm, named = ArmChoice(typed).work_arm(), ArmChoice(name).work_arm()
+        assert typed_arm.hand_size == named.hand_size
+        assert typed_arm.flange.equal(named.flange)
+    assert arm_of_robot("so100_follower") is arm("so101")
+    assert arm_of_robot("xarm6") is None
