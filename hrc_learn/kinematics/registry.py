@@ -81,7 +81,7 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
 def _registered_name(robot: str) -> str | None:
     """Registered arm of a robot's name or type; None if unknown.
 
-    Capitals and punctuation do not count, nor do the maker in front and roles such as "follower".
+    Capitals, punctuation, the maker in front and roles such as "follower" do not count.
     """
     sources = _sources()
     names = {name: name for name in sources}
