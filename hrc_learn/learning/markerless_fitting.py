@@ -226,9 +226,9 @@ class _Search:
         for demo, tools, item in list(zip(self._demos, found, objects, strict=True))[:3]:
             seen = [k for k, finding in enumerate(tools) if finding is not None] or [0]
             tiles = []
-            for _, shown in self._reader.stream(demo.episode, self._key, [seen[0], seen[-1]]):
+            for k, shown in self._reader.stream(demo.episode, self._key, [seen[0], seen[-1]]):
                 image = np.ascontiguousarray(shown)
-                for finding in filter(None, (tools[seen[len(tiles) - 1]], item)):
+                for finding in filter(None, (tools[k], item)):
                     draw_finding(image, finding)
                 tiles.append(image[::smaller, ::smaller])
             rows.append(np.hstack(tiles))

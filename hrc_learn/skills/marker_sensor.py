@@ -17,7 +17,7 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import StepLog
 from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, angle, centre
-from hrc_learn.vision.landmarks import LandmarkDetector, Landmarks
+from hrc_learn.vision.landmarks import Finding, LandmarkDetector, Landmarks, draw_finding
 
 # Standard deviation beyond which a landmark counts as not found [px].
 _UNSURE = 2.5
@@ -47,6 +47,10 @@ class FeatureSensor(ABC):
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image, RGB."""
         return self._camera.read()
+
+    def shown(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Take an image to be shown to people, RGB."""
+        return self.read()
 
     @abstractmethod
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
@@ -98,11 +102,25 @@ class LandmarkSensor(FeatureSensor):
         """
         super().__init__(camera)
         self._names, self._detector = names, LandmarkDetector(landmarks)
+        self._found: dict[str, Finding] = {}
+        self._is_fresh = False  # searched since the last image that was shown
+
+    def shown(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Take an image, with what was found since the last one drawn over it."""
+        image = self.read().copy()
+        for finding in self._found.values() if self._is_fresh else ():
+            draw_finding(image, finding)
+        self._is_fresh = False
+        return image
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
         """Take an image; landmarks found in it with a certain place, by number."""
         wanted = [i for i in (self._names if ids is None else ids) if i in self._names]
         found = self._detector.find(self.read(), [self._names[i] for i in wanted])
+        # An object is looked for before the tool comes over it, and still shown with the tool.
+        gone = {self._names[i] for i in wanted} - set(found)
+        self._found = {k: v for k, v in self._found.items() if k not in gone} | found
+        self._is_fresh = True
         return {
             i: SeenFeature(one.pixel, one.angle)
             for i in wanted
@@ -182,8 +200,8 @@ class DelayedDetection:
         self._joints: deque[tuple[float, np.ndarray]] = deque(maxlen=round(_REMEMBERED / dt))
 
     def image(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """An image taken now; None without a camera."""
-        return None if self._sensor is None else self._sensor.read()
+        """An image taken now, to be shown to people; None without a camera."""
+        return None if self._sensor is None else self._sensor.shown()
 
     def remember(self, time: float, joints: Float[np.ndarray, " joints"]) -> None:
         """Store joint positions at a time [s, rad]."""

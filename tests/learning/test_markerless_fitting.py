@@ -108,6 +108,16 @@ def test_the_tool_is_where_its_pose_says(fit):
         assert np.quantile(off, 0.9) < 2.5
 
 
+def test_the_picture_marks_the_tool_where_its_own_image_shows_it(fit):
+    assert fit.picture.shape == (3 * HEIGHT, 2 * WIDTH, 3)
+    red = (fit.picture == (255, 40, 40)).all(axis=-1)
+    for row, demo in enumerate(fit.demos):
+        seen = np.flatnonzero(demo.feature_visible)[[0, -1]]
+        for column, (u, v) in enumerate(np.rint(demo.feature[seen]).astype(int)):
+            tile = red[row * HEIGHT : (row + 1) * HEIGHT, column * WIDTH : (column + 1) * WIDTH]
+            assert tile[v, u]
+
+
 def test_the_object_is_found_with_its_angle(fit, filmed):
     found = np.array([d.extra[OBJECT_FEATURE][0, :2] for d in fit.demos])
     true = projected(np.array([place for place, _ in filmed[1]]))
