@@ -22,13 +22,14 @@ from hrc_learn.demos import (
     recover_all,
     repair_dataset,
 )
-from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
-from hrc_learn.demos.quality.repair import (
+from hrc_learn.demos.quality.ranking import (
     Decision,
     Decisions,
+    Ranking,
     Verdict,
     decisions_path,
     keep_decisions,
+    rank_episodes,
     read_decisions,
     write_curated,
 )

@@ -20,9 +20,9 @@ from hrc_learn.demos.issues import ValidationReport as ValidationReport
 from hrc_learn.demos.quality.check import check_dataset as check_dataset
 from hrc_learn.demos.quality.merging import merge_datasets as merge_datasets
 from hrc_learn.demos.quality.ranking import rank_episodes as rank_episodes
+from hrc_learn.demos.quality.ranking import write_curated as write_curated
 from hrc_learn.demos.quality.repair import RepairOptions as RepairOptions
 from hrc_learn.demos.quality.repair import repair_dataset as repair_dataset
-from hrc_learn.demos.quality.repair import write_curated as write_curated
 from hrc_learn.demos.read.quantities import ROLES as ROLES
 from hrc_learn.demos.read.source import DemonstrationSource as DemonstrationSource
 from hrc_learn.demos.read.source import load_demos as load_demos

@@ -134,7 +134,7 @@ class _EpisodeList:
         if segment.file not in placed:
             number = placed[segment.file] = self.videos.get(key, 0) + len(placed)
             path = metadata.place(metadata.VIDEO_PATH, number, video_key=key)
-            _put(segment.file, self.target / path, link=self._link)
+            put(segment.file, self.target / path, link=self._link)
         number = placed[segment.file]
         return {
             f"videos/{key}/chunk_index": number // metadata.CHUNK_SIZE,
@@ -232,7 +232,7 @@ def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> 
     """
     folder = open_folder(earlier)
     for file in (*earlier.glob("data/*/*.parquet"), *earlier.glob("videos/**/*.mp4")):
-        _put(file, listed.target / file.relative_to(earlier), link=True)
+        put(file, listed.target / file.relative_to(earlier), link=True)
     tables = [read_table(open_parquet(earlier, n), n) for n in episode_lists(earlier)]
     table = _concatenated(tables).sort_by("episode_index")
     listed.episodes = len(table)
@@ -252,8 +252,9 @@ def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments
     }
 
 
-def _put(source: Path, target: Path, *, link: bool) -> None:
+def put(source: str | Path, target: str | Path, *, link: bool = True) -> None:
     """Hard-link or copy a file: the original exists until the dataset is complete."""
+    target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
         try:

@@ -16,9 +16,10 @@ from hrc_learn.demos import DatasetError, open_demos
 from hrc_learn.demos.dataset_views import Chart, demonstration_charts
 from hrc_learn.demos.images import ImageReader, jpeg, thumbnail_size
 from hrc_learn.demos.issues import plain_text
-from hrc_learn.demos.quality.ranking import MEASURES, Ranking
-from hrc_learn.demos.quality.repair import (
+from hrc_learn.demos.quality.ranking import (
+    MEASURES,
     Decision,
+    Ranking,
     keep_decisions,
     read_decisions,
     write_curated,

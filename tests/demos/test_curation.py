@@ -14,11 +14,13 @@ from lerobot_folders import write_folder
 from hrc_learn.cli import dataset_commands
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.images import load_images
-from hrc_learn.demos.quality.ranking import gripper_moves, log_dimensionless_jerk, rank_episodes
-from hrc_learn.demos.quality.repair import (
+from hrc_learn.demos.quality.ranking import (
     Decision,
     decisions_path,
+    gripper_moves,
     keep_decisions,
+    log_dimensionless_jerk,
+    rank_episodes,
     read_decisions,
     write_curated,
 )

@@ -17,8 +17,7 @@ from websockets.sync.client import connect
 
 from hrc_learn.demos import load_demos
 from hrc_learn.demos.images import load_images
-from hrc_learn.demos.quality.ranking import rank_episodes
-from hrc_learn.demos.quality.repair import read_decisions
+from hrc_learn.demos.quality.ranking import rank_episodes, read_decisions
 from hrc_learn.demos.videos import decode_image
 from hrc_learn.kinematics import panda
 from hrc_learn.teleoperation import curation_page

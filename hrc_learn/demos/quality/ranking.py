@@ -1,23 +1,27 @@
-"""Ranking of a dataset's episodes by how doubtful they are.
+"""Ranking of a dataset's episodes by how doubtful they are, and the decisions on them.
 
-A ranking decides nothing: it tells a person which episodes to look at first, and why.
+A ranking decides nothing: it tells a person which episodes to look at first, and why. Decisions
+are kept next to the dataset, and a curated copy follows them.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.issues import Issue, aligned
+from hrc_learn.demos.issues import DatasetError, Issue, aligned
 from hrc_learn.demos.preprocessing import motion_range, resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
+from hrc_learn.demos.quality.repair import RepairOptions, RepairReport, repair_dataset
 from hrc_learn.demos.read.dataset_folder import Progress, open_folder
 from hrc_learn.demos.read.source import DemonstrationSource, open_dataset
+from hrc_learn.store import Count, read_json, write_json
 
 MEASURES = {
     "distance": "distance from the most similar episodes, relative to the usual one",
@@ -303,3 +307,111 @@ def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
             shown, own = float(np.exp(usual)) if is_duration else usual, known[k].measures[name]
             text = reason.format(own=own, usual=shown, above=own - shown)
             known[k].doubt(min(off[k] / _UNUSUAL, 5.0), text)
+
+
+Verdict = Literal["accept", "cut", "reject"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """Decision on one episode."""
+
+    verdict: Verdict
+    length: Count
+    """Number of frames of the episode."""
+    start: Count = 0
+    """First frame kept by a cut."""
+    stop: Count = 0
+    """End of the frames kept by a cut (exclusive)."""
+
+    def __post_init__(self) -> None:
+        is_cut = self.verdict == "cut"
+        if min(self.start, self.stop) < 0 or (
+            is_cut and not self.start < self.stop - 1 < self.length
+        ):
+            raise ValueError(
+                f"frames {self.start} to {self.stop} are no part of two frames or more of an "
+                f"episode of {self.length} frames"
+            )
+
+
+Decisions = dict[int, Decision]
+"""Episode index -> decision; episodes without one are accepted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DecisionFile:
+    decisions: dict[Count, Decision]
+    format: Literal[1] = 1
+
+
+def decisions_path(root: Path) -> Path:
+    """File of the decisions on a dataset, next to it."""
+    root = root.resolve()
+    return root.with_name(f"{root.name}.curation.json")
+
+
+def read_decisions(root: Path) -> Decisions:
+    """Decisions kept for the episodes of a dataset.
+
+    Raises:
+        DatasetError: The file is damaged, or belongs to another dataset.
+    """
+    path, advice = decisions_path(root), "delete it to begin anew"
+    if not path.is_file():
+        return {}
+    lengths = {entry.index: entry.length for entry in open_folder(root).episodes}
+    try:
+        kept = read_json(path, _DecisionFile, advice).decisions
+    except ValueError as error:
+        raise DatasetError(str(error).removeprefix(f"{path}: "), file=path) from error
+    for index, known in kept.items():
+        if known.length != lengths.get(index):
+            text = (
+                f"decides on an episode of {known.length} frames, the dataset has "
+                f"{lengths.get(index, 'no such episode')}: it belongs to another dataset; "
+                f"{advice}"
+            )
+            raise DatasetError(text, file=path, episode=index)
+    return kept
+
+
+def keep_decisions(root: Path, decisions: Mapping[int, Decision]) -> None:
+    """Write the decisions next to the dataset, which is not changed."""
+    write_json(decisions_path(root), _DecisionFile(decisions=dict(decisions)))
+
+
+def write_curated(
+    path: str | Path,
+    out: str | Path,
+    decisions: Mapping[int, Decision],
+    *,
+    progress: Progress | None = None,
+) -> RepairReport:
+    """Write the accepted and cut episodes into a new dataset of version 3.0.
+
+    Values stay as they are. Videos are copied, and cut by their times in the list of episodes.
+    The old dataset is not changed.
+
+    Args:
+        path: The dataset.
+        out: Folder of the new dataset, which must not exist.
+        decisions: Decisions by episode; episodes without one are accepted.
+        progress: Wraps the episodes, as in `repair_dataset`.
+
+    Raises:
+        DatasetError: No episode is left, or an accepted one cannot be read.
+        FileExistsError: `out` exists.
+    """
+    kept = {entry.index: slice(0, entry.length) for entry in open_folder(path).episodes}
+    for index, decision in decisions.items():
+        if index not in kept:
+            raise DatasetError("there is no such episode", file=path, episode=index)
+        if decision.verdict == "cut":
+            kept[index] = slice(decision.start, decision.stop)
+        elif decision.verdict == "reject":
+            del kept[index]
+    if not kept:
+        raise DatasetError("every episode is rejected: nothing is left to write", file=path)
+    options = RepairOptions(trim=False, drop_late=False, unwrap=False, fix_signs=False)
+    return repair_dataset(path, out, options, progress=progress, kept=kept)

@@ -1,23 +1,46 @@
-"""Repaired and curated copies of a dataset, and the decisions kept next to it."""
+"""Repaired copies of a dataset, also of what a killed recorder of LeRobot left."""
 
-from collections.abc import Collection, Iterator, Mapping
+import shutil
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pyarrow as pa
 
+from hrc_learn.demos.dataset_assembly import put
 from hrc_learn.demos.issues import DatasetError, counted
 from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
+from hrc_learn.demos.quality.video_checks import read_stream
 from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_folder
+from hrc_learn.demos.read.dataset_files import (
+    INFO_PATH,
+    finished_parquet,
+    is_unfinished,
+    open_parquet,
+    read_rows,
+    read_table,
+    write_parquet,
+)
+from hrc_learn.demos.read.dataset_folder import (
+    EpisodeEntry,
+    Progress,
+    episode_lists,
+    open_folder,
+    read_info,
+)
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities
+from hrc_learn.demos.recorded_episode import to_table
 from hrc_learn.demos.videos import read_segments, video_keys
-from hrc_learn.store import Count, read_json, write_json
+from hrc_learn.store import write_json
 
+_LISTS = "meta/episodes"
 _STAMP_TOLERANCE = 1e-3
 """Deviation from a regular clock that is kept [s]: above the rounding of float32 stamps."""
 
@@ -103,7 +126,8 @@ def repair_dataset(
 ) -> RepairReport:
     """Repair a dataset of version 2.0, 2.1 or 3.0 into a new one of version 3.0.
 
-    The old dataset is not changed. Columns keep their keys, names and units. The new
+    The old dataset is not changed. If LeRobot's recorder was killed, the episodes that it had
+    saved are recovered first. Columns keep their keys, names and units. The new
     `timestamp` is frame / fps by definition. If LeRobot's old stamps differ from that, or
     frames may be dropped in the middle, and no column holds true stamps, `time` is added with
     the old ones.
@@ -121,19 +145,127 @@ def repair_dataset(
         DatasetError: An episode cannot be read or repaired, and must not be left out.
         FileExistsError: `out` exists.
     """
-    dataset = OpenedDataset.of(open_folder(path), mapping)
-    if not dataset.folder.episodes:
-        raise DatasetError("the dataset holds no episodes", file=dataset.folder.root)
-    repair = _Repair(dataset, options or RepairOptions(), units or {}, kept)
-    repair.report.path = Path(out)
-    rewritten = repair.episodes(progress)
-    if repair.options.dry_run:
-        for _ in rewritten:
-            pass
-    else:
-        root = dataset.folder.root
-        copying.write_copy(Path(out), rewritten, repair.tasks, notes_of=root)
-    return repair.report
+    with _finished(Path(path)) as (root, notes):
+        dataset = OpenedDataset.of(open_folder(root), mapping)
+        if not dataset.folder.episodes:
+            raise DatasetError("the dataset holds no episodes", file=dataset.folder.root)
+        repair = _Repair(dataset, options or RepairOptions(), units or {}, kept)
+        repair.report.path = Path(out)
+        repair.report.notes[:0] = notes
+        rewritten = repair.episodes(progress)
+        if repair.options.dry_run:
+            for _ in rewritten:
+                pass
+        else:
+            copying.write_copy(Path(out), rewritten, repair.tasks, notes_of=root)
+        return repair.report
+
+
+@contextmanager
+def _finished(root: Path) -> Iterator[tuple[Path, list[str]]]:
+    """The dataset, or a readable copy of what a killed recorder left, with a note."""
+    if not (unfinished := unfinished_files(root)):
+        yield root, []
+        return
+    with TemporaryDirectory(dir=root.parent, prefix=f".{root.name}.finished_") as copy:
+        lost = finish_recording(root, Path(copy))
+        said = f"recorder was killed: {', '.join(unfinished)} had no end"
+        yield Path(copy), [f"{said}; episodes lost: {lost}"]
+
+
+def unfinished_files(root: Path) -> list[str]:
+    """Files without an end in what LeRobot's recorder left when it was killed (version 3.0).
+
+    It writes the rows of each episode at once, but the footers of its files, and the list of
+    episodes, only at its end.
+    """
+    try:
+        listed = open_folder(root).files
+    except DatasetError:
+        listed = {}
+    data, lists = (sorted(root.glob(f"{part}/*/file-*.parquet")) for part in ("data", _LISTS))
+    names = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
+    missing = [f"{_LISTS} (missing)"] if data and not lists else []
+    return [name for name in names if name not in listed] + missing
+
+
+def finish_recording(root: Path, target: Path) -> int:
+    """Copy what a killed recorder left into an empty folder, such that it can be read.
+
+    Files that are complete are linked.
+
+    Returns:
+        Number of episodes that `meta/info.json` counts and that are not there.
+
+    Raises:
+        DatasetError: No saved episode is complete, or the metadata are damaged.
+    """
+    info, rows, frames = read_info(root), [], 0
+    features = {k: f for k, f in info["features"].items() if f["dtype"] != "video"}
+    lists = [file for file in episode_lists(root) if not is_unfinished(root / file)]
+    known = [row for file in lists for row in read_rows(root, file, ("episode_index",))]
+    listed = {row["episode_index"]: row for row in known}
+    left_out = shutil.ignore_patterns("episodes", "images")
+    shutil.copytree(root, target, ignore=left_out, copy_function=put, dirs_exist_ok=True)
+    for path in sorted(target.glob("data/*/file-*.parquet")):
+        if is_unfinished(path):
+            content = finished_parquet(path.read_bytes(), _example(features))
+            path.unlink()  # it may be the file of the recording itself
+            path.write_bytes(content)
+        file = str(path.relative_to(target))
+        table = read_table(open_parquet(target, file), file, ["episode_index"])
+        for index, length in Counter(table.column(0).to_pylist()).items():
+            row = {"episode_index": index, "length": length, "dataset_from_index": frames}
+            rows.append(listed.get(index, row | _place("data", path)))
+            frames += length
+    if not rows:
+        raise DatasetError("the recording holds no complete episode", file=root)
+    for key in info["features"].keys() - features.keys():
+        _place_videos(target, key, rows, info["fps"])
+    names = dict.fromkeys(name for row in rows for name in row)
+    (target / _LISTS / "chunk-000").mkdir(parents=True)
+    table = pa.table({name: [row.get(name) for row in rows] for name in names})
+    write_parquet(table, target / _LISTS / "chunk-000/file-000.parquet")
+    counts = {"total_episodes": len(rows), "total_frames": frames}
+    write_json(target / INFO_PATH, info | counts)
+    return max(0, info.get("total_episodes", 0) - len(rows))
+
+
+def _example(features: Mapping[str, Mapping]) -> pa.Table:
+    """One row of the features."""
+    others = {
+        key: pa.array(["" if feature["dtype"] == "string" else {"bytes": b"", "path": ""}])
+        for key, feature in features.items()
+        if feature["dtype"] in ("image", "string")
+    }
+    numbers = features.keys() - others
+    return to_table(
+        {k: np.zeros((1, *features[k]["shape"])) for k in numbers}, features, others
+    )
+
+
+def _place(kind: str, path: Path) -> dict[str, int]:
+    """Columns of the list of episodes that name a file, such as chunk-000/file-001.mp4."""
+    numbers = (int(name.rpartition("-")[2]) for name in (path.parent.name, path.stem))
+    return dict(zip((f"{kind}/chunk_index", f"{kind}/file_index"), numbers, strict=True))
+
+
+def _place_videos(root: Path, key: str, rows: Sequence[dict], fps: float) -> None:
+    """Add the videos of a camera to the episodes without one, in the order of recording."""
+    kind = f"videos/{key}"
+    left = [row for row in rows if f"{kind}/file_index" not in row]
+    for path in sorted(root.glob(f"{kind}/*/file-*.mp4")):
+        place, begin = _place(kind, path), 0
+        if any(place.items() <= row.items() for row in rows):
+            continue
+        with suppress(DatasetError):  # episodes without a video are reported later
+            images = read_stream(path).images
+            while left and begin + left[0]["length"] <= images:
+                row = left.pop(0)
+                end = begin + row["length"]
+                times = {"from_timestamp": begin / fps, "to_timestamp": end / fps}
+                row |= place | {f"{kind}/{name}": time for name, time in times.items()}
+                begin = end
 
 
 class _Repair:
@@ -235,111 +367,3 @@ class _Repair:
                 frame=int(stalled[0]) + 1,
             )
         return edit if options.fps is None else edits.resample_to_grid(edit, options.fps)
-
-
-Verdict = Literal["accept", "cut", "reject"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Decision:
-    """Decision on one episode."""
-
-    verdict: Verdict
-    length: Count
-    """Number of frames of the episode."""
-    start: Count = 0
-    """First frame kept by a cut."""
-    stop: Count = 0
-    """End of the frames kept by a cut (exclusive)."""
-
-    def __post_init__(self) -> None:
-        is_cut = self.verdict == "cut"
-        if min(self.start, self.stop) < 0 or (
-            is_cut and not self.start < self.stop - 1 < self.length
-        ):
-            raise ValueError(
-                f"frames {self.start} to {self.stop} are no part of two frames or more of an "
-                f"episode of {self.length} frames"
-            )
-
-
-Decisions = dict[int, Decision]
-"""Episode index -> decision; episodes without one are accepted."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _DecisionFile:
-    decisions: dict[Count, Decision]
-    format: Literal[1] = 1
-
-
-def decisions_path(root: Path) -> Path:
-    """File of the decisions on a dataset, next to it."""
-    root = root.resolve()
-    return root.with_name(f"{root.name}.curation.json")
-
-
-def read_decisions(root: Path) -> Decisions:
-    """Decisions kept for the episodes of a dataset.
-
-    Raises:
-        DatasetError: The file is damaged, or belongs to another dataset.
-    """
-    path, advice = decisions_path(root), "delete it to begin anew"
-    if not path.is_file():
-        return {}
-    lengths = {entry.index: entry.length for entry in open_folder(root).episodes}
-    try:
-        kept = read_json(path, _DecisionFile, advice).decisions
-    except ValueError as error:
-        raise DatasetError(str(error).removeprefix(f"{path}: "), file=path) from error
-    for index, known in kept.items():
-        if known.length != lengths.get(index):
-            text = (
-                f"decides on an episode of {known.length} frames, the dataset has "
-                f"{lengths.get(index, 'no such episode')}: it belongs to another dataset; "
-                f"{advice}"
-            )
-            raise DatasetError(text, file=path, episode=index)
-    return kept
-
-
-def keep_decisions(root: Path, decisions: Mapping[int, Decision]) -> None:
-    """Write the decisions next to the dataset, which is not changed."""
-    write_json(decisions_path(root), _DecisionFile(decisions=dict(decisions)))
-
-
-def write_curated(
-    path: str | Path,
-    out: str | Path,
-    decisions: Mapping[int, Decision],
-    *,
-    progress: Progress | None = None,
-) -> RepairReport:
-    """Write the accepted and cut episodes into a new dataset of version 3.0.
-
-    Values stay as they are. Videos are copied, and cut by their times in the list of episodes.
-    The old dataset is not changed.
-
-    Args:
-        path: The dataset.
-        out: Folder of the new dataset, which must not exist.
-        decisions: Decisions by episode; episodes without one are accepted.
-        progress: Wraps the episodes, as in `repair_dataset`.
-
-    Raises:
-        DatasetError: No episode is left, or an accepted one cannot be read.
-        FileExistsError: `out` exists.
-    """
-    kept = {entry.index: slice(0, entry.length) for entry in open_folder(path).episodes}
-    for index, decision in decisions.items():
-        if index not in kept:
-            raise DatasetError("there is no such episode", file=path, episode=index)
-        if decision.verdict == "cut":
-            kept[index] = slice(decision.start, decision.stop)
-        elif decision.verdict == "reject":
-            del kept[index]
-    if not kept:
-        raise DatasetError("every episode is rejected: nothing is left to write", file=path)
-    options = RepairOptions(trim=False, drop_late=False, unwrap=False, fix_signs=False)
-    return repair_dataset(path, out, options, progress=progress, kept=kept)

@@ -73,7 +73,7 @@ def _check_camera(
             return
         try:
             require_file(folder.root, name, first)
-            stream = _read_stream(path)
+            stream = read_stream(path)
             report.run(_size_and_rate, folder, stream, place)
             report.run(_length, folder, shown, stream, place)
             if number % every == 0:
@@ -88,7 +88,7 @@ def _check_camera(
         seen.setdefault(digest, first)
 
 
-def _read_stream(path: Path) -> _Stream:
+def read_stream(path: Path) -> _Stream:
     """Count the packets of a file.
 
     Raises:

@@ -8,10 +8,10 @@ import json
 import re
 import stat
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -170,8 +170,8 @@ def open_parquet(root: Path, file: str, episode: int | None = None) -> pq.Parque
         return pq.ParquetFile(root / file, page_checksum_verification=True)
     except (pa.ArrowException, OSError, ValueError) as error:
         text = (
-            "unreadable: the file is truncated, because the recording was not finalized or "
-            "the copy is incomplete"
+            "unreadable: the file is truncated, because the recording was not finalized (hrc "
+            "repair recovers its saved episodes) or the copy is incomplete"
         )
         raise DatasetError(text, file=file, episode=episode) from error
 
@@ -236,3 +236,192 @@ def row_group_starts(metadata: pq.FileMetaData) -> list[int]:
 def write_parquet(table: pa.Table, path: Path) -> None:
     """Write a table with a checksum of each page, which readers verify."""
     pq.write_table(table, path, write_page_checksum=True)
+
+
+_MAGIC = b"PAR1"
+_BOOLEAN, _BYTE, _I64, _BINARY, _LIST, _STRUCT = (1, 2), 3, 6, 8, 9, 12
+"""Types of Thrift's compact protocol; those from 4 to 6 are integers."""
+_Struct = dict[int, tuple[int, Any]]
+"""Type and value of each field of a struct, by its number."""
+_ENCODINGS = (5, [0, 3, 8])
+"""PLAIN, RLE and RLE_DICTIONARY: those of pyarrow's pages."""
+
+
+class _Page(NamedTuple):
+    """One page of a column in a Parquet file."""
+
+    start: int
+    end: int
+    plain_size: int
+    """Header and uncompressed content [bytes]."""
+    values: int
+    """Number of values, 0 for a dictionary."""
+
+
+def is_unfinished(path: Path) -> bool:
+    """True for a Parquet file without its footer: its writer was killed."""
+    with path.open("rb") as stream:
+        begin = stream.read(4)
+        stream.seek(max(0, path.stat().st_size - 4))
+        return begin == _MAGIC and stream.read() != _MAGIC
+
+
+def finished_parquet(content: bytes, example: pa.Table) -> bytes:
+    """A Parquet file whose writer was killed, with a new footer for its complete row groups.
+
+    A footer repeats what the headers of the pages say, and the schema. It is made from that of
+    an example; the pages are kept as they are.
+
+    Args:
+        content: The file: pages as pyarrow writes them, with Snappy and dictionaries.
+        example: One row of a table with the columns of the file.
+    """
+    sink = pa.BufferOutputStream()
+    pq.write_table(example, sink)
+    twin = sink.getvalue().to_pybytes()
+    footer, _ = _read_struct(twin, len(twin) - 8 - int.from_bytes(twin[-8:-4], "little"))
+    (group,) = footer[4][1][1]
+    model = [column[3][1] for column in group[1][1][1]]
+    pages, groups, end, total = [*_pages(content)], [], 4, 0
+    while (found := _row_group(pages, model)) is not None:
+        rows, chunks = found
+        columns = [
+            {2: (_I64, 0), 3: (_STRUCT, _column(own, chunk))}
+            for own, chunk in zip(model, chunks, strict=True)
+        ]
+        size = sum(page.plain_size for chunk in chunks for page in chunk)
+        groups.append({1: (_LIST, (_STRUCT, columns)), 2: (_I64, size), 3: (_I64, rows)})
+        pages = pages[sum(map(len, chunks)) :]
+        end, total = chunks[-1][-1].end, total + rows
+    footer |= {3: (_I64, total), 4: (_LIST, (_STRUCT, groups))}
+    made = _value_bytes(_STRUCT, footer)
+    return content[:end] + made + len(made).to_bytes(4, "little") + _MAGIC
+
+
+def _column(model: _Struct, pages: Sequence[_Page]) -> _Struct:
+    """Metadata of the pages of a column, with the type, name and codec of a model."""
+    data = next(page for page in pages if page.values)
+    sizes = {
+        5: sum(page.values for page in pages),
+        6: sum(page.plain_size for page in pages),
+        7: pages[-1].end - pages[0].start,
+        9: data.start,
+    }
+    if data is not pages[0]:
+        sizes[11] = pages[0].start
+    made = {number: model[number] for number in (1, 3, 4)} | {2: (_LIST, _ENCODINGS)}
+    return made | {number: (_I64, size) for number, size in sizes.items()}
+
+
+def _pages(content: bytes) -> Iterator[_Page]:
+    """Complete pages, in their order in the file."""
+    at = len(_MAGIC)
+    while True:
+        try:
+            header, begin = _read_struct(content, at)
+            plain, end = begin - at + header[2][1], begin + header[3][1]
+            # Number of values in a data page of either version.
+            values = next((header[n][1][1][1] for n in (5, 8) if n in header), 0)
+        except (IndexError, KeyError, TypeError, ValueError):
+            return
+        if end > len(content):
+            return
+        yield _Page(at, end, plain, values)
+        at = end
+
+
+def _row_group(
+    pages: Sequence[_Page], model: Sequence[_Struct]
+) -> tuple[int, list[list[_Page]]] | None:
+    """Number of rows and pages of each column of the next row group; None if incomplete.
+
+    A column begins with its dictionary, unless it holds Booleans. Any page of the first column
+    may be its last one.
+    """
+    each = [column[5][1] for column in model]  # values of one row
+    for first in accumulate(page.values for page in pages):
+        rows, chunks, at = first // each[0], [], 0
+        for count, column in zip(each, model, strict=True):
+            values, begin = 0, at
+            while values < rows * count and at < len(pages):
+                values, at = values + pages[at].values, at + 1
+            is_plain = column[1][1] == 0
+            if not rows or values != rows * count or bool(pages[begin].values) != is_plain:
+                break
+            chunks.append(pages[begin:at])
+        if len(chunks) == len(model):
+            return rows, chunks
+    return None
+
+
+def _read_struct(data: bytes, at: int) -> tuple[_Struct, int]:
+    """A struct of Thrift's compact protocol, and the place behind it."""
+    fields: _Struct = {}
+    number = 0
+    while data[at]:
+        step, kind = divmod(data[at], 16)
+        number, at = (number + step, at + 1) if step else _read_value(data, at + 1, 4)
+        value, at = _read_value(data, at, kind)
+        fields[number] = kind, value
+    return fields, at + 1
+
+
+def _read_value(data: bytes, at: int, kind: int) -> tuple[Any, int]:
+    if kind in _BOOLEAN:
+        return kind == 1, at
+    if kind == _BYTE:
+        return data[at], at + 1
+    if kind == _STRUCT:
+        return _read_struct(data, at)
+    if kind == _LIST:
+        size, part = divmod(data[at], 16)
+        size, at = _read_number(data, at + 1) if size == 15 else (size, at + 1)
+        values = []
+        for _ in range(size):
+            value, at = _read_value(data, at, part)
+            values.append(value)
+        return (part, values), at
+    number, at = _read_number(data, at)
+    if kind == _BINARY:
+        return data[at : at + number], at + number
+    if kind in (4, 5, _I64):
+        return (number >> 1) ^ -(number & 1), at
+    raise ValueError(f"type {kind} of Thrift is not used in Parquet")
+
+
+def _read_number(data: bytes, at: int) -> tuple[int, int]:
+    """Unsigned number of seven bits a byte, the lowest first."""
+    number = shift = 0
+    while data[at] & 128:
+        number |= (data[at] & 127) << shift
+        at, shift = at + 1, shift + 7
+    return number | data[at] << shift, at + 1
+
+
+def _value_bytes(kind: int, value: Any) -> bytes:
+    """A value in Thrift's compact protocol; fields of structs are at most 15 numbers apart."""
+    if kind in _BOOLEAN:
+        return b""
+    if kind == _BYTE:
+        return bytes([value])
+    if kind == _BINARY:
+        return _number_bytes(len(value)) + value
+    if kind == _LIST:
+        part, values = value
+        parts = b"".join(_value_bytes(part, one) for one in values)
+        return bytes([240 | part]) + _number_bytes(len(values)) + parts
+    if kind == _STRUCT:
+        made, last = b"", 0
+        for number, (own, one) in sorted(value.items()):
+            made += bytes([(number - last) << 4 | own]) + _value_bytes(own, one)
+            last = number
+        return made + b"\0"
+    return _number_bytes(value << 1 if value >= 0 else ~(value << 1))
+
+
+def _number_bytes(number: int) -> bytes:
+    made = bytearray()
+    while number > 127:
+        made.append(number & 127 | 128)
+        number >>= 7
+    return bytes([*made, number])

@@ -202,7 +202,10 @@ def episode_lists(root: Path) -> list[str]:
 def _episodes_v3(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     files = episode_lists(root)
     if not files:
-        text = "no list of episodes: the recording was not finalized, or the copy is incomplete"
+        text = (
+            "no list of episodes: the recording was not finalized, or the copy is incomplete; "
+            "hrc repair recovers its saved episodes"
+        )
         raise DatasetError(text, file="meta/episodes")
     places = ("chunk_index", "file_index")
     counts = ("episode_index", "length", "dataset_from_index")
