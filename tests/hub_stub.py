@@ -208,9 +208,11 @@ class _Handler(BaseHTTPRequestHandler):
             taken = tag in repo.tags
             repo.tags.setdefault(tag, repo.find(revision))
             self._send(409 if taken else 200, {"error": "exists"} if taken else {})
-        elif what == "tag":
+        elif what == "tag" and revision in repo.tags:
             repo.tags.pop(revision)
             self._send(200, {})
+        elif what == "tag":
+            self._send(404, {"error": revision}, {"X-Error-Code": "RevisionNotFound"})
         elif what == "branch":
             taken = revision in repo.branches
             repo.branches.setdefault(revision, repo.branches["main"])

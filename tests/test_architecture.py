@@ -125,11 +125,10 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
-    "cli": {"huggingface_hub", "httpx"},
+    "cli": {"huggingface_hub", "httpx", "lerobot"},
     "demos": {
         "av",
         "scipy",
-        "huggingface_hub",
         "h5py",
         "zarr",
         "tfrecord",
@@ -162,7 +161,6 @@ DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "rerun": "rerun-sdk",
     "franky_sim": "franky-sim",
-    "huggingface_hub": "huggingface-hub",
     # Parts and requirements of matplotlib's own.
     "mpl_toolkits": "matplotlib",
     "cycler": "matplotlib",
@@ -170,8 +168,8 @@ DISTRIBUTIONS = {
     "trimesh": "viser",
     # Requirements of lerobot's own.
     "torchvision": "lerobot",
-    # Requirement of huggingface-hub's own.
-    "httpx": "huggingface-hub",
+    "huggingface_hub": "lerobot",
+    "httpx": "lerobot",
     "gymnasium": "lerobot",
     "draccus": "lerobot",
 }

@@ -40,10 +40,9 @@ _LIBRARIES = {
     "ui": ("viser",),
     "gamepad": ("pygame",),
     "haptic": ("forcedimension_core",),
-    "lerobot": ("lerobot", "gymnasium"),
+    "lerobot": ("lerobot", "gymnasium", "huggingface_hub", "httpx"),
     "hardware": ("franky", "pylibfranka", "franky_sim"),
     "meshes": ("example_robot_data",),
-    "hub": ("huggingface_hub", "httpx"),
 }
 _DEVICES = {"--robot": "site.device", "--teleop": "site.leader"}
 """Settings that hold LeRobot's options of a device."""

@@ -18,10 +18,10 @@ from hrc_learn.demos import (
     check_dataset,
     load_demos,
     merge_datasets,
-    push_dataset,
     recover_all,
     repair_dataset,
 )
+from hrc_learn.demos.issues import counted
 from hrc_learn.demos.quality.ranking import (
     Decision,
     Decisions,
@@ -311,41 +311,46 @@ def _browser_decisions(args: Curate, ranking: Ranking) -> Decisions:
 
 
 def push(args: Push) -> int:
-    """Check the dataset, upload it, and print its address."""
+    """Check the dataset, have LeRobot upload it, and print its address.
+
+    Raises:
+        ValueError: The dataset has errors, or the name of the repository has another form.
+    """
+    if args.repo.count("/") != 1:
+        raise ValueError(f"repository name {args.repo!r} must have the form OWNER/NAME")
+    report = check_dataset(args.dataset)
+    if report.errors and not args.unsound:
+        raise ValueError(
+            f"{args.dataset} has {counted(len(report.errors), 'error')}: repair it, or upload "
+            f"it as it is (--unsound). The first: {report.errors[0]}"
+        )
+    sizes = [path.stat().st_size for path in args.dataset.rglob("*") if path.is_file()]
+    place = "nothing sent" if args.dry_run else _uploaded(args)
+    print(
+        f"{counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB: {place or 'nothing sent'}"
+    )
+    counts = {"errors": len(report.errors), "warnings": len(report.warnings)}
+    write_values(args.json, {"files": len(sizes), "bytes": sum(sizes)} | counts)
+    return 0 if place else 1
+
+
+def _uploaded(args: Push) -> str:
+    """Address of the dataset after LeRobot's upload with card and tag; "" if it was refused."""
     import httpx
+    from huggingface_hub import constants
     from huggingface_hub.errors import HfHubHTTPError
+    from lerobot.datasets import LeRobotDataset
 
     try:
-        pushed = push_dataset(
-            args.dataset,
-            args.repo,
-            private=args.private,
-            license=args.license,
-            tags=args.tags,
-            unsound=args.unsound,
-            dry_run=args.dry_run,
+        LeRobotDataset(args.repo, root=args.dataset).push_to_hub(
+            tags=[*args.tags], license=args.license, private=args.private
         )
     except HfHubHTTPError as error:
         status = getattr(error.response, "status_code", None)
         login = " (`hf auth login` with a token that may write)" if status in (401, 403) else ""
         print(f"error: refused by the Hub: {one_line(error)}{login}", file=sys.stderr)
-        return 1
+        return ""
     except httpx.TransportError as error:
         print(f"error: the Hub cannot be reached: {one_line(error)}", file=sys.stderr)
-        return 1
-    if args.dry_run:
-        print(pushed.card)
-        print(*(f"{size:12d}  {file}" for file, size in pushed.files.items()), sep="\n")
-    size = f"{len(pushed.files)} files, {pushed.bytes / 1e6:.1f} MB"
-    place = pushed.url or f"{pushed.repo}, nothing sent"
-    print(f"{size}, tag {pushed.tag}: {place}")
-    if args.license is None and "license:" not in pushed.card:
-        print("no licence: --license names the one under which others may use the data")
-    values = {
-        "files": len(pushed.files),
-        "bytes": pushed.bytes,
-        "errors": len(pushed.report.errors),
-        "warnings": len(pushed.report.warnings),
-    }
-    write_values(args.json, values)
-    return 0
+        return ""
+    return f"{constants.ENDPOINT}/datasets/{args.repo}"

@@ -6,7 +6,6 @@ from hrc_learn.demos.dataset_writer import DatasetWriter as DatasetWriter
 from hrc_learn.demos.demonstration import Demonstration as Demonstration
 from hrc_learn.demos.demonstration import DemonstrationSet as DemonstrationSet
 from hrc_learn.demos.demonstration import PaddedDemonstrations as PaddedDemonstrations
-from hrc_learn.demos.hub import push_dataset as push_dataset
 from hrc_learn.demos.image_features import Detector as Detector
 from hrc_learn.demos.image_features import Extraction as Extraction
 from hrc_learn.demos.image_features import attach_features as attach_features
