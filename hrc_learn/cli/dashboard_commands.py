@@ -162,8 +162,6 @@ def _shown(args: Show) -> "ShownDataset":
 
 def report(args: Report) -> None:
     """Write the reports of several runs to one page."""
-    if not args.runs:
-        raise ValueError("name at least one folder with a report.json")
     reports = [read_report(run) for run in args.runs]
     title = reports[0].title if len(reports) == 1 else "Runs"
     page = evidence_page(reports) if args.evidence else reports_page(title, reports)

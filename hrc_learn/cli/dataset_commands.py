@@ -48,8 +48,6 @@ _RANKED_LINES = 20
 
 def import_recordings(args: Import) -> None:
     """Show what the recordings hold, and convert them."""
-    if not args.files:
-        raise ValueError("name at least one recording to import")
     if args.out is None and not args.dry_run:
         raise ValueError("name the folder of the new dataset (--out), or give --dry-run")
     template = args.dry_run and args.mapping is not None and not args.mapping.exists()

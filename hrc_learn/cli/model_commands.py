@@ -202,6 +202,8 @@ def smooth(args: Smooth) -> None:
         raise FileNotFoundError(f"there is no folder {args.checkpoint}")
     if args.checkpoint is None and (args.remove or args.limits is None):
         raise ValueError("give --checkpoint, or --limits to write only a file.")
+    if args.dataset is None and not args.remove:
+        raise ValueError("give --dataset: the limits are those of its demonstrators.")
     # LeRobot takes seconds to import.
     from hrc_learn.lerobot.arm_values import ArmValues
     from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
@@ -210,8 +212,7 @@ def smooth(args: Smooth) -> None:
         remove_smoothing(args.checkpoint)
         print(f"limits removed from {args.checkpoint}")
         return
-    if args.dataset is None:
-        raise ValueError("give --dataset: the limits are those of its demonstrators.")
+    assert args.dataset is not None
     limits = gathered_limits(
         args.dataset,
         scale=args.scale,

@@ -8,6 +8,8 @@ import subprocess
 import sys
 import typing
 from dataclasses import dataclass, field
+from fractions import Fraction
+from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -68,6 +70,11 @@ def test_the_page_of_commands_lists_every_command():
     page = Path(__file__).parents[2] / "docs" / "howto" / "commands.md"
     text = page.read_text(encoding="utf-8")
     assert not [name for name in COMMANDS if f"`hrc {name}" not in text]
+
+
+def test_the_version_is_that_of_the_package():
+    status, output, error = hrc("--version")
+    assert (status, output, error) == (0, f"{metadata.version('hrc-learn')}\n", "")
 
 
 def test_help_waits_for_no_library():
@@ -161,6 +168,22 @@ def test_choices_are_those_of_the_package(alias, known):
         (("serve", "--config", "site.speeed=1"), "site.speeed: no such setting; did you mean"),
         (("check", "none"), "there is no dataset"),
         (("import", "none.npz", "--out", "new"), "none.npz"),
+        (("import", "--out", "new"), "missing: --files (see hrc import --help)"),
+        (("import", "none.npz"), "name the folder of the new dataset (--out)"),
+        (("report", "--out", "new.html"), "missing: --runs (see hrc report --help)"),
+        (("smooth",), "give --checkpoint, or --limits to write only a file"),
+        (
+            ("smooth", "--limits", "new.json"),
+            "give --dataset: the limits are those of its demonstrators",
+        ),
+        (
+            ("play", "none", "--goal", 0.4, 0, 0.4, "--out", "new"),
+            "there is no model at none",
+        ),
+        (
+            ("multiply", "none", "--episodes", -1, "--out", "new"),
+            "--episodes must not be negative, but is -1",
+        ),
         (("fit", "--dataset", "none", "--out", "new"), "none"),
         (("fit", "image-jacobian", "--dataset", "none", "--out", "new"), "none"),
         (("evaluate", "none", "none"), "no model at none"),
@@ -194,9 +217,14 @@ class Stop:
     reason: str = ""
 
 
+type Gait = Literal["trot", "walk"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Motion:
     speed: float = 1.0
+    gait: Gait = "walk"
+    share: Fraction = Fraction(1, 2)
     mode: Literal["fast", "slow"] = "slow"
     corner: tuple[float, float] = (0.0, 0.0)
     stops: tuple[Stop, ...] = ()
@@ -216,13 +244,20 @@ class Settings:
 def test_settings_are_read_from_words_and_files_the_last_one_counts(tmp_path):
     file = tmp_path / "cell.toml"
     file.write_text("[motion]\nspeed = 2\ncorner = [1, 0.5]\n")
-    texts = ("motion.speed=3", str(file), "motion.mode=fast", "most-tries=5")
+    texts = (
+        "motion.speed=3",
+        str(file),
+        "motion.mode=fast",
+        "most-tries=5",
+        "motion.gait=trot",
+    )
     stops = "motion.stops=[{after=1}, {after=2.5, reason='door'}]"
     settings = with_settings([*texts, stops, "motion.log=a/b"], Settings())
     assert settings == Settings(
         motion=Motion(
             speed=2.0,
             mode="fast",
+            gait="trot",
             corner=(1.0, 0.5),
             stops=(Stop(after=1.0), Stop(after=2.5, reason="door")),
             log=Path("a/b"),
@@ -243,6 +278,9 @@ def test_settings_are_read_from_words_and_files_the_last_one_counts(tmp_path):
         ("motion.corner=[1]", "--config motion.corner must be"),
         ("motion.stops=[{after=1, why=2}]", "motion.stops.why: no such setting"),
         ("motion.speed=0", "speed must be positive"),
+        ("motion.gait=gallop", "--config motion.gait must be"),
+        ("motion.share=2", "Fraction cannot be given here"),
+        ("motion.two words=2", "--config motion.two words=2: not NAME=VALUE"),
     ],
 )
 def test_a_wrong_setting_is_named(text, message):
@@ -279,6 +317,8 @@ def run(monkeypatch, main) -> object:
         (PermissionError(13, "Permission denied", "/x"), 2, "error: /x: Permission denied\n"),
         (IsADirectoryError(21, "Is a directory", "/x"), 2, "error: /x: Is a directory\n"),
         (KeyboardInterrupt(), 1, "interrupted\n"),
+        (ConnectionRefusedError("no arm\nthere"), 1, "failed: no arm there\n"),
+        (OSError(28, "No space left on device"), 2, "error: [Errno 28] No space"),
         (
             ModuleNotFoundError("no mujoco", name="mujoco.viewer"),
             1,

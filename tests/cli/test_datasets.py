@@ -5,11 +5,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
-from commands import hrc
+from commands import done, hrc
 from lerobot_folders import joint_path, write_folder
 from rrd_reading import Rrd
 
@@ -222,6 +223,40 @@ def test_findings_are_written_even_if_the_camera_check_fails(tmp_path, monkeypat
     assert (status, error.count("\n")) == (2, 1)
     assert "no marker was seen in 2 episodes" in error  # so they were read as told
     assert all(path.exists() for path in written.values())
+
+
+@pytest.mark.parametrize(
+    ("places", "said", "moved"),
+    [
+        ((), "the marker is visible in fewer than two episodes, nothing to compare", 0),
+        (((0, 1),), "camera stood still in episodes 0, 1", 0),
+        (((0,), (1,)), "moved by 3 px in episodes 1", 1),
+    ],
+)
+def test_a_moved_camera_is_reported_with_its_episodes(
+    tmp_path, monkeypatch, places, said, moved
+):
+    groups = [SimpleNamespace(episodes=one, motion="moved by 3 px") for one in places]
+    monkeypatch.setattr(dataset_commands, "feature_trajectories", lambda demos: ())
+    monkeypatch.setattr(dataset_commands, "camera_placements", lambda *_: groups)
+    episodes = [{"observation.state": joint_path(60, 2, seed=k)} for k in range(2)]
+    root = write_folder(tmp_path / "set", episodes, {"observation.state": ["a.pos", "b.pos"]})
+    outcome = done("check", root, "--camera", "--json", tmp_path / "n.json")
+    assert said in outcome.output
+    assert json.loads((tmp_path / "n.json").read_text())["camera_moved"] == moved
+
+
+def test_a_contract_leaves_a_doubtful_unit_open(tmp_path):
+    swing = np.sin(np.linspace(0, 6, 80))[:, None] * [95, 90, 80]
+    names = ["shoulder_pan.pos", "elbow_flex.pos", "wrist_roll.pos"]
+    episode = {"observation.state": swing}
+    root = write_folder(tmp_path / "set", [episode] * 2, {"observation.state": names})
+    output = done("check", root, "--keep-contract").output
+    assert f"contract stored in {root / 'meta/hrc_learn.json'}: edit it there" in output
+    assert (
+        "unit left open, as the evidence is weak: observation.state/shoulder_pan.pos, "
+        in output
+    )
 
 
 def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):

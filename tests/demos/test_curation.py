@@ -225,6 +225,32 @@ def test_an_episode_is_not_decided_on_twice(odd, one, other):
     assert not decisions_path(odd).exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (("--reject", 99), "there is no episode 99; the dataset has 0 to 13"),
+        (("--cut", 3, "30"), "--cut 3 30: give the first frame to keep and the one after"),
+        (("--cut", 3, "30:9999"), "--cut 3 30:9999: give the first frame to keep"),
+    ],
+)
+def test_a_decision_on_what_does_not_exist_is_refused(odd, words, fault):
+    assert fault in done("curate", odd, "--no-browser", *words, status=2).error
+    assert not decisions_path(odd).exists()
+
+
+def test_a_cleaned_set_is_written_from_the_terminal(tmp_path):
+    root, out, figures = write_set(tmp_path / "set", "v2.0"), tmp_path / "new", tmp_path / "n"
+    lengths = [len(demo) for demo in load_demos(root)]
+    options = ("--no-browser", "--reject", 3, "--cut", 1, "20:90", "--out", out)
+    written = done("curate", root, *options, "--write", "--json", figures).output
+    frames = sum(lengths) - lengths[3] - lengths[1] + 70
+    assert f"{out}: 4 episodes, {frames} of {sum(lengths)} frames" in written
+    values = json.loads(figures.read_text())
+    assert (values["episodes"], values["frames"]) == (5, frames)
+    assert (values["episodes_rejected"], values["episodes_cut"]) == (1, 1)
+    assert [len(demo) for demo in load_demos(out)] == [lengths[0], 70, lengths[2], lengths[4]]
+
+
 def test_all_rejected_and_unknown_episodes_are_refused(odd, tmp_path):
     everything = dict.fromkeys(range(14), decide("reject", 100))
     with pytest.raises(DatasetError, match="every episode"):

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from importlib.metadata import distribution
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,26 +28,26 @@ MOVES = {
 GOALS = {"panda": (0.5, -0.1, 0.4), "so101": (0.25, 0.1, 0.15)}
 
 
-def taught(name, folder, factor=1.0):
+def taught(name, folder, factor=1.0, without=()):
     """Model of two demonstrations of an arm, with joints in units of `1 / factor` rad."""
     robot, demos, s = arm(name), [], np.linspace(0, 1, 101)[:, None]
     progress = minimum_jerk(torch.from_numpy(s))[0].numpy()
     for episode, move in enumerate(MOVES[name]):
         q = robot.ready.numpy() + progress * np.array(move) + 0.05 * np.sin(np.pi * s)
         tool = robot.forward(torch.from_numpy(q))
-        demos.append(
-            Demonstration(
-                episode=episode,
-                fps=50,
-                time=2 * s[:, 0],
-                joint_names=robot.chain.joint_names,
-                joint_position=factor * q,
-                position=tool.position.numpy(),
-                orientation=tool.orientation.numpy(),
-            )
+        demo = Demonstration(
+            episode=episode,
+            fps=50,
+            time=2 * s[:, 0],
+            joint_names=robot.chain.joint_names,
+            joint_position=factor * q,
+            position=tool.position.numpy(),
+            orientation=tool.orientation.numpy(),
         )
+        demos.append(replace(demo, **dict.fromkeys(without)))
     unit = "rad" if factor == 1.0 else "deg"
-    fit_primitives(DemonstrationSet(demos, joint_unit=unit), 20).save(folder)
+    channels = ("position",) if without else ()
+    fit_primitives(DemonstrationSet(demos, joint_unit=unit), 20, channels=channels).save(folder)
     return FittedModel.load(folder)
 
 
@@ -170,6 +171,70 @@ def test_a_path_without_an_arm_is_the_models_own(models):
     assert motion.joints[0] == pytest.approx(panda.ready.numpy(), abs=1e-3)
     apart = np.abs(motion.joints[-1] - goal.numpy())
     assert motion.goal_errors == {"goal_joint_error": pytest.approx(apart.max(), rel=1e-6)}
+
+
+@pytest.fixture(scope="module")
+def positions(tmp_path_factory):
+    """Model of positions alone."""
+    folder = tmp_path_factory.mktemp("positions") / "panda"
+    return taught("panda", folder, without=("joint_position", "orientation"))
+
+
+def test_positions_alone_are_played_from_any_start(positions):
+    goal, start = at(GOALS["panda"]), at((0.35, 0.1, 0.5))
+    motion = play_path(positions, start, goal, 1.5)
+    assert motion.orientation is None
+    assert motion.joints is None
+    assert motion.time[-1] == pytest.approx(1.5)
+    assert motion.position is not None
+    assert motion.position[0] == pytest.approx(start.position.numpy(), abs=1e-9)
+    off = np.linalg.norm(motion.position[-1] - goal.position.numpy())
+    assert off < 1e-3
+    assert motion.goal_errors["goal_position_error_mm"] == pytest.approx(1e3 * off, abs=1e-6)
+
+
+def test_positions_alone_move_an_arm(positions):
+    motion = moved(positions, "panda", at(GOALS["panda"]), at((0.35, 0.1, 0.5)))
+    ends = [tool_by_pinocchio("panda", joints) for joints in motion.joints[[0, -1]]]
+    assert ends[0] == pytest.approx((0.35, 0.1, 0.5), abs=1e-3)
+    assert ends[1] == pytest.approx(GOALS["panda"], abs=1e-3)
+    assert beyond("panda", motion.joints) <= 1 + 1e-6
+    with pytest.raises(ValueError, match="holds no primitive of joints: give --goal position"):
+        moved(positions, "panda", Target(joints=panda.ready))
+
+
+def test_an_arm_starts_at_the_joints_that_are_given(models):
+    first = panda.ready + 0.2
+    motion = moved(models["panda"], "panda", at(GOALS["panda"]), Target(joints=first))
+    assert motion.joints[0] == pytest.approx(first.numpy(), abs=1e-9)
+    assert tool_by_pinocchio("panda", motion.joints[-1]) == pytest.approx(
+        GOALS["panda"], abs=1e-3
+    )
+
+
+def test_what_a_model_cannot_play_is_named(models, positions):
+    joints = Target(joints=panda.ready)
+    with pytest.raises(ValueError, match=r"a goal of joints: it has position. With --robot"):
+        play_path(positions, None, joints, None)
+    with pytest.raises(ValueError, match="--start and --goal must be of one kind"):
+        play_path(models["panda"], joints, at(GOALS["panda"]), None)
+
+
+def test_poses_of_another_tool_are_refused_and_those_of_our_hand_found(models, tmp_path):
+    model = models["panda"]
+    moved_base = replace(model.pose.start, position=model.pose.start.position + 0.1)
+    other = SimpleNamespace(start=moved_base)
+    shifted = replace(model, primitives=model.primitives | {"pose": other})
+    with pytest.raises(ValueError, match=r"begin 173 mm from where its"):
+        arm_for(shifted, "panda")
+    robot = arm("ur5e")
+    hand = robot.with_hand()
+    joint = SimpleNamespace(start=robot.ready, joint_names=robot.chain.joint_names, units="rad")
+    for tool in (robot, hand):
+        pose = SimpleNamespace(start=tool.forward(robot.ready))
+        found = arm_for(replace(model, primitives={"joint": joint, "pose": pose}), "ur5e")
+        reached = found.forward(robot.ready).position
+        assert reached.tolist() == pytest.approx(pose.start.position.tolist(), abs=1e-9)
 
 
 def test_degrees_move_an_arm_as_radians_do(models, tmp_path):
