@@ -3,13 +3,14 @@
 import io
 import json
 
+import cv2
 import numpy as np
 import pytest
 from broken_copies import STATE
 from lerobot_folders import joint_path, one_step_of_act, read_info
 from scipy.spatial.transform import Rotation
 
-from hrc_learn.demos import DatasetError, ImageReader
+from hrc_learn.demos import DatasetError, ImageReader, load_demos
 from hrc_learn.demos.recording_formats import open_recordings
 from hrc_learn.demos.recording_import import plan_import, write_plan
 from hrc_learn.demos.recording_names import ImportOptions
@@ -591,6 +592,186 @@ def test_arrays_that_count_are_episodes(tmp_path):
     demos = read(tmp_path / "a.h5", fps=10)
     assert [len(demo) for demo in demos] == [30, 31]
     np.testing.assert_allclose(demos[1].joint_position, (Q + 1)[:31])
+
+
+def buffer(**arrays):
+    """A file of one array for each name, after each other in one buffer."""
+    return lambda path: np.savez(path / "a.npz", **({"q": Q} | arrays))
+
+
+def clocks(**arrays):
+    """A file of states at their own stamps, with further fields."""
+    given = {name.replace("__", "/"): values for name, values in arrays.items()}
+    content = {"robot/time": np.arange(40) / 20, "robot/q": Q} | given
+    return lambda path: write_hdf5(path / "a.h5", content)
+
+
+def kept_elsewhere(path):
+    import h5py
+
+    with h5py.File(path / "a.h5", "w") as file:
+        file.create_dataset("q", (40, 3), "f8", external=[("raw.bin", 0, h5py.h5f.UNLIMITED)])
+
+
+def of_two_rates(path):
+    for number, rate in enumerate((20, 30)):
+        np.savez(path / f"run_{number}.npz", q=Q, t=np.arange(40) / rate)
+
+
+def dataset(path):
+    (path / "meta").mkdir()
+    (path / "meta/info.json").write_text("{}")
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (dataset, "is a LeRobot dataset already: `hrc check`"),
+        (lambda path: (path / "notes.txt.bak").touch(), "holds no recording that is read here"),
+        (kept_elsewhere, "a.h5, q: is kept in another file: not opened"),
+        (
+            buffer(episode_ends=np.array([10, 50])),
+            r"up to the 40 frames there are, got \[10, 50",
+        ),
+        (buffer(episode_ends=np.array([20, 20, 40])), r"must increase up to the 40 frames"),
+        (buffer(episode_ends=np.array([0, 40])), r"must increase up to the 40 frames"),
+        (
+            buffer(episode=np.repeat([0, 1, 0, 2], 10)),
+            "numbers the episodes, but comes back to earlier ones",
+        ),
+        (
+            buffer(q=np.stack([Q] * 3), u=np.stack([Q] * 2)),
+            "(q|u): holds (2|3) demonstrations, other arrays hold (2|3)",
+        ),
+        (buffer(t=np.where(np.arange(40) == 7, np.nan, TIME)), "t: is nan at frame 7"),
+        (
+            clocks(tool__time=100 + np.arange(40) / 20, tool__gripper=np.full(40, 0.01)),
+            r"clocks of tool/gripper and of the state do not overlap",
+        ),
+        (
+            clocks(gripper=np.full(30, 0.01)),
+            "it has 30, the state 40, and no stamps are its own",
+        ),
+    ],
+)
+def test_recordings_that_cannot_be_read_say_why(tmp_path, write, message):
+    write(tmp_path)
+    with pytest.raises(DatasetError, match=message):
+        read(
+            *([tmp_path] if write is dataset else [*tmp_path.glob("a.*")] or [tmp_path]), fps=20
+        )
+
+
+def test_other_rates_need_one_for_the_dataset(tmp_path):
+    of_two_rates(tmp_path)
+    with pytest.raises(ValueError, match=r"frame rates differ: 20 \(run_0.npz\), 30 \(run_1"):
+        write_plan(plan(tmp_path), tmp_path / "set", "any", True)
+    write_plan(plan(tmp_path, fps=25), tmp_path / "set", "any", True)
+    for demo, rate in zip(load_demos(tmp_path / "set"), (20, 30), strict=True):
+        np.testing.assert_allclose(np.diff(demo.time), 1 / rate)
+
+
+def test_quantities_that_do_not_exist_are_named():
+    with pytest.raises(ValueError, match="unknown quantity 'wrench'; known are time, joint"):
+        ImportOptions(columns={"wrench": "x"})
+    ImportOptions(columns={"observation.wrench": "x", "action": "u", "joint_effort": "tau"})
+
+
+@pytest.mark.parametrize(
+    ("flags", "lengths"),
+    [
+        ({"dones": np.arange(40) % 10 == 9}, [10, 10, 10, 10]),
+        ({"dones": np.arange(40) == 24}, [25, 15]),
+        ({"terminals": np.arange(40) == 14, "timeouts": np.arange(40) == 29}, [15, 15, 10]),
+    ],
+)
+def test_flags_end_episodes_after_their_frame(tmp_path, flags, lengths):
+    np.savez(tmp_path / "a.npz", q=Q, **{name: f.astype(float) for name, f in flags.items()})
+    demos = read(tmp_path / "a.npz", fps=10)
+    assert [len(demo) for demo in demos] == lengths
+    np.testing.assert_array_equal(np.concatenate([d.joint_position for d in demos]), Q)
+
+
+def test_a_table_of_named_columns_in_one_array(tmp_path):
+    kinds = [("time", "f8"), ("j1", "f8"), ("j2", "f8"), ("j3", "f8")]
+    rows = [(t, *row) for t, row in zip(TIME.tolist(), Q.tolist(), strict=True)]
+    np.save(tmp_path / "a.npy", np.array(rows, kinds))
+    (demo,) = read(tmp_path / "a.npy")
+    np.testing.assert_array_equal(demo.joint_position, Q)
+    np.testing.assert_allclose(demo.time, TIME - TIME[0])
+
+
+def test_arrays_of_one_folder_are_one_recording_and_folders_in_it_several(tmp_path):
+    for number in range(2):
+        folder = tmp_path / f"run_{number}"
+        folder.mkdir()
+        np.save(folder / "qpos.npy", Q + number)
+        np.save(folder / "gripper.npy", np.full(40, 0.01 * number))
+    demos = read(tmp_path, fps=10)
+    for number, demo in enumerate(demos):
+        np.testing.assert_array_equal(demo.joint_position, Q + number)
+        np.testing.assert_array_equal(demo.gripper, 0.01 * number)
+
+
+def test_the_last_observation_may_have_no_action(tmp_path):
+    """Of n + 1 states and n actions, the last action counts for two."""
+    np.savez(tmp_path / "a.npz", qpos=Q, actions=Q[1:])
+    (one,) = plan(tmp_path / "a.npz", fps=10).episodes()
+    expected = np.concatenate([Q[1:], Q[-1:]])
+    np.testing.assert_array_equal(one.demonstration.command_position, expected)
+
+
+def test_transforms_of_three_rows_are_poses(tmp_path):
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = TURN.as_matrix(), Q
+    np.savez(tmp_path / "a.npz", ee_pose=poses[:, :3], t=TIME)
+    (demo,) = read(tmp_path / "a.npz")
+    np.testing.assert_allclose(demo.position, Q)
+    turned = Rotation.from_quat(demo.orientation, scalar_first=True)
+    assert (turned * TURN.inv()).magnitude().max() < 1e-9
+
+
+def test_images_are_written_from_bytes_and_from_real_numbers(tmp_path):
+    """Levels up to 1 are fractions of 255; images of one size are padded to no other."""
+    levels = np.linspace(0, 1, 40)
+    flat = np.ones((40, 32, 48, 3), "f4") * levels[:, None, None, None]
+    coded = [cv2.imencode(".png", np.full((32, 48, 3), k, np.uint8))[1] for k in range(40)]
+    rows = np.zeros((40, max(map(len, coded))), np.uint8)
+    for row, data in zip(rows, coded, strict=True):
+        row[: len(data)] = data.ravel()
+    depth = np.full((40, 32, 48), 900, np.uint16)
+    arrays = {"qpos": Q, "images/flat": flat, "images/coded": rows, "images/depth": depth}
+    write_hdf5(tmp_path / "a.h5", arrays)
+    made = plan(tmp_path / "a.h5", fps=10)
+    assert {*made.meaning.cameras} == {"flat", "coded"}
+    write_plan(made, tmp_path / "set", "any", True)
+    shown = ImageReader(tmp_path / "set").read(0)
+    for name, expected in (("flat", 255 * levels), ("coded", np.arange(40))):
+        mean = shown[f"observation.images.{name}"].float().mean((1, 2, 3))
+        np.testing.assert_allclose(mean, expected, atol=4)  # the encoder rounds, twice
+
+
+def test_commands_that_joints_do_not_follow_are_kept_as_recorded(tmp_path):
+    away = np.random.default_rng(1).uniform(-1, 1, Q.shape)
+    columns = {f"joint_{k}": Q[:, k] for k in range(3)}
+    columns |= {f"target_joint_{k}": away[:, k] for k in range(3)}
+    header = ",".join(["time", *columns])
+    rows = np.column_stack([TIME, *columns.values()])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=header, comments="")
+    made = plan(tmp_path / "a.csv")
+    (one,) = made.episodes()
+    assert one.demonstration.command_position is None
+    np.testing.assert_allclose(one.demonstration.extra["action"], away)
+    assert any("do not follow the recorded action" in note for note in made.meaning.notes)
+
+
+def test_joint_velocities_of_other_joints_are_left_out(tmp_path):
+    np.savez(tmp_path / "a.npz", qpos=Q, qvel=Q[:, :2], t=TIME)
+    columns = {"joint_position": "qpos", "joint_velocity": "qvel"}
+    made = plan(tmp_path / "a.npz", columns=columns)
+    (one,) = made.episodes()
+    assert one.demonstration.joint_velocity is None
+    assert made.meaning.left_out["qvel"] == "2 columns for 3 joints"
 
 
 def write_pusht(path):
