@@ -16,26 +16,33 @@ pytestmark = pytest.mark.simulation
 NETWORK = re.compile(r"hub|network|internet|offline|download|connection", re.IGNORECASE)
 
 
-@pytest.fixture(scope="module", params=["v3.0", "v2.1"])
-def sound(tmp_path_factory, request):
+VERSIONS = ("v3.0", "v2.1")
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    """A sound set of each version."""
+    return {version: write(tmp_path_factory, version) for version in VERSIONS}
+
+
+def write(tmp_path_factory, version):
     motions = [joint_path(60, seed=i) for i in range(3)]
     episodes = [
         {STATE: q, "action": q + 0.01 * np.sin(np.arange(60))[:, None]} for q in motions
     ]
     names = ["motor0.pos", "motor1.pos", "motor2.pos"]
     root = tmp_path_factory.mktemp("sound") / "set"
-    write_folder(root, episodes, {STATE: names, "action": names}, version=request.param)
-    return root
+    return write_folder(root, episodes, {STATE: names, "action": names}, version=version)
 
 
-@pytest.fixture
-def copy(sound, tmp_path):
+def copied(sound, tmp_path):
     shutil.copytree(sound, tmp_path / "set")
     return Copy(tmp_path / "set")
 
 
-def test_the_sound_set_has_no_findings_but_guesses_of_units(sound):
-    report = check_dataset(sound)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_sound_set_has_no_findings_but_guesses_of_units(sets, version):
+    report = check_dataset(sets[version])
     assert report.ok
     assert not [w for w in report.warnings if "no unit" not in w.message]
 
@@ -58,9 +65,17 @@ def assert_place(found: Issue, defect, copy: Copy) -> None:
         assert defect.key in found.key
 
 
-@pytest.mark.parametrize("name", DEFECTS)
-def test_every_defect_is_found_and_located(copy, name):
-    defect = DEFECTS[name]
+# test_checker_score.py has the other version of many.
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        (name, version)
+        for k, name in enumerate(DEFECTS)
+        for version in (VERSIONS if DEFECTS[name].file else VERSIONS[k % 2 :][:1])
+    ],
+)
+def test_every_defect_is_found_and_located(sets, tmp_path, name, version):
+    copy, defect = copied(sets[version], tmp_path), DEFECTS[name]
     defect.damage(copy)
     report = check_dataset(copy.root)
     assert not NETWORK.search(str(report))
@@ -81,8 +96,10 @@ def test_every_defect_is_found_and_located(copy, name):
         assert_place(raised.value.issue, defect, copy)
 
 
+@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("name", HARMLESS)
-def test_what_lerobot_stumbles_over_is_read_like_any_other(copy, name):
+def test_what_lerobot_stumbles_over_is_read_like_any_other(sets, tmp_path, name, version):
+    copy = copied(sets[version], tmp_path)
     HARMLESS[name](copy)
     assert check_dataset(copy.root).ok
     assert load_demos(copy.root).joint_names == ("motor0", "motor1", "motor2")

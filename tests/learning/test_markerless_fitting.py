@@ -20,7 +20,7 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 """From base to camera: image right is x, the view straight down."""
 PLATE = np.array([0.02, -0.03, -0.06])
 """Middle of a printed plate on the tool, in the tool's frame [m]."""
-EPISODES, FRAMES = 3, 24
+EPISODES, FRAMES = 3, 16
 
 
 def projected(points):
