@@ -1,5 +1,6 @@
 """Thresholds of the comparison between episodes, with cases on both sides of each."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -215,3 +216,65 @@ def test_a_hold_counts_above_five_usual_ones_and_two_per_cent(tmp_path, frames, 
 
     episodes = [episode(k, 4) for k in range(4)] + [episode(4, frames)]
     assert bool(found(tmp_path / "set", episodes, "encoder froze")) == frozen
+
+
+@pytest.mark.parametrize(
+    ("frames", "told"), [(21, False), (20, True), (499, False), (500, True)]
+)
+def test_an_episode_five_times_as_long_or_short_is_named(tmp_path, frames, told):
+    lengths = [100, 100, 100, 100, frames]
+    episodes = [{STATE: joint_path(n, seed=k)} for k, n in enumerate(lengths)]
+    issues = found(tmp_path / "set", episodes, "frames where 100 are usual: broken off")
+    assert [issue.episode for issue in issues] == ([ODD] if told else [])
+    assert all(f"has {frames} frames" in issue.message for issue in issues)
+
+
+def stated(root, **statistics):
+    """Statistics of the state as they are, but for some that are given."""
+    values = np.concatenate([joint_path(60, seed=k) for k in range(3)])
+    known = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+    known |= {name: change(known) for name, change in statistics.items()}
+    lists = {name: value.tolist() for name, value in known.items() if value is not None}
+    (root / "meta/stats.json").write_text(json.dumps({STATE: lists}))
+
+
+@pytest.mark.parametrize(
+    ("statistics", "text"),
+    [
+        ({}, ""),
+        # A part of a dataset keeps the statistics of the whole, up to 20 times as wide.
+        ({"max": lambda s: s["max"] + 15 * (s["max"] - s["min"])}, ""),
+        ({"max": lambda s: s["max"] + 25 * (s["max"] - s["min"]) + 1}, "in 3 components"),
+        ({"max": lambda s: s["max"] - 0.01 * (s["max"] - s["min"])}, ""),
+        ({"max": lambda s: s["max"] - 0.04 * (s["max"] - s["min"])}, "in 3 components"),
+        ({"min": lambda s: s["min"] + 0.04 * (s["max"] - s["min"])}, "in 3 components"),
+        ({"mean": lambda s: s["max"] + 0.04 * (s["max"] - s["min"])}, "in 3 components"),
+        ({"mean": lambda s: s["min"] - 0.04 * (s["max"] - s["min"])}, "in 3 components"),
+        ({"std": lambda s: s["std"] * [1, -1, 1]}, "in 1 components"),
+        ({"std": lambda _: None}, "statistics are incomplete"),
+    ],
+)
+def test_statistics_enclose_the_data_and_are_not_far_wider(tmp_path, statistics, text):
+    episodes = [{STATE: joint_path(60, seed=k)} for k in range(3)]
+    root = write_folder(tmp_path / "set", episodes, {STATE: JOINTS})
+    stated(root, **statistics)
+    said = [issue.message for issue in check_dataset(root).warnings]
+    said = [message for message in said if "statistics" in message]
+    assert len(said) == bool(text)
+    assert all(text in message for message in said)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "text"),
+    [(("  ",), "task 0 has no text"), (("pour", "stir"), "a task is listed twice")],
+)
+def test_tasks_have_texts_of_their_own(tmp_path, tasks, text):
+    episodes = [{STATE: joint_path(60, seed=k)} for k in range(2)]
+    root = write_folder(
+        tmp_path / "set", episodes, {STATE: JOINTS}, tasks=tasks, version="v2.1"
+    )
+    if len(tasks) > 1:
+        lines = [{"task_index": k, "task": "pour"} for k in range(2)]
+        texts = "".join(json.dumps(line) + "\n" for line in lines)
+        (root / "meta/tasks.jsonl").write_text(texts)
+    assert [i.message for i in check_dataset(root).warnings].count(text) == 1

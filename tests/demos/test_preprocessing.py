@@ -16,6 +16,7 @@ from hrc_learn.demos.preprocessing import (
     cut,
     estimate_joint_velocity,
     estimate_twist,
+    regular_grid,
     resample,
     resting,
     savitzky_golay,
@@ -338,3 +339,44 @@ def test_poses_are_aligned_too_and_the_median_leads():
         assert angle(demo.orientation, demos[1].orientation).mean() < 0.03
     with pytest.raises(ValueError, match="empty set"):
         align(DemonstrationSet([]))
+
+
+ALONE = swing(np.arange(60) / 50, position=None, orientation=None)
+FRAME = Demonstration(
+    time=np.zeros(1), joint_position=np.zeros((1, 1)), joint_names=("a",), fps=50
+)
+GRIPPER = Demonstration(time=np.arange(60) / 50, gripper=np.zeros(60), fps=50)
+
+
+@pytest.mark.parametrize(
+    ("step", "fault"),
+    [
+        (lambda: estimate_twist(ALONE), "a twist needs position and orientation"),
+        (lambda: resting(GRIPPER), "rest is found in joint positions or positions; neither"),
+        (lambda: resample(ALONE, 0), "fps must be positive, got 0"),
+        (lambda: resample(ALONE, 0.8), "1.18 s hold no two frames at 0.8 Hz"),
+        (lambda: resample(FRAME, 1), "hold no two frames|of one frame cannot be interpolated"),
+        (lambda: at_times(FRAME, np.zeros(2)), "of one frame cannot be interpolated"),
+        (
+            lambda: compensate_delay(ALONE, {"joint_velocity": -0.1}),
+            r"joint_velocity must be between 0 and 1.18 s, got -0.1",
+        ),
+        (lambda: compensate_delay(ALONE, {"joint_velocity": 1.2}), r"0 and 1.18 s, got 1.2"),
+        (lambda: compensate_delay(ALONE, {"gripper": 0.1}), "gripper is not recorded; there"),
+        (
+            lambda: align(DemonstrationSet([GRIPPER, GRIPPER])),
+            "alignment needs joints or poses recorded in all",
+        ),
+    ],
+)
+def test_what_a_step_needs_and_a_demonstration_lacks_is_named(step, fault):
+    with pytest.raises(ValueError, match=fault):
+        step()
+
+
+def test_a_grid_allows_for_rounded_stamps_and_no_more():
+    """A duration nine ten-thousandths of a period too short still holds its last frame."""
+    for missing, frames in ((0.0, 51), (9e-4, 51), (2e-3, 50)):
+        assert len(regular_grid(1 - missing / 50, 50)) == frames
+    assert len(regular_grid(0.02, 50)) == 2
+    np.testing.assert_allclose(np.diff(regular_grid(2.0, 8)), 1 / 8)

@@ -126,3 +126,9 @@ def test_a_pose_that_is_no_rotation_is_refused():
 def test_look_at_needs_two_points():
     with pytest.raises(ValueError, match="must differ"):
         CameraModel().look_at(np.zeros(3), np.zeros(3))
+
+
+@pytest.mark.parametrize("wrong", [{"width": 0}, {"height": -1}, {"focal": (1200.0, 0.0)}])
+def test_a_camera_without_an_extent_is_refused(wrong):
+    with pytest.raises(ValueError, match="width, height and focal must be positive, but are"):
+        CameraModel(**wrong)
