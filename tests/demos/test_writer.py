@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -253,6 +254,76 @@ def test_a_recording_without_episodes_leaves_nothing(tmp_path):
     with pytest.raises(DatasetError, match="no episode was saved"), writing(tmp_path / "set"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("wrong", "fault"),
+    [
+        ({"fps": 0}, "fps must be positive, got 0"),
+        ({"joint_names": ("a", "b", "a")}, "joint names must differ, got a, b, a"),
+        ({"features": {"shelf": ("row",)}}, "LeRobot understands: 'observation.shelf'"),
+    ],
+)
+def test_settings_that_no_reader_understands_are_refused(tmp_path, wrong, fault):
+    with pytest.raises(ValueError, match=fault):
+        DatasetWriter(tmp_path / "set", **({"fps": 50, "robot_type": "any"} | wrong))
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_joints_pictures_in_drafts_and_other_columns_are_refused(tmp_path):
+    root, time = tmp_path / "set", np.arange(9) / 50
+    other = Demonstration(time=time, fps=50, joint_position=np.ones((9, 1)), joint_names=("b",))
+    with DatasetWriter(root, 50, "any", ["a"]) as writer:
+        with pytest.raises(ValueError, match=r"joints \('b',\) are not the dataset's \('a',\)"):
+            writer.add_episode(other)
+        writer.add_episode(replace(other, joint_names=("a",)))
+
+    def append() -> None:
+        with DatasetWriter(root, 50, "any", ["a"], append=True) as writer:
+            writer.start_episode("reach")
+            for _ in range(3):
+                writer.add_frame(joint_velocity=[0.0])
+            writer.save_episode()
+
+    with pytest.raises(ValueError, match=r"cannot append to .*set: observation\.state.* there"):
+        append()
+    assert len(load_demos(root)) == 1
+
+    def draft() -> None:
+        with DatasetWriter(tmp_path / "seen", 50, "any", cameras={"front": (8, 8)}) as writer:
+            writer.write_draft("reach", [{"gripper": 0.1}])
+
+    with pytest.raises(RuntimeError, match="a draft holds no images"):
+        draft()
+
+
+@pytest.mark.parametrize("kind", ["missing", "damaged"])
+def test_an_interrupted_recording_that_is_not_whole_is_named(tmp_path, kind):
+    root = tmp_path / "set"
+
+    def record_three() -> None:
+        with DatasetWriter(root, 50, "any") as writer:
+            for _ in range(3):
+                writer.start_episode("reach")
+                for _ in range(4):
+                    writer.add_frame(gripper=0.1)
+                writer.save_episode()
+            raise OSError("lost")
+
+    with pytest.raises(OSError, match="lost"):
+        record_three()
+    staged = sorted((tmp_path / "set.recording").rglob("episode_*.parquet"))
+    assert len(staged) == 3
+    if kind == "missing":
+        staged[1].unlink()
+        fault = "is missing from the recording; rename the later ones"
+    else:
+        pq.write_table(pq.read_table(staged[1]).replace_schema_metadata({}), staged[1])
+        fault = "no episode of a recording"
+    with pytest.raises(DatasetError, match=fault) as raised:
+        recover_dataset(root)
+    assert str(raised.value.file).endswith("episode_000001.parquet")
+    assert not root.exists()
 
 
 def test_an_exception_keeps_the_saved_episodes_for_recovery(tmp_path):

@@ -10,11 +10,14 @@ from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open
 from hrc_learn.dmp import JointDMP, LearnedMotion, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
 from hrc_learn.learning import primitive_fitting
+from hrc_learn.learning.fit_dashboards import shown_fit
+from hrc_learn.learning.fitted_model import FittedModel
 from hrc_learn.learning.model_choice import contexts, keep_best
 from hrc_learn.learning.primitive_fitting import (
     EACH,
     Motions,
     fit_primitives,
+    fit_streamed,
     load_primitive,
     sampled,
 )
@@ -90,6 +93,32 @@ def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
     best = fitted.selection.error.min()
     chosen = fitted.selection.candidates.index(fitted.n_basis)
     assert fitted.selection.error[chosen] <= 1.05 * best
+
+
+def test_what_a_kind_cannot_do_is_named(demos, tmp_path):
+    with pytest.raises(ValueError, match=r"chosen by joints or positions: give n_basis"):
+        fit_primitives(demos, None, channels=("orientation",))
+    fitted = fit_primitives(demos, 10, channels=("orientation",))
+    with pytest.raises(ValueError, match="orientations alone cannot be shown"):
+        shown_fit(fitted, "Fit")
+    with pytest.raises(ValueError, match="shortest demonstration has 100 samples, too few"):
+        fit_primitives(demos, None, channels=("position",), candidates=(51, 60))
+    (tmp_path / "orientation").mkdir()
+    with pytest.raises(FileNotFoundError, match="holds no primitive of joints, poses or"):
+        FittedModel.load(tmp_path)
+
+
+def test_a_stream_is_of_joints_or_positions_that_are_recorded(tmp_path):
+    with DatasetWriter(tmp_path / "set", 50, "any", ["a"]) as writer:
+        writer.start_episode("reach")
+        for k in range(40):
+            writer.add_frame(joint_position=[0.01 * k])
+        writer.save_episode()
+    source = open_demos(tmp_path / "set")
+    with pytest.raises(ValueError, match="'pose' cannot be streamed, only joint and position"):
+        fit_streamed(source, 10, channels=("pose",))
+    with pytest.raises(ValueError, match=r"set, episode 0: no position\."):
+        fit_streamed(source, 10, channels=("position",))
 
 
 def test_contexts_are_ends_or_columns(demos, tmp_path):

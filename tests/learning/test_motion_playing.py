@@ -185,6 +185,7 @@ def test_positions_alone_are_played_from_any_start(positions):
     motion = play_path(positions, start, goal, 1.5)
     assert motion.orientation is None
     assert motion.joints is None
+    assert positions.joint_names == ()
     assert motion.time[-1] == pytest.approx(1.5)
     assert motion.position is not None
     assert motion.position[0] == pytest.approx(start.position.numpy(), abs=1e-9)
