@@ -200,3 +200,10 @@ def test_folders_of_texts_and_values_are_made_where_they_are_missing(tmp_path):
     store.write_json(path.with_name("values"), values)
     written = json.loads(path.with_name("values").read_text())
     assert written == {"a": 0.5, "b": 3, "c": None, "d": True}
+
+
+@pytest.mark.parametrize(("given", "place"), [("caches", "caches"), ("", "home/.cache")])
+def test_caches_are_where_the_user_keeps_them(tmp_path, monkeypatch, given, place):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / given) if given else "")
+    assert store.cache_home() == tmp_path / place
