@@ -30,18 +30,21 @@ from hrc_learn.experiments.grasping_trial import GraspingScene, GraspingSceneCon
 from hrc_learn.experiments.metric_table import wilson_interval
 from hrc_learn.experiments.surroundings import unmarked_for
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import CameraEstimator, Measurement
+from hrc_learn.jacobian import CameraConfig, CameraEstimator, Measurement
 from hrc_learn.kinematics import ArmChoice, UnreachableError
 from hrc_learn.sim import Imperfections, World, open_camera
 from hrc_learn.sim.scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import UNMARKED
-from hrc_learn.skills.marker_sensor import FeatureSensor, feature_sensor
+from hrc_learn.skills.marker_sensor import FeatureSensor, SeenFeature, feature_sensor
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Distances of the visited poses from above the middle of the table [m], and tilts [rad].
 _REACH, _HIGHER, _TILT = (0.10, 0.08), 0.06, 0.03
+# Distance of the tool from the border of the image [px].
+_BORDER = 80
 # Offset from the object that the grasping experiment wants [mm].
 _WANTED = 6.0
 
@@ -65,44 +68,65 @@ class Args:
     json: Path | None = None
 
 
-class _Scene(NamedTuple):
-    """Errors in one scene; NaN where something was not found."""
+class _Look(NamedTuple):
+    """The tool in one image."""
 
-    tool: list[float]
-    """Distances of the found from the true tool [px]."""
+    pose: Pose
+    """Measured pose."""
+    pixel: Float[np.ndarray, "2"]
+    """Where it was found [px]."""
+    true: Float[np.ndarray, "2"]
+    """Where it truly is [px]."""
+
+
+class _Seen(NamedTuple):
+    """Everything that was seen in one scene."""
+
+    item: SeenFeature
+    looks: list[_Look]
+    last: _Look | None
+    """Right above the object."""
+    jacobian: Float[np.ndarray, "2 2"]
+    """True derivative of the tool's pixel by its place in the plane, there [px/m]."""
+    yaw: float
+    """Turn of the object on the table [rad]."""
     looked: int
     """Images in which the tool was looked for."""
-    item: bool
-    """True if the object was found."""
-    turn: float
+
+
+class _Errors(NamedTuple):
+    """Errors in one scene; NaN where something was not found."""
+
+    turn: float = math.nan
     """Error of the gripper's turn for the object [deg]."""
-    offset: float
+    offset: float = math.nan
     """Distance from above the object at which servoing would end [mm]."""
-    predicted: float
+    predicted: float = math.nan
     """Standard deviation of that as predicted [mm]."""
 
 
 def main(args: Args) -> None:
     skill, start = VisualServoSkill.load(args.aiming), process_time()
     seeds = range(args.seed, args.seed + args.scenes)
-    scenes = [_scene(args, skill, seed) for seed in track(seeds, description="Scenes")]
-    tool = np.concatenate([one.tool for one in scenes])
-    offset = np.array([one.offset for one in scenes])
+    scenes = [_looks(args, skill, seed) for seed in track(seeds, description="Scenes")]
+    seen = [one for _, one in scenes if one is not None]
+    found = [_Errors() if one is None else _errors(skill, w, one) for w, one in scenes]
+    looks = [look for one in seen for look in (*one.looks, one.last) if look is not None]
+    tool = np.array([np.linalg.norm(look.pixel - look.true) for look in looks])
+    turn, offset, predicted = map(np.array, zip(*found, strict=True))
     near = int((offset < _WANTED).sum())
     low, high = wilson_interval(near, len(scenes))
-    known = offset[np.isfinite(offset)]
     figures = {
-        "scenes": float(len(scenes)),
-        "tool seen": len(tool) / sum(one.looked for one in scenes),
-        "tool, median [px]": _quantile(tool, 0.5),
-        "tool, p95 [px]": _quantile(tool, 0.95),
-        "objects found": float(sum(one.item for one in scenes)),
-        "turn, p95 [deg]": _quantile(np.array([one.turn for one in scenes]), 0.95),
-        "offset, median [mm]": _quantile(known, 0.5),
-        "offset, p95 [mm]": _quantile(known, 0.95),
-        "offset predicted, median [mm]": _quantile(
-            np.array([one.predicted for one in scenes]), 0.5
-        ),
+        "scenes": len(scenes),
+        "objects found": len(seen),
+        "tool seen": len(tool) / max(1, sum(one.looked for one in seen)),
+        "tool, median, px": _quantile(tool, 0.5),
+        "tool, p95, px": _quantile(tool, 0.95),
+        "turn, p95, deg": _quantile(np.abs(turn), 0.95),
+        "offset, median, mm": _quantile(offset, 0.5),
+        "offset, p95, mm": _quantile(offset, 0.95),
+        "offset, root mean square, mm": float(np.sqrt(np.nanmean(offset**2))),
+        "offset predicted, median, mm": _quantile(predicted, 0.5),
         f"within {_WANTED:g} mm": near / len(scenes),
     }
     console = Console()
@@ -121,7 +145,8 @@ def _quantile(values: Float[np.ndarray, " n"], q: float) -> float:
     return float(np.quantile(values, q)) if len(values) else math.nan
 
 
-def _scene(args: Args, skill: VisualServoSkill, seed: int) -> _Scene:
+def _looks(args: Args, skill: VisualServoSkill, seed: int) -> tuple[Workplace, _Seen | None]:
+    """Workplace of a scene, and what was seen there."""
     rng = np.random.default_rng(seed)
     workplace = Workplace.of(ArmChoice(args.robot).work_arm())
     workplace = unmarked_for(workplace, skill, UnmarkedLook(), seed)
@@ -129,10 +154,48 @@ def _scene(args: Args, skill: VisualServoSkill, seed: int) -> _Scene:
     drawn = GraspingSceneConfig(random_camera=not args.still)
     scene = GraspingScene.draw(workplace, drawn, rng, "synthetic", sizes)
     scene = replace(scene, workplace=scene.workplace.approached(skill.approach))
-    return _Looks(skill, scene, rng).errors(args.visits)
+    return scene.workplace, _Camera(skill, scene, rng).seen(args.visits)
 
 
-class _Looks:
+def _errors(
+    skill: VisualServoSkill,
+    workplace: Workplace,
+    seen: _Seen,
+    config: CameraConfig = UNMARKED,
+) -> _Errors:
+    """Where servoing would end, with a camera learned from what was seen."""
+    assert skill.target is not None
+    estimator = CameraEstimator(copy.deepcopy(skill.jacobian).double(), config)
+    state = estimator.initial_state()
+    looks = seen.looks if seen.last is None else [*seen.looks, seen.last]
+    for look in looks:
+        state = estimator.update(state, _measurement(look.pose, look.pixel))
+    target = ServoTarget(
+        config=VisualServoConfig(),
+        above=workplace.hover(),
+        posture=None,
+        visual=skill.target,
+        item=seen.item.pixel,
+        angle=seen.item.angle,
+        turn_range=workplace.hover_turns,
+    )
+    turn = math.nan
+    heading = target.heading(state.best)
+    if skill.angle is not None and heading is not None:
+        reference = target.above.orientation
+        turn = skill.angle.turn(heading, reference, 0.0, target.turn_range, None)
+        turn = math.degrees((turn - seen.yaw + math.pi / 2) % math.pi - math.pi / 2)
+    if seen.last is None:
+        return _Errors(turn=turn)
+    target = replace(target, orientation=seen.last.pose.orientation)
+    wanted = target.pixel(state.best, seen.last.pose)
+    offset = np.linalg.solve(seen.jacobian, wanted - seen.last.pixel)
+    learned = estimator.jacobian(state, seen.last.pose).numpy()
+    predicted = target.uncertainty(state.spread(), learned)
+    return _Errors(turn, 1e3 * float(np.linalg.norm(offset)), 1e3 * predicted)
+
+
+class _Camera:
     """A scene, its camera and what is found there."""
 
     def __init__(self, skill: VisualServoSkill, scene: GraspingScene, rng: np.random.Generator):
@@ -147,60 +210,32 @@ class _Looks:
             self._workplace.tool_marker,
             [self._item.marker.id],
         )
-        self._tool_errors: list[float] = []
         self._looked = 0
 
-    def errors(self, visits: int) -> _Scene:
-        workplace, skill = self._workplace, self._skill
-        self._place(workplace.home_joints())
+    def seen(self, visits: int) -> _Seen | None:
+        """Look for the object, then visit poses; None: the object was not found."""
+        self._place(self._workplace.home_joints())
         number = self._item.marker.id
         item = self._sensor.features([number]).get(number)
-        if item is None or skill.target is None:
-            return _Scene([], 0, False, math.nan, math.nan, math.nan)
-        estimator = CameraEstimator(copy.deepcopy(skill.jacobian).double(), UNMARKED)
-        state = estimator.initial_state()
-        for pose in self._visits(visits):
-            measured, pixel = self._look(pose)
-            if measured is not None and np.isfinite(pixel).all():
-                state = estimator.update(state, _measurement(measured, pixel))
-        above = workplace.hover()
-        target = ServoTarget(
-            config=VisualServoConfig(),
-            above=above,
-            posture=None,
-            visual=skill.target,
-            item=item.pixel,
-            angle=item.angle,
-            turn_range=workplace.hover_turns,
-        )
-        turn = 0.0
-        if skill.angle is not None and math.isfinite(item.angle):
-            heading = target.heading(state.best)
-            assert heading is not None
-            turn = skill.angle.turn(heading, above.orientation, 0.0, target.turn_range, None)
-        about = quaternion.exp(torch.tensor([0.0, 0.0, turn], dtype=torch.float64))
-        target = replace(target, orientation=quaternion.multiply(about, above.orientation))
-        yaw = math.atan2(self._scene.object_pose[1, 0], self._scene.object_pose[0, 0])
-        off = (turn - yaw + math.pi / 2) % math.pi - math.pi / 2
+        if item is None:
+            return None
+        looks = [self._look(pose) for pose in self._visits(visits)]
+        above, pose = self._workplace.hover(), self._scene.object_pose
+        yaw = math.atan2(pose[1, 0], pose[0, 0])
+        low, high = self._workplace.hover_turns
+        turned = low + (yaw - low) % math.pi if high - low >= math.pi - 1e-9 else yaw
+        about = quaternion.exp(torch.tensor([0.0, 0.0, turned], dtype=torch.float64))
         position = above.position.clone()
-        position[:2] = torch.from_numpy(self._scene.object_pose[:2, 3])
-        measured, pixel = self._look(Pose(position, target.tool_orientation))
-        if measured is None or not np.isfinite(pixel).all():
-            return _Scene(
-                self._tool_errors, self._looked, True, math.degrees(off), math.nan, math.nan
-            )
-        wanted = target.pixel(state.best, measured)
-        J = self._model.image_jacobian(self._world.marker_poses()[workplace.tool_marker][:3, 3])
-        offset = np.linalg.solve(J[:, :2], wanted - pixel)
-        learned = estimator.jacobian(state, measured).numpy()
-        predicted = target.uncertainty(state.spread(), learned)
-        return _Scene(
-            self._tool_errors,
-            self._looked,
-            True,
-            math.degrees(off),
-            1e3 * float(np.linalg.norm(offset)),
-            1e3 * predicted,
+        position[:2] = torch.from_numpy(pose[:2, 3])
+        last = self._look(Pose(position, quaternion.multiply(about, above.orientation)))
+        marker = self._world.marker_poses()[self._workplace.tool_marker][:3, 3]
+        return _Seen(
+            item=item,
+            looks=[look for look in looks if look is not None],
+            last=last,
+            jacobian=self._model.image_jacobian(marker)[:, :2],
+            yaw=yaw,
+            looked=self._looked,
         )
 
     def _visits(self, number: int) -> list[Pose]:
@@ -217,29 +252,27 @@ class _Looks:
             poses.append(Pose(above.position + torch.from_numpy(size * shift), orientation))
         return poses
 
-    def _look(self, pose: Pose) -> tuple[Pose | None, Float[np.ndarray, "2"]]:
-        """Measured pose and found pixel of a tool that truly is at a pose; None: not seen."""
-        robot, unseen = self._workplace.robot, np.full(2, np.nan)
+    def _look(self, pose: Pose) -> _Look | None:
+        """The tool found in an image while it truly is at a pose; None: not seen."""
+        robot = self._workplace.robot
         try:
             q = robot.inverse(pose, near=self._workplace.hover_joints())
+            self._place(q)
+            # Base and tool are truly elsewhere: a step back lands the true tool at the pose.
+            q = robot.inverse(_corrected(pose, self._true_tool()), near=q)
         except UnreachableError:
-            return None, unseen
-        # Base and tool are truly elsewhere: one step back lands the true tool at the pose.
-        self._place(q)
-        q = robot.inverse(_corrected(pose, self._true_tool()), near=q)
+            return None
         self._place(q)
         marker = self._workplace.tool_marker
         true = self._model.project(self._world.marker_poses()[marker][:3, 3])
-        inside = (true > 80).all() and (true < np.array([1360, 1000])).all()
-        if not inside:
-            return None, unseen
+        if not ((true > _BORDER).all() and (true < np.array(IMAGE_SIZE) - _BORDER).all()):
+            return None
         self._looked += 1
         found = self._sensor.features([marker]).get(marker)
         if found is None:
-            return None, unseen
-        self._tool_errors.append(float(np.linalg.norm(found.pixel - true)))
-        measured = self._world.arm.read().joint_position
-        return robot.chain.forward(torch.from_numpy(measured)), found.pixel
+            return None
+        measured = torch.from_numpy(self._world.arm.read().joint_position)
+        return _Look(robot.chain.forward(measured), found.pixel, true)
 
     def _place(self, q: Float[torch.Tensor, " joints"]) -> None:
         self._world.reset(q.numpy(), {self._item.name: self._scene.object_pose})

@@ -83,8 +83,8 @@ class MarkerlessFit:
     """Demonstrations with image features, in place of those recorded."""
     landmarks: Landmarks
     """Tool and object, to be found at run time."""
-    camera: CameraFit
-    """Camera that explains the motion of the tool."""
+    camera: Float[Tensor, "13"]
+    """Camera that explains the motion of the tool (see `jacobian.perspective`)."""
     seen: float
     """Fraction of the searched frames in which the tool was found."""
     deviation: float
@@ -150,14 +150,14 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
             "to the same time."
         )
     _, link, fit = best
-    tool = _tool(tracks, link, _adjusted(tracks, link, fit.camera, (width, height)), width)
-    # The place on the tool, from all points at once, is seen better than one point.
-    seen = [tool.find(one, width) for one in features]
-    pixels = np.array([(np.nan, np.nan) if one is None else one.pixel for one in seen])
-    fit = fit_camera([_as_demonstration(pixels, poses)], (width, height))
+    adjusted = _adjusted(tracks, link, fit.camera, (width, height))
+    tool = _tool(tracks, link, adjusted, width)
     landmarks = Landmarks(tool=tool, image_size=(width, height))
-    found = search.follow(landmarks, fit)
-    item = search.object(fit.camera)
+    # The place as the tool sees it: where it belongs to the wrist, it is on the common axis.
+    place = poses[0].inverse().apply(link.pose[0].apply(torch.from_numpy(tool.place)))
+    seen_by = torch.cat([adjusted[: MARKER.start], place])
+    found = search.follow(landmarks, seen_by)
+    item = search.object(seen_by)
     if item is not None:
         landmarks = replace(landmarks, objects={"object": item[0]})
     objects = [None] * len(demos) if item is None else item[1]
@@ -165,7 +165,7 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
     return MarkerlessFit(
         demos=_described(demos, found, objects),
         landmarks=landmarks,
-        camera=fit,
+        camera=seen_by,
         seen=len(sure) / max(1, search.followed),
         deviation=float(np.median(sure)),
         picture=search.picture(found, objects),
@@ -198,7 +198,9 @@ class _Search:
             shown = self._reader.stream(demo.episode, self._key, frames)
             yield [as_grey(image) for _, image in shown]
 
-    def follow(self, landmarks: Landmarks, fit: CameraFit) -> list[list[Finding | None]]:
+    def follow(
+        self, landmarks: Landmarks, camera: Float[Tensor, "13"]
+    ) -> list[list[Finding | None]]:
         """The tool in frames of every demonstration; None where it was not looked for, too."""
         found: list[list[Finding | None]] = []
         stride = max(1, sum(map(len, self._demos)) // _FOLLOWED)
@@ -207,8 +209,8 @@ class _Search:
             row: list[Finding | None] = [None] * len(demo)
             # From the last frame back, at which the target is learned.
             wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
-            expected = marker_pixels(fit.camera, _pose_of(demo))[0].numpy()
-            most = max(2 * _AGREES * self._size[0] / 1440, 6 * fit.noise)
+            expected = marker_pixels(camera, _pose_of(demo))[0].numpy()
+            most = 4 * _AGREES * self._size[0] / 1440
             for k, image in self._reader.stream(demo.episode, self._key, wanted):
                 seen = detector.find(image, ["tool"]).get("tool")
                 # A few points may agree by chance, but not with the motion of the arm.

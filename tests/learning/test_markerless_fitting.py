@@ -90,10 +90,8 @@ def fit(filmed):
 
 
 def test_the_camera_is_found_without_calibration(fit):
-    assert fit.camera.camera[FOCAL].exp() == pytest.approx(FOCUS, rel=0.05)
-    torch.testing.assert_close(
-        eye_of(fit.camera.camera), torch.from_numpy(EYE), atol=0.05, rtol=0
-    )
+    assert fit.camera[FOCAL].exp() == pytest.approx(FOCUS, rel=0.05)
+    torch.testing.assert_close(eye_of(fit.camera), torch.from_numpy(EYE), atol=0.05, rtol=0)
 
 
 def test_the_tool_is_where_its_pose_says(fit):
