@@ -65,8 +65,8 @@ _FEW_FRAMES, _SEARCHES, _FINALISTS = 100, 5, 3
 _CLEAR = 0.2
 # Residual, in robust standard deviations, beyond which a frame counts less.
 _OUTLIER = 2.5
-# Largest number of steps of a bundle adjustment, and relative gain of a step that ends it.
-_ADJUSTMENTS, _SETTLED = 60, 1e-6
+# Steps of a bundle adjustment: it settles within twenty.
+_ADJUSTMENTS = 30
 # Frames in a row whose errors are summed to measure how far neighbours share their errors.
 _BLOCK = 25
 
@@ -336,11 +336,8 @@ def adjust_bundle(
         parts = misfit(candidates)
         new = cost_of(candidates, parts[-1])
         if new < cost:
-            settled = bool(cost - new < _SETTLED * cost)
             cameras, (error, slope, square), cost = candidates, parts, new
             damping = damping / 5
-            if settled:
-                break
         else:
             damping = damping * 10
     return cameras

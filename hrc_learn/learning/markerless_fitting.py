@@ -150,8 +150,7 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
             "to the same time."
         )
     _, link, fit = best
-    adjusted = _adjusted(tracks, link, fit.camera, (width, height))
-    tool = _tool(tracks, link, adjusted, width)
+    tool, adjusted = _tool(tracks, link, fit.camera, (width, height))
     landmarks = Landmarks(tool=tool, image_size=(width, height))
     # The place as the tool sees it: where it belongs to the wrist, it is on the common axis.
     place = poses[0].inverse().apply(link.pose[0].apply(torch.from_numpy(tool.place)))
@@ -293,14 +292,10 @@ def _cameras(
         if len(chosen) < _TRIED and all(not a < _STILL * image_size[0] / 1440 for a in apart):
             chosen.append(pixels[k])
             for link in links:
-                yield fit_camera([_as_demonstration(pixels[k], link.pose)], image_size)
-
-
-def _as_demonstration(pixels: Float[np.ndarray, "frames 2"], pose: Pose) -> ImageDemonstration:
-    feature = torch.from_numpy(pixels)
-    return ImageDemonstration(
-        pose=pose, feature=feature.nan_to_num(0.0), visible=feature.isfinite().all(-1)
-    )
+                track = torch.from_numpy(pixels[k])
+                seen = track.isfinite().all(-1)
+                demo = ImageDemonstration(pose=link.pose, feature=track, visible=seen)
+                yield fit_camera([demo], image_size)
 
 
 def _points(
@@ -337,28 +332,20 @@ def _points(
     return point, good & (np.linalg.norm(point, axis=1) < _NEAR)
 
 
-def _adjusted(
+def _tool(
     tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], image_size: tuple[int, int]
-) -> Float[Tensor, "13"]:
-    """The camera that explains all points of a link together."""
+) -> tuple[Tool, Float[Tensor, "13"]]:
+    """The tool of the points that move with a link, and the camera adjusted to all of them."""
+    width = image_size[0]
     for reach in _CLOSER:
-        points, agrees = _points(tracks, link.pose, camera, image_size[0])
-        places = torch.from_numpy(points[agrees])
-        bare = camera[: MARKER.start].expand(len(places), MARKER.start)
-        pixels = torch.from_numpy(tracks.pixels[agrees])
-        each = adjust_bundle(
-            torch.cat([bare, places], dim=-1),
-            link.pose,
-            pixels,
-            image_size,
-            reach * image_size[0] / 1440,
+        points, agrees = _points(tracks, link.pose, camera, width)
+        places, pixels = (
+            torch.from_numpy(points[agrees]),
+            torch.from_numpy(tracks.pixels[agrees]),
         )
-        camera = each[0]
-    return camera
-
-
-def _tool(tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int) -> Tool:
-    """The points that move with a link, and the place on it that stands for the tool."""
+        cameras = torch.cat([camera[: MARKER.start].expand(len(places), -1), places], dim=-1)
+        reach_px = reach * width / 1440
+        camera = adjust_bundle(cameras, link.pose, pixels, image_size, reach_px)[0]
     points, agrees = _points(tracks, link.pose, camera, width)
     points = points[agrees]
     place = np.median(points, axis=0)
@@ -367,8 +354,13 @@ def _tool(tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int)
         origin, direction = link.axis
         place = origin + ((place - origin) @ direction) * direction
     f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
-    descriptors = tracks.descriptors[agrees]
-    return Tool(points=points, descriptors=descriptors, place=place, optics=(f, u, v, k))
+    tool = Tool(
+        points=points,
+        descriptors=tracks.descriptors[agrees],
+        place=place,
+        optics=(f, u, v, k),
+    )
+    return tool, camera
 
 
 def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> DemonstrationSet:

@@ -45,12 +45,8 @@ class FeatureSensor(ABC):
         return self._camera.age if isinstance(self._camera, TimedCamera) else 0.0
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Take an image, RGB."""
-        return self._camera.read()
-
-    def shown(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image to be shown to people, RGB."""
-        return self.read()
+        return self._camera.read()
 
     @abstractmethod
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
@@ -86,7 +82,7 @@ class MarkerSensor(FeatureSensor):
 
     def corners(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "4 2"]]:
         """Take an image; return the corners of each marker in it, clockwise from top left."""
-        return self._detector.detect(self.read(), ids)
+        return self._detector.detect(self._camera.read(), ids)
 
 
 class LandmarkSensor(FeatureSensor):
@@ -103,11 +99,11 @@ class LandmarkSensor(FeatureSensor):
         super().__init__(camera)
         self._names, self._detector = names, LandmarkDetector(landmarks)
         self._found: dict[str, Finding] = {}
-        self._is_fresh = False  # searched since the last image that was shown
+        self._is_fresh = False  # searched since the last image was shown
 
-    def shown(self) -> UInt8[np.ndarray, "height width 3"]:
+    def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image, with what was found since the last one drawn over it."""
-        image = self.read().copy()
+        image = self._camera.read().copy()
         for finding in self._found.values() if self._is_fresh else ():
             draw_finding(image, finding)
         self._is_fresh = False
@@ -116,7 +112,7 @@ class LandmarkSensor(FeatureSensor):
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
         """Take an image; landmarks found in it with a certain place, by number."""
         wanted = [i for i in (self._names if ids is None else ids) if i in self._names]
-        found = self._detector.find(self.read(), [self._names[i] for i in wanted])
+        found = self._detector.find(self._camera.read(), [self._names[i] for i in wanted])
         # An object is looked for before the tool comes over it, and still shown with the tool.
         gone = {self._names[i] for i in wanted} - set(found)
         self._found = {k: v for k, v in self._found.items() if k not in gone} | found
@@ -201,7 +197,7 @@ class DelayedDetection:
 
     def image(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """An image taken now, to be shown to people; None without a camera."""
-        return None if self._sensor is None else self._sensor.shown()
+        return None if self._sensor is None else self._sensor.read()
 
     def remember(self, time: float, joints: Float[np.ndarray, " joints"]) -> None:
         """Store joint positions at a time [s, rad]."""
