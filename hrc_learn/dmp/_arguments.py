@@ -106,6 +106,24 @@ def transforming() -> bool:
     return _transform_level() is not None or forward_ad._current_level >= 0
 
 
+def refuse_nested_forward(s: Tensor) -> None:
+    """Raise NotImplementedError where times may have two forward derivatives.
+
+    PyTorch silently takes the outer derivative of an `autograd.Function` for zero there.
+    """
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    if torch.compiler.is_compiling() or not functorch.is_functorch_wrapped_tensor(s):
+        return
+    from torch._functorch.pyfunctorch import retrieve_all_functorch_interpreters
+
+    levels = [str(level.key()) for level in retrieve_all_functorch_interpreters()]
+    if levels.count("TransformType.Jvp") > 1:
+        raise NotImplementedError(
+            "PyTorch loses the outer of two forward derivatives of a motion: use "
+            "jacfwd(jacrev(f)), as torch.func.hessian does"
+        )
+
+
 def fits_numpy(detached: Tensor, *others: Any) -> bool:
     """True if NumPy may compute with the tensors: nothing traces, maps or differentiates them.
 

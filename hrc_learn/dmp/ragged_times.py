@@ -18,10 +18,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import refuse_nested_forward
 from hrc_learn.dmp.response import (
     Response,
     chebyshev_points,
     empty_in_large_pages,
+    powers_of,
     product,
     without_subnormals,
 )
@@ -44,9 +46,13 @@ def motion(
         s: Normalised times, >= 0 (float64).
         coordinates: Coordinates of each column, as `Response` defines them.
         order: 0 for y itself, 1 for y', and so on.
+
+    Raises:
+        NotImplementedError: Two forward derivatives (`refuse_nested_forward`).
     """
     if torch.compiler.is_compiling():
         return _gathered(_table(response, order, coordinates), s, coordinates)
+    refuse_nested_forward(s)
     return _Motion.apply(s, coordinates, response, order)  # pyright: ignore[reportReturnType]
 
 
@@ -86,7 +92,7 @@ class CoefficientTable:
         if periodic:  # the remainder may round up to the divisor
             piece = piece.clamp(max=pieces - 1)
         u = 2 * (x - piece if periodic else x.frac()).to(dtype) - 1
-        powers = _powers(u, self.size)
+        powers = powers_of(u, self.size)
         if periodic or not (torch.compiler.is_compiling() or piece.max() == pieces):
             return piece, powers
         back = spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
@@ -100,20 +106,6 @@ class CoefficientTable:
         if self.response.forced.periodic:
             return spring_rows(self.response, s, self.order).to(dtype)
         return _approach(s, self.response.approach, self.order).to(dtype)[..., None]
-
-
-def _powers(u: Float[Tensor, "*batch"], size: int) -> Float[Tensor, "*batch K"]:
-    """Powers u^0 to u^(size - 1)."""
-    if torch.compiler.is_compiling() or u.requires_grad:
-        columns = [torch.ones_like(u)]
-        for _ in range(1, size):
-            columns.append(columns[-1] * u)
-        return torch.stack(columns, dim=-1)
-    # Written in place column by column: a product along rows of six takes twice as long.
-    powers = u.new_ones(*u.shape, size)
-    for k in range(1, size):
-        torch.mul(powers[..., k - 1], u, out=powers[..., k])
-    return powers
 
 
 def spring_rows(response: Response, s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import fits_numpy, transforming
+from hrc_learn.dmp._arguments import fits_numpy, refuse_nested_forward, transforming
 from hrc_learn.dmp.dynamics import (
     Basis,
     SpringDamper,
@@ -50,6 +50,24 @@ def chebyshev_points() -> Float[Tensor, "P"]:
     return (1 - torch.cos(torch.pi * k / DEGREE)) / 2
 
 
+def powers_of(u: Float[Tensor, "*batch"], size: int) -> Float[Tensor, "*batch K"]:
+    """Powers u^0 to u^(size - 1).
+
+    Products, because derivatives of `**` by tensors of exponents hold logarithms, of negative
+    numbers too.
+    """
+    if torch.compiler.is_compiling() or u.requires_grad or transforming():
+        columns = [torch.ones_like(u)]
+        for _ in range(1, size):
+            columns.append(columns[-1] * u)
+        return torch.stack(columns, dim=-1)
+    # Written in place column by column: a product along rows of six takes twice as long.
+    powers = u.new_ones(*u.shape, size)
+    for k in range(1, size):
+        torch.mul(powers[..., k - 1], u, out=powers[..., k])
+    return powers
+
+
 @dataclass(frozen=True, eq=False)
 class PiecewisePolynomial:
     """Matrix function f(s) = sum_p c_p u^p, with u from -1 to 1 along the piece around s."""
@@ -59,13 +77,7 @@ class PiecewisePolynomial:
     """Length of a piece."""
     periodic: bool = False
     """True if the first piece follows the last."""
-    _exponents: Float[Tensor, "1 P"] = field(init=False)
     _moved: dict[torch.device, "PiecewisePolynomial"] = field(default_factory=dict)
-
-    def __post_init__(self):
-        # Made here, because a tensor made while a program is traced cannot be kept.
-        exponents = torch.arange(DEGREE + 1)[None].to(self.coefficients)
-        object.__setattr__(self, "_exponents", exponents)
 
     @classmethod
     def interpolate(
@@ -91,7 +103,7 @@ class PiecewisePolynomial:
         x = s / self.interval
         x = x % pieces if self.periodic else x.clamp(0, pieces)
         piece = x.detach().long().clamp(max=pieces - 1)
-        powers = (2 * (x - piece) - 1)[..., None, None] ** self._exponents
+        powers = powers_of(2 * (x - piece) - 1, P).unsqueeze(-2)
         # `index_select`, because a tracer reads a single index in brackets as a number.
         c = self.coefficients.view(pieces, -1).index_select(0, piece.reshape(-1))
         return (powers @ c.view(*s.shape, P, -1)).view(*s.shape, *shape)
@@ -227,7 +239,12 @@ class Response:
         return position, velocity, acceleration
 
     def evaluate(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 M"]:
-        """Rows H(s), H'(s), H''(s); differentiable any number of times in `s`."""
+        """Rows H(s), H'(s), H''(s); differentiable any number of times in `s`.
+
+        Raises:
+            NotImplementedError: Two forward derivatives (`refuse_nested_forward`).
+        """
+        refuse_nested_forward(s)
         state = _StateAt.apply(s, self)
         return torch.cat([state, self._acceleration(s, state)], dim=-2)
 

@@ -128,6 +128,32 @@ def test_maps_over_durations(batch, output):
     torch.testing.assert_close(rates[0], central, rtol=1e-6, atol=1e-5)
 
 
+@shapes_unchecked()
+def test_second_derivatives_by_durations_are_right_or_refused(batch):
+    """PyTorch would lose the second of two forward derivatives of a rollout without a word."""
+    time = torch.linspace(0, 2.5, 30, dtype=torch.float64)
+    single, jacfwd, jacrev = batch[0], torch.func.jacfwd, torch.func.jacrev
+
+    def of_a_batch(tau):
+        return batch.rollout(time, duration=tau).position.square().sum()
+
+    def of_steps(tau):
+        state = single.initial_state(duration=tau[0])
+        # At times all over the motion, and beyond its end.
+        ends = [single.step(state, tau[1] + t).position for t in torch.linspace(0, 2, 9)]
+        return torch.stack(ends).square().sum()
+
+    for function, at in ((of_a_batch, [1.5, 2.0, 2.2, 2.7, 3.0]), (of_steps, [1.5, 0.07])):
+        tau = torch.tensor(at, dtype=torch.float64)
+        expected = jacrev(jacrev(function))(tau)
+        assert expected.abs().max() > 0.1
+        torch.testing.assert_close(jacfwd(jacrev(function))(tau), expected)
+        torch.testing.assert_close(jacrev(jacfwd(function))(tau), expected)
+    torch.testing.assert_close(jacfwd(jacfwd(of_steps))(tau), expected)
+    with pytest.raises(NotImplementedError, match=r"use jacfwd\(jacrev\(f\)\)"):
+        jacfwd(jacfwd(of_a_batch))(torch.ones(5, dtype=torch.float64))
+
+
 def recordings(n, lengths, velocity=False):
     """Motions with timestamps of their own, in lists."""
     rng = torch.Generator().manual_seed(3)
