@@ -8,7 +8,7 @@ import torch
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import TOOL_LINK, GraspedBox, panda, separation
-from hrc_learn.kinematics.collision import nearest_on_segment_and_box
+from hrc_learn.kinematics.collision import nearest_on_segment_and_box, segment_distance
 
 BOX = GraspedBox(half_size=(0.04, 0.022, 0.03), centre=(0.0, 0.005, 0.01))
 ARM = panda.whole
@@ -210,6 +210,26 @@ def test_the_distance_from_boxes_is_the_simulators():
     torch.testing.assert_close(one.flatten(), ARM.box_distance(q, centres[:1], halves[:1]))
     assert (found > 0.02).sum() > 3
     assert (found < one.flatten() - 0.01).any()
+
+
+@pytest.mark.parametrize("length", [1.0, 1e-3])
+@pytest.mark.parametrize("slant", [1.0, 1e-5])
+def test_distances_of_segments_are_symmetric_and_scale_with_them(length, slant):
+    """Of long and short ones, crossing or nearly parallel."""
+    rng = sampling.generator(9)
+    first = torch.randn(300, 2, 3, generator=rng, dtype=torch.float64)
+    along = (first[:, 1] - first[:, 0]) + slant * torch.randn(300, 3, generator=rng).double()
+    start = torch.lerp(first[:, 0], first[:, 1], torch.rand(300, 1, generator=rng).double())
+    start = start + 0.3 * length * torch.randn(300, 3, generator=rng).double()
+    second = torch.stack([start, start + length * along], dim=1)
+    found = segment_distance(first, second)
+    # Of nearly parallel ones of a metre any point may be the nearest, to some micrometres.
+    atol = 1e-9 if slant == 1 else 1e-5 * length
+    for other in (segment_distance(second, first), segment_distance(first.flip(1), second)):
+        torch.testing.assert_close(other, found, rtol=1e-7, atol=atol)
+    for scale in (1e-3, 40.0):
+        scaled = segment_distance(scale * first, scale * second)
+        torch.testing.assert_close(scaled, scale * found, rtol=1e-7, atol=atol * scale)
 
 
 def test_a_held_box_ends_at_its_far_face():
