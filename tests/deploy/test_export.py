@@ -260,6 +260,15 @@ def test_a_step_that_cannot_be_compiled_runs_eagerly_and_says_so(tmp_path):
     assert not list(tmp_path.glob("step-*"))
 
 
+def test_a_package_without_a_layout_is_none_of_ours(tmp_path):
+    with replacing(tmp_path / "step", EXPORT) as new:
+        new.mkdir()
+        (new / "step.o").write_bytes(b"compiled")
+        write_json(new / "step.json", {"made": "elsewhere"})
+    with pytest.raises(ValueError, match=r"step.o was not written by export_step: it has no"):
+        load(tmp_path / "step" / "step.o")
+
+
 def test_a_damaged_package_is_refused(tmp_path):
     with replacing(tmp_path / "step", EXPORT) as new:
         new.mkdir()

@@ -90,6 +90,31 @@ def test_operations_equal_those_of_torch(batch, lanes, dtype):
         torch.testing.assert_close(state, 1 + numbers[:1], equal_nan=True)
 
 
+class One(nn.Module):
+    def __init__(self, operation):
+        super().__init__()
+        self.operation = operation
+
+    def forward(self, state: Tensor, observation: Tensor, command: Tensor) -> None:
+        command.copy_(self.operation(observation))
+
+
+@pytest.mark.parametrize(
+    ("operation", "message"),
+    [
+        (lambda x: torch.linalg.vector_norm(x, ord=1, dim=0, keepdim=True), "norm of order 1"),
+        (lambda x: torch.div(x, 2.0, rounding_mode="floor"), "div.* with rounding_mode"),
+        (lambda x: x.sort(0).values, "operation aten.sort.default"),
+    ],
+)
+def test_what_has_no_code_is_named(operation, message):
+    vectors = [torch.zeros(n, dtype=torch.float64) for n in (1, ROWS, ROWS)]
+    with pytest.raises(UnknownOperationError, match=message):
+        scalar_program(
+            torch.export.export(One(operation), tuple(vectors), strict=False), torch.float64
+        )
+
+
 def test_equal_instructions_are_kept_once_and_constants_carried_out():
     program = ScalarProgram(torch.float64)
     x, two = program.input("observation", 0, 0), program.constant(2.0)

@@ -90,6 +90,31 @@ def test_different_lengths_fit_as_if_alone():
         assert nrmse(trajectory.position[i, : len(t)], y) < 3e-6
 
 
+@pytest.mark.parametrize("method", ["trajectory", "ridge", "lwr"])
+def test_lists_of_demonstrations_fit_as_if_alone(method):
+    """Times of their own or one grid, and masks in a list; velocities as recorded."""
+    time, position = arm_motion(120, n_joints=2)
+    other = arm_motion(120, n_joints=2, seed=1)[1]
+    mask = [torch.ones(120, dtype=torch.bool), torch.arange(120) < 90]
+    shared = JointDMP.fit(time, [position, other], 10, mask=mask, method=method)
+    listed = JointDMP.fit([time, time[:90]], [position, other[:90]], 10, method=method)
+    for i, end in enumerate((120, 90)):
+        alone = JointDMP.fit(time[:end], [position, other][i][:end], 10, method=method)
+        for together in (shared, listed):
+            torch.testing.assert_close(together.weights[i], alone.weights)
+            torch.testing.assert_close(together.duration[i], alone.duration)
+    slopes = [torch.gradient(y, spacing=(time,), dim=0)[0] for y in (position, other)]
+    both = JointDMP.fit(
+        [time, time[:90]],
+        [position, other[:90]],
+        10,
+        velocity=[slopes[0], slopes[1][:90]],
+        method=method,
+    )
+    alone = JointDMP.fit(time[:90], other[:90], 10, velocity=slopes[1][:90], method=method)
+    torch.testing.assert_close(both.weights[1], alone.weights)
+
+
 def test_dropouts_are_bridged():
     time, position = arm_motion()
     mask = torch.ones(400, dtype=torch.bool)

@@ -147,6 +147,23 @@ def test_what_cannot_be_is_refused(distribution):
         distribution.position([-1.0])
 
 
+def test_a_known_duration_conditions_before_the_ends(distribution):
+    start, goal = [0.1, 0.2], [0.9, 1.1]
+    found = distribution.at(start, goal, duration=1.7).mean_primitive()
+    expected = distribution.condition([], duration=1.7).at(start, goal).mean_primitive()
+    torch.testing.assert_close(found.rollout().position, expected.rollout().position)
+    assert float(found.duration) == pytest.approx(1.7)
+
+
+def test_an_unknown_kind_of_primitive_in_a_file_is_named(distribution, tmp_path):
+    distribution.save(tmp_path / "model")
+    config = tmp_path / "model" / "config.json"
+    config.write_text(config.read_text().replace('"JointDMP"', '"SpiralDMP"'))
+    (tmp_path / "model" / ".manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"unknown primitive 'SpiralDMP'; choose from .*Joint"):
+        ProbabilisticDMP.load(tmp_path / "model")
+
+
 # Means
 
 

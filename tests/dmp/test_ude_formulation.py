@@ -173,6 +173,18 @@ def test_unknown_formulations_are_refused():
         OrientationDMP.fit(*turning_motion(), formulation="hamilton")
 
 
+def test_a_coupling_pushes_the_angular_velocity_as_it_does_in_the_other_formulation(dmp):
+    """It is an angular acceleration in the base frame [rad/s^2]."""
+    push = torch.tensor([0.8, -0.5, 0.3], dtype=torch.float64)
+    dt = 1e-4
+    for primitive in (dmp, OrientationDMP.fit(*turning_motion(), n_basis=15, approach=0)):
+        state = primitive.initial_state()
+        with torch.no_grad():
+            free = primitive.step(state, dt).angular_velocity
+            pushed = primitive.step(state, dt, coupling=push).angular_velocity
+        torch.testing.assert_close(pushed - free, push * dt, rtol=1e-3, atol=1e-9)
+
+
 def test_jerk_is_refused(dmp):
     with pytest.raises(ValueError, match="'ude' has no jerk"):
         _ = dmp.motion.rollout().jerk
