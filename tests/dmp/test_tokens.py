@@ -91,6 +91,31 @@ def test_any_tokens_decode_within_the_demonstrated_range(tokenizer):
         assert ((made >= low) & (made <= high)).all()
 
 
+def test_tokens_are_the_same_in_any_unit(tokenizer):
+    """Of each column, and of time; what they decode to is in the units of the motions."""
+    position, velocity = motions(400)
+    unit = torch.tensor([1000.0, 1.0, 1e-3], dtype=torch.float64)
+    other = MotionTokenizer.fit(
+        2 * TIME, unit * position, VOCABULARY, start_velocity=unit * velocity / 2
+    )
+    ids = tokenizer.encode(TIME, position[:40], velocity[:40])
+    found = other.encode(2 * TIME, unit * position[:40], unit * velocity[:40] / 2)
+    # A parameter at the middle between two levels may be rounded to either.
+    assert (found == ids).double().mean() > 0.99
+    rng = torch.Generator().manual_seed(6)
+    drawn = torch.randint(0, VOCABULARY, (60, 12), generator=rng)
+    made = tokenizer.decode(drawn, TIME)
+    torch.testing.assert_close(other.decode(drawn, 2 * TIME) / unit, made, rtol=0, atol=1e-6)
+    for own, scaled, limit in zip(
+        (tokenizer.components.low, tokenizer.components.high),
+        (other.components.low, other.components.high),
+        limits(position),
+        strict=True,
+    ):
+        torch.testing.assert_close(own, limit)
+        torch.testing.assert_close(scaled, unit * limit)
+
+
 def test_a_start_beyond_the_range_moves_the_limit(tokenizer):
     low, high = limits(motions(400)[0])
     start = high + 1.0
