@@ -51,6 +51,8 @@ _SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (0
 # spare, then no further than objects are put.
 _REACHES = (0.14, 0.1)
 _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
+# Short arms with thick wrists reach down to shelves beside them.
+_DOWN = -0.3
 # Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
 # Quality with which a layout is taken without looking at others.
@@ -397,7 +399,7 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
     if beside:
-        for far, higher, home in product(_BESIDE, _HIGHER, _ON_THE_WAY):
+        for far, higher, home in product(_BESIDE, (*_HIGHER, _DOWN), _ON_THE_WAY):
             yield _beside(_placed(usual, scale, 0.0, higher, _DEPTHS[-1], far), home)
         return
     shifts = [(along, higher) for along in _ALONG for higher in _HIGHER]
