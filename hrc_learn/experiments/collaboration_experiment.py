@@ -38,6 +38,15 @@ object, at random moments of the whole job, or never."""
 # Time for the elbow to come to rest after the last drag [s], as after the two without a worker.
 _AFTER_DRAGS = 1.0
 
+_NO_NULL_SPACE = (
+    "The pose of its tool takes them all: a push at the elbow would move the tool, so no person "
+    "pushes there."
+)
+_FEWER_JOINTS = (
+    "They set the position of the tool, its pitch and its turn about the approach; its yaw "
+    "follows from the position. The table has a target for each. "
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class _FitMetrics:
@@ -50,10 +59,10 @@ class CollaborationExperiment(CollaborationScenario):
 
     title: ClassVar[str] = "Collaboration: grasping and placing near a person"
     summary: ClassVar[str] = (
-        "An arm grasps objects with an uncalibrated camera while a person pushes its elbow "
-        "aside to reach under it. It then carries each object to a cabinet along a motion "
-        "learned from demonstrations of the end effector and the null-space posture, and "
-        "places it on a shelf. Simulated in MuJoCo, which also decides on success by contacts."
+        "An arm grasps objects with an uncalibrated camera. If it has a null space, a person "
+        "pushes its elbow aside meanwhile to reach under it. It then carries each object to a "
+        "cabinet along a motion learned from demonstrations, and places it on a shelf. "
+        "Simulated in MuJoCo, which also decides on success by contacts."
     )
 
     aiming: Path
@@ -126,14 +135,20 @@ class CollaborationExperiment(CollaborationScenario):
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]
     ) -> Sequence[Section]:
-        """Report sections: timeline, grasping, person, worker, motion."""
+        """Report sections: timeline, grasping, person, worker, motion, missing null space."""
         notes = [
             f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
             for pick in run.picks
             for note in pick.recoveries
         ]
         spans = {pick.item.name: pick.span for pick in run.picks}
-        return run_sections(recordings["run"], spans, notes)
+        robot = run.workplace.robot
+        sections = run_sections(recordings["run"], spans, notes)
+        if robot.null_space == "none":
+            text = _FEWER_JOINTS if robot.task == "nearest pose" else ""
+            text = f"The {robot.name} has {robot.joints} joints. {text}{_NO_NULL_SPACE}"
+            sections.append(Section(heading="No null space", text=text))
+        return sections
 
     def study(self) -> Study:
         """Trials with other object poses, imperfections and noise."""

@@ -15,6 +15,7 @@ from hrc_learn.experiments.run_measures import (
     grasp_offset,
     limit_violations,
     place_angle,
+    place_pitch_and_yaw,
     spans,
     unwanted_contacts,
     worker_distance,
@@ -98,6 +99,9 @@ def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
 _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
     Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
+    # Five joints set the pitch of the tool; its yaw follows from where it is.
+    Metric("place pitch", lambda run: _off_by_five_joints(run, 0), "deg", at_most=3.0),
+    Metric("place yaw", lambda run: _off_by_five_joints(run, 1), "deg", at_most=3.0),
     never("joint limit violations", lambda run: limit_violations(run.cell)),
     _touches("cabinet", "contacts with the cabinet"),
     _touches("table", "contacts with the table"),
@@ -302,6 +306,18 @@ def _placed(run: CollaborationRun) -> tuple[float | None, float | None]:
     if not errors:
         return None, None
     return 1e3 * float(max(errors)), float(np.rad2deg(max(angles)))
+
+
+def _off_by_five_joints(run: CollaborationRun, which: int) -> float | None:
+    """Largest pitch (0) or yaw (1) of placed objects [deg]; None with more than five joints."""
+    if run.workplace.robot.task != "nearest pose":
+        return None
+    angles = [
+        place_pitch_and_yaw(run.world.object_pose(pick.item.name), pick.goal.orientation)[which]
+        for pick in run.picks
+        if pick.release is not None
+    ]
+    return float(np.rad2deg(max(angles))) if angles else None
 
 
 def _standing(run: CollaborationRun) -> list[str]:

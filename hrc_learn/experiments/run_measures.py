@@ -229,11 +229,36 @@ def place_angle(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> flo
         pose: Pose of the box.
         goal: Orientation of the hand at the goal.
     """
+    return float(_place_turn(pose, goal).norm())
+
+
+def place_pitch_and_yaw(
+    pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]
+) -> tuple[float, float]:
+    """Pitch and yaw of a placed box from its intended orientation, without signs [rad].
+
+    Yaw is about the vertical, pitch about the horizontal axis across the approach of the hand.
+
+    Args:
+        pose: Pose of the box.
+        goal: Orientation of the hand at the goal, not vertical.
+    """
+    turn = _place_turn(pose, goal)
+    up = turn.new_tensor([0.0, 0.0, 1.0])
+    across = torch.linalg.cross(up, quaternion.rotate(goal, up))
+    return float((turn @ across / across.norm()).abs()), float(turn[2].abs())
+
+
+def _place_turn(
+    pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]
+) -> Float[Tensor, "3"]:
+    """Rotation vector of a placed box from its intended orientation, in the base frame [rad]."""
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
-    wanted = quaternion.multiply(goal, _IN_HAND)
+    back = quaternion.conjugate(quaternion.multiply(goal, _IN_HAND))
     # A box looks the same after half a turn about its z axis.
     turned = quaternion.multiply(q, q.new_tensor([0.0, 0.0, 0.0, 1.0]))
-    return min(float(quaternion.angle(either, wanted)) for either in (q, turned))
+    turns = [quaternion.log(quaternion.multiply(either, back)) for either in (q, turned)]
+    return min(turns, key=lambda turn: float(turn.norm()))
 
 
 class PullEffect(NamedTuple):

@@ -16,6 +16,7 @@ from hrc_learn.experiments.placing_trial import (
     random_start,
     taught_correction,
 )
+from hrc_learn.experiments.run_measures import place_angle, place_pitch_and_yaw
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, Touch, World
@@ -44,6 +45,23 @@ def faults(**changes):
 
 def test_a_good_placing_has_no_faults():
     assert faults() == ()
+
+
+@pytest.mark.parametrize("half_turn", [False, True])
+def test_pitch_and_yaw_of_a_placed_box_are_turns_about_horizontal_and_vertical(half_turn):
+    # The hand points along -y and closes along x: its box stands with its top towards +y.
+    goal = WORKPLACE.shelf("middle").orientation
+    box = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    if half_turn:
+        box = box @ np.diag([-1.0, -1, 1])
+    for axis, expected in ((0, (0.02, 0.0)), (1, (0.0, 0.0)), (2, (0.0, 0.02))):
+        c, s = np.cos(-0.02), np.sin(-0.02)
+        i, k = (axis + 1) % 3, (axis + 2) % 3
+        pose = np.eye(4)
+        pose[np.ix_([i, k], [i, k])] = [[c, -s], [s, c]]
+        pose[:3, :3] = pose[:3, :3] @ box
+        assert place_pitch_and_yaw(pose, goal) == pytest.approx(expected, abs=1e-9)
+        assert place_angle(pose, goal) == pytest.approx(0.02)
 
 
 TOUCH = Touch(first="box", second="board_middle", start=6.1, end=6.2, depth=0.0121)
