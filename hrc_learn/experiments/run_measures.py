@@ -249,9 +249,7 @@ def place_pitch_and_yaw(
     return float((turn @ across / across.norm()).abs()), float(turn[2].abs())
 
 
-def _place_turn(
-    pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]
-) -> Float[Tensor, "3"]:
+def _place_turn(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
     """Rotation vector of a placed box from its intended orientation, in the base frame [rad]."""
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
     back = quaternion.conjugate(quaternion.multiply(goal, _IN_HAND))
