@@ -39,8 +39,8 @@ object, at random moments of the whole job, or never."""
 _AFTER_DRAGS = 1.0
 
 _NO_NULL_SPACE = (
-    "The pose of its tool takes them all: a push at the elbow would move the tool, so no person "
-    "pushes there."
+    "The pose of its tool takes them all: a push at the elbow would move the tool, so no "
+    "person pushes there."
 )
 _FEWER_JOINTS = (
     "They set the position of the tool, its pitch and its turn about the approach; its yaw "

@@ -250,7 +250,7 @@ def place_pitch_and_yaw(
 
 
 def _place_turn(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-    """Rotation vector of a placed box from its intended orientation, in the base frame [rad]."""
+    """Rotation vector of a placed box from its intended orientation, in the base [rad]."""
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
     back = quaternion.conjugate(quaternion.multiply(goal, _IN_HAND))
     # A box looks the same after half a turn about its z axis.
