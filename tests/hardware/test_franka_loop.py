@@ -117,6 +117,8 @@ class TestLostAnswers:
     def test_nothing_is_begun_with_no_number(self):
         assert not answer_was_lost(self.nothing, self.a, self.v, self.v)
         assert not answer_was_lost(self.nothing, self.a, self.nothing, self.nothing)
+        one = np.where(np.arange(7) == 3, np.nan, self.v)
+        assert not answer_was_lost(one, self.a, self.v, self.v + self.d)
 
 
 class TestPunctuality:

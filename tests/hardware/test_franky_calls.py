@@ -117,8 +117,8 @@ def franky(monkeypatch):
         franky.scheduling = (policy, parameters)
 
     monkeypatch.setattr(os, "sched_setscheduler", schedule)
-    monkeypatch.setattr(os, "sched_getscheduler", lambda _: franky.scheduling[0])
-    monkeypatch.setattr(os, "sched_getparam", lambda _: franky.scheduling[1])
+    monkeypatch.setattr(os, "sched_getscheduler", lambda thread: franky.scheduling[thread])
+    monkeypatch.setattr(os, "sched_getparam", lambda thread: franky.scheduling[1 + thread])
     yield franky
     franky.scheduling = (os.SCHED_OTHER, 0)
 
