@@ -80,6 +80,7 @@ def test_the_robot_that_is_silent_and_the_controller_that_is_missing_are_named(g
 
 def test_joints_are_found_by_name_and_speeds_measured_where_none_are_sent(graph):
     arm, rng = position_arm(graph), np.random.default_rng(0)
+    assert arm.read().gripper_width == 0.0
     np.testing.assert_array_equal(arm.read().joint_velocity, np.zeros(7))
     other, speed = READY + rng.normal(size=7), rng.normal(size=7)
     names = ["finger", *NAMES[::-1]]

@@ -51,6 +51,17 @@ def test_a_standing_worker_is_as_tall_and_as_long_armed_as_people_are(stature):
     assert part(ends, "thigh_left")[0, 2] - FLOOR == pytest.approx(0.53 * stature, rel=0.02)
 
 
+def test_a_quarter_of_the_foot_is_behind_the_ankle():
+    worker = Worker()
+    ends = worker.ends(worker.standing())
+    foot, radius = part(ends, "foot_left"), worker.radius[PARTS.index("foot_left")]
+    ankle = part(ends, "shank_left")[1]
+    back, front = (np.linalg.norm((end - ankle)[:2]) + radius for end in foot)
+    assert front == pytest.approx(3 * back)
+    # Winter (2009): a foot of 0.152 of the stature.
+    assert back + front == pytest.approx(0.152 * worker.config.stature, rel=0.02)
+
+
 def test_parts_are_rigid_and_hang_together():
     worker = Worker()
     ends = worker.ends(random_postures(worker, 200))

@@ -7,6 +7,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 
@@ -168,3 +169,24 @@ def test_unknown_objects_and_bad_commands_are_refused(world):
         world.object_pose("bottle")
     with pytest.raises(ValueError, match="finite"):
         world.arm.command(np.full(7, np.nan))
+
+
+def test_an_arm_that_is_controlled_elsewhere_is_shown_with_what_it_carries(world, workplace):
+    """The object keeps its place in the gripper; without it, it stays where it was."""
+    world.hold("box", workplace.home_joints().numpy())
+    grip = np.linalg.inv(world.arm.tcp_pose()) @ world.object_pose("box")
+    other = workplace.home_joints() + 0.2
+    state = ArmState(
+        time=7.5,
+        joint_position=other.numpy(),
+        joint_velocity=np.zeros(7),
+        gripper_width=float("nan"),  # of an arm without a gripper
+    )
+    world.follow(state, carried="box")
+    assert world.time == 7.5
+    tool = panda.forward(other).matrix().numpy()
+    np.testing.assert_allclose(world.arm.tcp_pose(), tool, atol=1e-9)
+    np.testing.assert_allclose(world.object_pose("box"), tool @ grip, atol=1e-9)
+    assert world.arm.read().gripper_width == pytest.approx(0.0, abs=1e-9)
+    world.follow(replace(state, joint_position=workplace.home_joints().numpy()))
+    np.testing.assert_allclose(world.object_pose("box"), tool @ grip, atol=1e-9)

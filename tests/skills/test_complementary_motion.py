@@ -283,3 +283,5 @@ def test_step_that_ends_too_near_an_obstacle_is_not_taken():
     assert asked
     assert torch.equal(joints[-1], panda.ready)
     assert "obstacle" in human.reasons()[-1]
+    kept = {reason.hindrance: reason.kept for reason in human.told[-1].reasons}
+    assert kept["obstacle"] == 0.0

@@ -14,6 +14,7 @@ from hrc_learn.kinematics import gripper_down
 from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.skills.servo_target import LONGEST_OFFSET, VisualTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OFFSET = np.array([0.012, -0.01, 0.11])
 MIDDLE = torch.tensor([0.26, 0.54, 0.16], dtype=torch.float64)
@@ -153,3 +154,37 @@ def test_a_skill_knows_its_metrics_only_where_it_was_fitted(tmp_path):
         ValueError, match="a loaded skill has no metrics"
     ):  # it lacks the errors by cell
         VisualServoSkill(jacobian=fitted, target=None).metrics()
+
+
+def test_landmarks_survive_the_disk(tmp_path):
+    rng = np.random.default_rng(0)
+
+    def descriptors(n):
+        return rng.integers(0, 256, (n, 128), dtype=np.uint8)
+
+    def view(n):
+        return Features(pixels=rng.uniform(0, 600, (n, 2)), descriptors=descriptors(n))
+
+    tool = Tool(
+        points=rng.normal(size=(9, 3)),
+        descriptors=descriptors(9),
+        place=np.array([0.01, -0.02, 0.1]),
+        optics=(810.0, 320.5, 239.5, -0.06),
+    )
+    objects = {"box": Object(views=(view(5), view(7))), "cup": Object(views=(view(3),))}
+    landmarks = Landmarks(tool=tool, objects=objects, image_size=(640, 480))
+    vector = camera_vector(MODEL)
+    skill = VisualServoSkill(jacobian=camera_network(vector), target=None, landmarks=landmarks)
+    skill.save(tmp_path / "skill")
+    loaded = VisualServoSkill.load(tmp_path / "skill").landmarks
+    assert loaded is not None
+    assert loaded.image_size == (640, 480)
+    assert loaded.tool.optics == pytest.approx(tool.optics)
+    for name in ("points", "descriptors", "place"):
+        np.testing.assert_array_equal(getattr(loaded.tool, name), getattr(tool, name))
+    assert loaded.objects.keys() == objects.keys()
+    for name, item in objects.items():
+        views = zip(loaded.objects[name].views, item.views, strict=True)
+        for got, given in views:
+            np.testing.assert_array_equal(got.pixels, given.pixels)
+            np.testing.assert_array_equal(got.descriptors, given.descriptors)

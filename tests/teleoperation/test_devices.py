@@ -1,7 +1,13 @@
 """Keys and gamepads, with a terminal and a controller that the tests play; several at once."""
 
+import atexit
 import ctypes
+import os
+import pty
+import sys
+import termios
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -14,6 +20,7 @@ from hrc_learn.teleoperation import InteractionForceConfig
 from hrc_learn.teleoperation.devices import (
     DIRECTIONS,
     Gamepad,
+    HapticDevice,
     KeyboardState,
     TerminalKeyboard,
     deflection,
@@ -212,6 +219,40 @@ def test_a_keyboard_without_a_terminal_is_refused(monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     with pytest.raises(ValueError, match="needs a terminal"):
         TerminalKeyboard.open(panda)
+
+
+def test_a_terminal_is_read_key_by_key_and_given_back(monkeypatch):
+    ours, theirs = pty.openpty()
+    given_back = []
+    monkeypatch.setattr(atexit, "register", lambda *call: given_back.append(call))
+    with os.fdopen(theirs, closefd=False) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        before = termios.tcgetattr(theirs)
+        keyboard = TerminalKeyboard.open(panda)
+        assert not termios.tcgetattr(theirs)[3] & (termios.ICANON | termios.ECHO)
+        assert keyboard.read(STATE).gripper is None  # nothing was typed: it does not wait
+        os.write(ours, b"]" + 70 * b"x" + b"i")  # without the end of a line
+        read = keyboard.read(STATE)
+        assert read.gripper == 0.0
+        assert read.twist[:3] @ np.array(DIRECTIONS["i"]) > 0
+        (give, *values), *others = given_back
+        assert others == []
+        give(*values)
+        assert termios.tcgetattr(theirs) == before
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_a_haptic_device_needs_its_library_and_a_device(monkeypatch):
+    monkeypatch.setitem(sys.modules, "forcedimension_core", None)
+    with pytest.raises(ValueError, match="extra `haptic` and Force Dimension's SDK"):
+        HapticDevice.open(panda)
+    dhd = SimpleNamespace(open=lambda: -1, errorGetLastStr=lambda: "no cable")
+    monkeypatch.setitem(sys.modules, "forcedimension_core", SimpleNamespace(dhd=dhd))
+    with pytest.raises(ValueError, match=r"no haptic device: no cable\."):
+        HapticDevice.open(panda)
+    dhd.open = lambda: 0
+    assert isinstance(HapticDevice.open(panda), HapticDevice)
 
 
 CONFIG = InputFilterConfig(linear=1.5, angular=5.0)

@@ -1,6 +1,8 @@
 """Pointing into the scene, against a pinhole camera that projects the other way."""
 
+import asyncio
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Box, quaternion
+from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.region_editor import (
+    RegionEditor,
     meet_box,
     meet_plane,
     region_over,
@@ -94,3 +98,185 @@ def test_a_region_stands_over_what_was_drawn():
 def test_a_region_has_a_size_whatever_was_drawn():
     region = region_over(np.zeros((1, 3)), bottom=0.0, height=0.0, smallest=0.03)
     assert region.half_size == (0.03, 0.03, 0.03)
+
+
+class Handle(SimpleNamespace):
+    """A control or a node of viser's page: what it is made with, and what it calls."""
+
+    def on(self, act):
+        self.act = act
+
+    on_click = on_update = on_drag = on
+
+
+class Server:
+    """A viser server that keeps controls and nodes by their name, and pointer listeners."""
+
+    def __init__(self):
+        self.scene = self.gui = self
+        self.made, self.listening = {}, {}
+
+    def _add(self, name, *values, **settings):
+        self.made[name] = Handle(values=values, disabled=False, **settings)
+        return self.made[name]
+
+    add_button = add_transform_controls = add_box = add_icosphere = _add
+
+    def add_checkbox(self, name, value, *, hint):
+        return self._add(name, value=value)
+
+    def add_slider(self, name, low, high, step, value):
+        return self._add(name, value=value, low=low, high=high)
+
+    def add_line_segments(self, name, points, *_, **settings):
+        return self._add(name, points=points)
+
+    def on_rect_select(self):
+        return lambda act: self.listening.update(rectangle=act)
+
+    def on_click(self):
+        return lambda act: self.listening.update(click=act)
+
+    def remove_rect_select_callback(self, act):
+        assert self.listening.pop("rectangle") is act
+
+    def remove_click_callback(self, act):
+        assert self.listening.pop("click") is act
+
+    def use(self, name, event=None):
+        asyncio.run(self.made[name].act(event))
+
+
+TABLE = Box(centre=(0.4, 0.3, -0.1), half_size=(0.5, 0.5, 0.1), name="table")
+BOARD = Box(centre=(0.4, 0.3, 0.5), half_size=(0.1, 0.1, 0.01), name="board")
+
+
+@pytest.fixture
+def page():
+    return Server()
+
+
+@pytest.fixture
+def editor(page):
+    return RegionEditor(page, [TABLE, BOARD])
+
+
+def shown(page):
+    """Middle, edges and sliders of the region that is shown."""
+    sliders = [page.made[f"Size {axis}"].value for axis in "xyz"]
+    box = page.made["/region/box"]
+    corner, edges = page.made["/region/corner"].position, page.made["/region/edges"].points
+    np.testing.assert_allclose(np.abs(edges).reshape(-1, 3).max(axis=0), corner)
+    np.testing.assert_allclose(2 * np.array(corner), box.dimensions)
+    np.testing.assert_allclose(sliders, box.dimensions, atol=5e-4)
+    return page.made["/region"].position, box.dimensions
+
+
+def test_a_region_attracts_only_while_it_is_active(page, editor):
+    assert editor.region is None
+    faint = page.made["/region/box"].opacity
+    page.made["Active"].value = True
+    page.use("Active")
+    assert editor.region == editor.drawn
+    assert page.made["/region/box"].opacity > faint
+    other = DrawnRegion(centre=(0.1, 0.2, 0.3), half_size=(0.1, 0.2, 0.05))
+    editor.draw(other, active=False)
+    assert (editor.region, editor.drawn) == (None, other)
+    assert shown(page) == (other.centre, (0.2, 0.4, 0.1))
+    editor.draw(other, active=True)
+    editor.draw(other)
+    assert editor.region == other
+
+
+def test_sliders_gizmo_and_corner_change_the_region(page, editor):
+    for axis, size in zip("xyz", (0.3, 0.2, 0.5), strict=True):
+        page.made[f"Size {axis}"].value = size
+    page.use("Size x", SimpleNamespace(client=None))  # moved by ourselves
+    assert editor.drawn.half_size != (0.15, 0.1, 0.25)
+    page.use("Size x", SimpleNamespace(client=1))
+    assert editor.drawn.half_size == (0.15, 0.1, 0.25)
+    page.use("/region", SimpleNamespace(target=SimpleNamespace(position=(0.2, 0.1, 0.4))))
+    assert editor.drawn.centre == (0.2, 0.1, 0.4)
+    assert editor.drawn.half_size == (0.15, 0.1, 0.25)
+    # Seen from above, the corner follows the pointer in the plane of its height.
+    eye = np.array([0.2, 0.1, 2.4])
+    client = SimpleNamespace(camera=SimpleNamespace(position=eye))
+    for pointer, half in (
+        ((0.5, 0.3, 0.65), (0.3, 0.2, 0.25)),
+        ((0.2, 0.1, 0.64), (0.02, 0.02, 0.25)),  # no smaller
+        ((1.7, 1.6, 0.65), (0.5, 0.5, 0.25)),  # and no larger
+    ):
+        page.use("/region/corner", SimpleNamespace(client=client, end_position=pointer))
+        np.testing.assert_allclose(editor.drawn.half_size, half, atol=1e-9)
+        assert editor.drawn.centre == (0.2, 0.1, 0.4)
+        shown(page)
+
+
+def camera(target):
+    orientation, R = looking_down_at(np.array(target))
+    view = SimpleNamespace(wxyz=orientation, fov=FIELD, aspect=ASPECT, position=EYE)
+    return SimpleNamespace(camera=view), R
+
+
+def test_a_rectangle_on_the_screen_is_the_footprint_of_the_region(page, editor):
+    client, R = camera([0.3, 0.4, 0.0])
+    bottom = editor.drawn.centre[2] - editor.drawn.half_size[2]
+    page.use("Draw on the table")
+    assert page.made["Draw on the table"].disabled
+    sides = [np.array([0.3 + a, 0.4 + b, 0.0]) for a in (-0.1, 0.1) for b in (-0.08, 0.08)]
+    places = np.array([project(side, R) for side in sides])
+    low, high = places.min(axis=0), places.max(axis=0)
+    event = SimpleNamespace(client=client, screen_min=low, screen_max=high)
+    asyncio.run(page.listening["rectangle"](event))
+    assert page.listening == {}  # it counts once
+    assert not page.made["Draw on the table"].disabled
+    # The middles of the rectangle's sides, seen from the camera, lie on the region's edge.
+    middle = (low + high) / 2
+    rays = [
+        view_ray(place, client.camera.wxyz, FIELD, ASPECT)
+        for place in (
+            (low[0], middle[1]),
+            (high[0], middle[1]),
+            (middle[0], low[1]),
+            (middle[0], high[1]),
+        )
+    ]
+    points = np.array([EYE - EYE[2] / ray[2] * ray for ray in rays])[:, :2]
+    centre, half = np.array(editor.drawn.centre), np.array(editor.drawn.half_size)
+    np.testing.assert_allclose(centre[:2] - half[:2], points.min(axis=0))
+    np.testing.assert_allclose(centre[:2] + half[:2], points.max(axis=0))
+    assert centre[2] - half[2] == pytest.approx(bottom)
+    before = editor.drawn
+    page.use("Draw on the table")
+    up = SimpleNamespace(client=client, screen_min=(0.4, -3.0), screen_max=(0.6, 0.5))
+    asyncio.run(page.listening["rectangle"](up))  # above the horizon
+    assert editor.drawn == before
+
+
+@pytest.mark.parametrize(
+    ("aim", "marked"),
+    [
+        ((0.4, 0.3, 0.51), (0.4, 0.3, 0.59)),  # the board before the table
+        ((0.1, 0.0, 0.0), (0.1, 0.0, 0.08)),  # the table
+        ((-2.0, -1.0, 0.0), (-2.0, -1.0, 0.08)),  # beside it, at its height
+    ],
+)
+def test_a_click_marks_the_target_above_what_is_nearest(page, editor, aim, marked):
+    page.use("Mark the target")
+    way = np.array(aim) - EYE
+    event = SimpleNamespace(ray_origin=EYE, ray_direction=way / np.linalg.norm(way))
+    asyncio.run(page.listening["click"](event))
+    assert page.listening == {}
+    np.testing.assert_allclose(editor.target, marked, atol=1e-9)
+    mark = page.made["/target"]
+    assert mark.visible
+    np.testing.assert_allclose(mark.position, marked, atol=1e-9)
+    page.use("/target", SimpleNamespace(end_position=(0.1, 0.2, 0.3)))
+    assert editor.target == (0.1, 0.2, 0.3)
+    page.use("Mark the target")
+    up = SimpleNamespace(ray_origin=EYE, ray_direction=np.array([0.0, 0.6, 0.8]))
+    asyncio.run(page.listening["click"](up))
+    assert editor.target == (0.1, 0.2, 0.3)  # the sky is no place
+    page.use("Clear the target")
+    assert editor.target is None
+    assert not mark.visible
