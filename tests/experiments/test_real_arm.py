@@ -9,14 +9,12 @@ import torch
 from taught_models import teach
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments import real_arm as on_arm
 from hrc_learn.experiments.real_arm import ArmSite, placing_task, run_on_arm
 from hrc_learn.geometry import Pose
 from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.grasping import as_load, joint_plan
 from hrc_learn.skills.work_cell import TaskFailedError
 
 pytest.importorskip("franky")
@@ -88,25 +86,6 @@ def test_a_dry_run_takes_the_same_way_at_a_share_of_the_speed():
         fastest[speed] = float((tool.diff(dim=0).norm(dim=-1) / 0.01).max())
         assert float(tool[-1, 2] - tool[0, 2]) == pytest.approx(0.02, abs=2e-3)
     assert fastest[0.2] < 0.35 * fastest[1.0]
-
-
-def test_plans_are_checked_with_what_is_in_the_hand(monkeypatch):
-    checked = []
-    monkeypatch.setattr(on_arm, "check_plan", lambda plan, world, held: checked.append(held))
-    item = WORKPLACE.scene.objects[0]
-
-    def task(cell, check):
-        plan = joint_plan(cell, cell.joints, cell.joints)
-        check(plan)
-        cell.load = as_load(item)
-        check(plan)
-        return ""
-
-    with arm_at_home() as (_, site):
-        run = run_on_arm(site, WORKPLACE, task)
-    assert checked == [None, item.name]
-    in_hand = run.world.object_pose(item.name)[:3, 3] - run.world.arm.tcp_pose()[:3, 3]
-    np.testing.assert_allclose(in_hand, 0.0, atol=1e-9)
 
 
 def test_a_task_that_fails_ends_with_the_arm_at_rest_and_says_why():
