@@ -262,11 +262,17 @@ def configuration(args: Any) -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """Command line of this process."""
+    """Command line that repeats this process, to be pasted where it was started."""
+    from hrc_learn.viz.report import shortest
+
     program, *arguments = sys.argv
-    # The installed command is on the path; a program needs Python.
-    start = ["python", program] if program.endswith(".py") else [Path(program).name]
-    return shlex.join([*start, *arguments])
+    path = Path(program)
+    # `python -m hrc_learn.cli` is `hrc`, which is on the path; other programs need Python.
+    if path.name == "__main__.py":
+        start = ["hrc"]
+    else:
+        start = ["python", shortest(program)] if path.suffix == ".py" else [path.name]
+    return shlex.join([*start, *map(shortest, arguments)])
 
 
 def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings:

@@ -4,6 +4,8 @@ Each figure takes the recording of the run and the time interval of each object,
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import as_file, files
 
 import matplotlib
 import numpy as np
@@ -15,6 +17,7 @@ from hrc_learn.experiments.placing_metrics import PlacingRun
 from hrc_learn.experiments.placing_trial import SPACES, demonstrated_path
 from hrc_learn.experiments.run_measures import lasting
 from hrc_learn.log import JointRanges, RunRecording
+from hrc_learn.store import read_toml
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
     DEMO_LOOK,
@@ -44,76 +47,55 @@ _SHELVES = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)
 """Colours of the shelves, from bottom to top."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _SectionText:
+    heading: str
+    text: str
+    captions: dict[str, str]
+    """Captions of the figures, by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Texts:
+    section: dict[str, _SectionText]
+
+
 def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -> list[Section]:
     """Report sections: timeline, servoing, person and worker if they came, motion.
+
+    `run_report.toml` holds their texts.
 
     Args:
         run: Recording of a run that servoed with a camera.
         objects: Start and end of the work on each object [s].
         notes: Recoveries, in words.
     """
-
-    def section(heading: str, text: str, *figures: tuple[str, Figure, str]) -> Section:
-        return Section(heading=heading, text=text, figures=[Picture(*f) for f in figures])
-
-    sections = [
-        section(
-            "The job",
-            f"A state machine. {' '.join(notes) or 'No recovery was needed.'}",
-            ("timeline", timeline_figure(run, objects), "Phases over time."),
-        ),
-        section(
-            "Grasping with an uncalibrated camera",
-            "Visual servoing moves the marker of the gripper to its demonstrated place above "
-            "the object. The image Jacobian was learned from the demonstrations and adapts "
-            "online, also to a moved camera.",
-            (
-                "marker",
-                marker_figure(run, objects),
-                "Paths of the marker over the camera's first image, and its distance from the "
-                "target.",
-            ),
-            (
-                "image_jacobian",
-                image_jacobian_figure(run),
-                "Image Jacobian: estimate of the controller, and truth in the simulator.",
-            ),
-        ),
-    ]
+    shown = {
+        "job": {"timeline": timeline_figure(run, objects)},
+        "servoing": {
+            "marker": marker_figure(run, objects),
+            "image_jacobian": image_jacobian_figure(run),
+        },
+    }
     if run.nullspace_input is not None and run.nullspace_input.any():
-        sections.append(
-            section(
-                "The person",
-                "The force of the person acts in the null space of the task: the elbow yields, "
-                "the end effector stays.",
-                ("person", person_figure(run), "Effort of the person, elbow and end effector."),
-            )
-        )
+        shown["person"] = {"person": person_figure(run)}
     if run.worker_distance:
-        sections.append(
-            section(
-                "The worker",
-                "A worker comes to the table, puts something down, reaches for markers under "
-                "the arm and leaves, without regard to the robot. The robot sees the worker "
-                "late and with noise, keeps the protective distance of ISO 10218-2 and waits "
-                "if necessary. The expert drags joint 4 forward and back twice to make space.",
-                (
-                    "worker",
-                    plots_figure(run.time, worker_plots(run)),
-                    "Smallest distance from the robot and its load: true, as the robot sees "
-                    "it, and the protective distance of the part with the smallest margin.",
-                ),
-            )
+        shown["worker"] = {"worker": plots_figure(run.time, worker_plots(run))}
+    shown["motion"] = {
+        "trajectories": trajectories_figure(run, objects),
+        "joints": joints_figure(run),
+    }
+    with as_file(files(__package__) / "run_report.toml") as path:
+        texts = read_toml(path, _Texts).section
+    recoveries = {"job": f" {' '.join(notes) or 'No recovery was needed.'}"}
+    return [
+        Section(
+            heading=texts[topic].heading,
+            text=texts[topic].text + recoveries.get(topic, ""),
+            figures=[Picture(n, f, texts[topic].captions[n]) for n, f in figures.items()],
         )
-    sections.append(
-        section(
-            "Motion",
-            "The motion of the arm with every object, and the demonstration if there is one.",
-            ("trajectories", trajectories_figure(run, objects), "Paths of the end effector."),
-            ("joints", joints_figure(run), "Joint positions and limits."),
-        )
-    )
-    return sections
+        for topic, figures in shown.items()
+    ]
 
 
 def person_figure(run: RunRecording) -> Figure:

@@ -5,6 +5,7 @@ plots that the dashboards show (`panels.py`).
 """
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -42,6 +43,10 @@ STYLE: dict[Any, Any] = {
 WIDTH = 7.2
 """Width of a figure [inch]: the text width of a page."""
 
+_NARROW = 3.7
+"""Width of a figure for a phone [inch]: 390 pixels, with text as large as the page's."""
+_TITLE = 48  # letters in a line of a title on a phone
+_AROUND = 0.65  # title, ticks and legend of a panel on a phone [inch]
 _SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
 
 
@@ -164,6 +169,39 @@ def joints_figure(run: RunRecording) -> Figure:
         motions.append(JointCurves("demonstration", run.time, demo, *DEMO_LOOK))
     motions.append(JointCurves("run", run.time, run.joint_position))
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
+
+
+def stack_panels(figure: Figure) -> None:
+    """Put the panels of a figure above one another, for the width of a phone.
+
+    Curves keep their height, images and views in space their proportions. Legends come below
+    their panels. The figure has been drawn once, which gives the panels their size.
+    """
+    panels = [axes for axes in figure.axes if axes.axison or axes.name == "3d"]
+    if not panels or any(axes.get_subplotspec() is None for axes in panels):
+        return
+    width, height = figure.get_size_inches()
+    rows = []
+    for axes in panels:
+        area = axes.get_position()
+        shaped = axes.name == "3d" or axes.get_aspect() != "auto"
+        scale = min(1.0, _NARROW / width / area.width) if shaped else 1.0
+        rows.append(scale * height * area.height)
+    grid = figure.add_gridspec(len(panels), 1, height_ratios=rows)
+    for axes, row in zip(panels, range(len(panels)), strict=True):
+        axes.set_subplotspec(grid[row])
+        axes.tick_params(labelbottom=True)
+        axes.set_title(fill(axes.get_title("left"), _TITLE), loc="left", fontsize=8)
+        if (legend := axes.get_legend()) is not None:
+            names = [text.get_text() for text in legend.texts]
+            look = {"fontsize": 8, "frameon": False, "ncols": 2, "bbox_to_anchor": (0, -0.2)}
+            axes.legend(legend.legend_handles, names, loc="upper left", **look)
+    for legend in [*figure.legends]:
+        names = [text.get_text() for text in legend.texts]
+        legend.remove()
+        look = {"fontsize": 8, "frameon": False, "ncols": 2}
+        figure.legend(legend.legend_handles, names, loc="outside upper center", **look)
+    figure.set_size_inches(_NARROW, sum(rows) + _AROUND * len(rows) + 0.3)
 
 
 def plots_figure(

@@ -108,6 +108,9 @@ class Picture:
     drawing: Any = b""
     """A matplotlib figure, an RGB image (height, width, 3), or a finished PNG file."""
     caption: str = ""
+    narrow: bytes = b""
+    """A figure for phones as a PNG file, its panels above one another; drawn together with
+    `png`. Empty for photographs, which dark pages show unchanged."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):
@@ -127,7 +130,13 @@ class Picture:
 
             Image.fromarray(self.drawing).save(buffer, "PNG", optimize=True)
         else:
+            from hrc_learn.viz.figures import stack_panels
+
             self.drawing.savefig(buffer, format="png", dpi=_DPI)
+            phone = BytesIO()
+            stack_panels(self.drawing)
+            self.drawing.savefig(phone, format="png", dpi=_DPI)
+            object.__setattr__(self, "narrow", phone.getvalue())
         return buffer.getvalue()
 
 
@@ -291,6 +300,8 @@ REPORT = "report.json"
 """File that marks the folder of a run with a report."""
 PAGE = "report.html"
 FIGURES = "figures"
+NARROW = "narrow"
+"""Folder of the figures for phones, in that of the figures."""
 FILM = "film.mp4"
 LINKED = (".rrd", ".mp4", ".npz")
 """Suffixes of recordings, films and logs in the folder, to which the page links."""
@@ -318,14 +329,15 @@ def write_report(folder: str | os.PathLike[str], report: Report) -> None:
 
     Args:
         folder: Folder of the run. Each file appears only when complete, `report.json` last;
-            pictures go to `figures/`.
+            pictures go to `figures/`, those for phones to `figures/narrow/`.
         report: Content of the report.
     """
     folder = Path(folder)
-    drawn = {picture.name: picture.png for picture in report.pictures}
-    (folder / FIGURES).mkdir(parents=True, exist_ok=True)
+    drawn = {f"{picture.name}.png": picture.png for picture in report.pictures}
+    drawn |= {f"{NARROW}/{p.name}.png": p.narrow for p in report.pictures if p.narrow}
+    (folder / FIGURES / NARROW).mkdir(parents=True, exist_ok=True)
     for name, png in drawn.items():
-        with new_file(folder / FIGURES / f"{name}.png") as part:
+        with new_file(folder / FIGURES / name) as part:
             part.write_bytes(png)
     if report.film is not None:
         with new_file(folder / FILM) as part:
@@ -374,9 +386,14 @@ def _as_file(report: Report) -> dict[str, Any]:
 
 def _from_file(content: _ReportFile, folder: Path) -> Report:
     def with_pictures(section: Section) -> Section:
-        files = [folder / FIGURES / f"{shown.name}.png" for shown in section.figures]
-        drawn = zip(section.figures, files, strict=True)
-        return replace(section, figures=[replace(p, drawing=f.read_bytes()) for p, f in drawn])
+        drawn = []
+        for picture in section.figures:
+            wide, narrow = (
+                folder / FIGURES / place / f"{picture.name}.png" for place in ("", NARROW)
+            )
+            phone = narrow.read_bytes() if narrow.is_file() else b""
+            drawn.append(replace(picture, drawing=wide.read_bytes(), narrow=phone))
+        return replace(section, figures=drawn)
 
     values = {field.name: getattr(content, field.name) for field in fields(Report)}
     values["sections"] = [with_pictures(section) for section in content.sections]
@@ -421,10 +438,11 @@ def show_command(path: str | os.PathLike[str]) -> str:
     if shutil.which("hrc") == str(program):
         return shlex.join(["hrc", "show", str(path)])
     words = [str(program)] if program.is_file() else [str(python), "-m", "hrc_learn.cli"]
-    return shlex.join([*(_shortest(word) for word in words), "show", str(path)])
+    return shlex.join([*(shortest(word) for word in words), "show", str(path)])
 
 
-def _shortest(word: str) -> str:
+def shortest(word: str) -> str:
+    """A word of a command, as a relative path if it names one below the current folder."""
     path = Path(word)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else word
 

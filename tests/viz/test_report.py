@@ -30,7 +30,7 @@ from hrc_learn.viz.report import (
     write_report,
 )
 
-VOID = {"meta", "img", "br", "link", "hr"}
+VOID = {"meta", "img", "br", "link", "hr", "source"}
 NASTY = '<script>alert("x")</script> & co'
 
 
@@ -132,6 +132,31 @@ def test_every_picture_is_in_the_page_and_can_be_decoded():
         images.append(Image.open(BytesIO(base64.b64decode(data))))
     assert [image.size for image in images] == [(450, 300), (6, 4)]
     np.testing.assert_array_equal(np.asarray(images[1]), image)
+
+
+def test_figures_for_phones_have_their_panels_above_one_another():
+    wide = Figure(figsize=(7.2, 3.0), layout="constrained")
+    for axes in wide.subplots(1, 2):
+        axes.plot([0, 1], [0, 1], label="a curve")
+        axes.legend()
+    picture = Picture("two", wide, "Two panels")
+    assert Image.open(BytesIO(picture.png)).size == (1080, 450)
+    width, height = Image.open(BytesIO(picture.narrow)).size
+    assert width < 600 < height
+    first, second = (axes.get_position() for axes in wide.axes)
+    assert first.y0 > second.y1
+    assert first.x0 == pytest.approx(second.x0)
+    photo = Picture("photo", np.zeros((4, 6, 3), dtype=np.uint8))
+    assert photo.png
+    assert not photo.narrow  # dark pages leave it as it is
+
+
+def test_a_report_with_several_sections_has_contents():
+    sections = [Section(heading="Path & way"), Section(heading="Joints")]
+    shown = page(sections=sections)
+    assert "nav" in shown.tags
+    assert shown.links == ["#run1-1", "#run1-2", "#run1-again"]
+    assert set(shown.links) <= {f"#{anchor}" for anchor in shown.anchors}
 
 
 def test_nothing_is_fetched_from_elsewhere():
@@ -312,7 +337,8 @@ def test_several_reports_are_listed_with_their_verdicts_first():
         ["2", "Run 2", "1 of 1 targets missed."],
     ]
     assert shown.links == ["#run1", "#run2"]
-    assert shown.anchors == ["run1", "run2"]
+    assert [a for a in shown.anchors if "-" not in a] == ["run1", "run2"]
+    assert {f"#{anchor}" for anchor in shown.anchors} >= set(shown.links)
     assert len(shown.images) == 2
     with pytest.raises(ValueError, match="at least one report"):
         reports_page("None", [])
@@ -341,7 +367,8 @@ def test_common_values_of_several_runs_are_compared():
 def test_a_folder_holds_page_pictures_and_data(tmp_path):
     write_report(tmp_path, report())
     files = {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*") if f.is_file()}
-    assert files == {"report.html", "report.json", "figures/path.png"}
+    pictures = {"figures/path.png", "figures/narrow/path.png"}
+    assert files == {"report.html", "report.json", *pictures}
     assert Image.open(tmp_path / "figures/path.png").size == (450, 300)
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert html == reports_page("Grasp", [read_report(tmp_path)])
