@@ -259,7 +259,7 @@ def placing_paths_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
                 axes.plot(*path.T, color=colour, lw=1.8, label=f"{shelf} shelf")
                 axes.plot(*path[-1], "s", color=colour, ms=4)
             axes.set_title(label.capitalize(), loc="left")
-            frame_space(axes, points, zoom=1.0)
+            frame_space(axes, points)
             axes.xaxis.set_major_locator(MaxNLocator(3))
             axes.view_init(elev=16, azim=62)
         handles, labels = figure.axes[0].get_legend_handles_labels()

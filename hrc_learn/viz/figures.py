@@ -45,7 +45,7 @@ WIDTH = 7.2
 
 _NARROW = 3.7
 """Width of a figure for a phone [inch]: 390 pixels, with text as large as the page's."""
-_TITLE = 48  # letters in a line of a title on a phone
+_TITLE = 50  # letters in a line of a title on a phone
 _AROUND = 0.65  # title, ticks and legend of a panel on a phone [inch]
 _SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
 
@@ -87,11 +87,11 @@ def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
     return axes
 
 
-def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"], zoom: float = 1.12) -> None:
+def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
     """Show the surroundings of some points, with the same scale on every axis."""
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(tuple(high - low), zoom=zoom)  # pyright: ignore[reportArgumentType]
+    axes.set_box_aspect(tuple(high - low))  # pyright: ignore[reportArgumentType]
 
 
 def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
