@@ -7,6 +7,7 @@ bounded, and so is its cost.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from importlib.resources import as_file, files
 from itertools import pairwise
 from typing import Any
 
@@ -37,6 +38,7 @@ from hrc_learn.skills.pick_and_place import HOME, RELEASE, TRANSFER
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.store import read_toml
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
 from hrc_learn.viz.film import Picture, annotated, camera_inset, draw_run, film_mp4
@@ -58,18 +60,8 @@ LONGEST = 16.0
 _EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
 _FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
 
-_CAPTIONS = {
-    "detect": "looks for the object with an uncalibrated camera",
-    "servo": "servoes with that camera until the gripper is above the object",
-    INTERACT: "holds the gripper there while a person may pull the elbow aside",
-    "grasp": "descends and grasps",
-    "lift": "lifts the object",
-    HOME: "carries it home",
-    TRANSFER: "carries it to the shelf along the learned motion",
-    RELEASE: "releases it on the shelf",
-    "retreat": "retreats from the cabinet",
-    "done": "done",
-}
+with as_file(files(__package__) / "film_captions.toml") as _path:
+    _CAPTIONS: dict[str, str] = read_toml(_path)
 """Captions of the phases."""
 
 _CARRYING = (HOME, TRANSFER, RELEASE, "retreat")
@@ -264,8 +256,7 @@ def caption(recording: RunRecording, time: float) -> str:
     begun = [event.text for event in recording.phases if event.time <= time]
     if not begun:
         return recording.title
-    text = _CAPTIONS.get(begun[-1], begun[-1])
-    return text[:1].upper() + text[1:]
+    return _CAPTIONS.get(begun[-1], begun[-1].capitalize())
 
 
 @contextmanager

@@ -5,6 +5,7 @@ plots that the dashboards show (`panels.py`).
 """
 
 from collections.abc import Sequence
+from importlib.resources import as_file, files
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -23,21 +24,11 @@ from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, single
 
-STYLE: dict[Any, Any] = {
-    "font.size": 9.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.titlesize": 10.0,
-    "axes.titlelocation": "left",
-    "axes.prop_cycle": cycler(color=palette.SERIES),
-    "grid.color": "#E3E5E8",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.4,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    "figure.constrained_layout.use": True,
-}
+with as_file(files(__package__) / "figures.mplstyle") as _path:
+    STYLE: dict[Any, Any] = {
+        **matplotlib.rc_params_from_file(_path, use_default_template=False),
+        "axes.prop_cycle": cycler(color=palette.SERIES),
+    }
 """Settings of matplotlib for every figure."""
 
 WIDTH = 7.2
