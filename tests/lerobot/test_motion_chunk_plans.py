@@ -1,6 +1,7 @@
 """`motion_chunk` knows several ways: averaged where their error explains them, else chosen."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from lerobot_samples import (
 )
 
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
-from hrc_learn.lerobot.policy.motion_chunks import MotionChunk, Plans
+from hrc_learn.lerobot.policy.motion_chunks import ContinuedMotion, MotionChunk, Plans
 
 SHOWN = reaching(10)
 
@@ -117,3 +118,56 @@ def test_both_ways_round_an_obstacle_are_kept_and_none_between():
     # The likeliest is one of them, always the same.
     policy.config.sample_plans = False
     assert sides(policy, 2).diff().abs() == 0
+
+
+def under_way():
+    """A motion of ten samples of which two are wide: sample k is at (k, -k), at rate 1."""
+    motion = ContinuedMotion(SimpleNamespace(samples=10), compose=lambda smooth, _: smooth)  # type: ignore[arg-type]
+    k = torch.arange(10.0)
+    states = torch.zeros(1, 10, 3, 2)
+    states[0, :, 0], states[0, :, 1] = torch.stack([k, -k], 1), torch.tensor([1.0, -1.0])
+    stepped = (k > 4)[None, :, None].float()
+    motion.chunk = MotionChunk(states=states, stepped=stepped, actions=states[:, :, 0])
+    return motion
+
+
+@pytest.mark.parametrize(("steps", "first"), [(0, 0), (3, 3), (9, 9), (12, 9)])
+def test_what_is_left_of_a_chunk_stands_still_beyond_its_end(steps, first):
+    rest = under_way().after(steps)
+    expected = torch.arange(first, first + 10).clamp(max=9).float()
+    assert torch.equal(rest.states[0, :, 0, 0], expected)
+    assert torch.equal(rest.actions[0, :, 1], -expected)
+    assert torch.equal(rest.stepped[0, :, 0], (expected > 4).float())
+    moving = torch.arange(10) + steps <= 9
+    assert torch.equal(rest.states[0, :, 1, 0], moving.float())
+
+
+@pytest.mark.parametrize(
+    ("at", "first"), [((6.2, -5.9), 6), ((-5.0, 5.0), 1), ((50.0, 0.0), 9)]
+)
+def test_a_motion_goes_on_from_its_nearest_action_but_the_first(at, first):
+    rest = under_way().nearest(torch.tensor([at]))
+    assert rest.states[0, 0, 0, 0] == first
+
+
+@pytest.mark.parametrize(
+    ("left", "first"),
+    [
+        ([[4.0, -4.0], [5.0, -5.0]], 4),
+        ([[4.0, -4.0], [5.0, -5.0], [0.0, 0.0]], 4),  # filled up with zeros
+        ([[0.0, 0.0], [1.0, -1.0]], 0),
+        ([[0.0, 0.0]], 9),  # none is left over
+        ([[4.0, -4.0], [6.0, -6.0]], None),  # of another source
+    ],
+)
+def test_actions_left_over_are_found_in_the_last_chunk(left, first):
+    rest = under_way().left_over(torch.tensor(left))
+    assert (None if rest is None else rest.states[0, 0, 0, 0]) == first
+
+
+def test_nothing_under_way_has_no_rest():
+    motion = under_way()
+    motion.reset()
+    assert motion.after(1) is None
+    assert motion.nearest(torch.zeros(1, 2)) is None
+    assert motion.left_over(torch.ones(1, 2)) is None
