@@ -391,7 +391,7 @@ def changed_features(
         points, width = np.rint(near).astype(np.int32), round(2 * ASIDE * image.shape[1])
         mask &= np.asarray(cv2.polylines(np.zeros_like(mask), [points], False, 1, width))
     if not mask.any():
-        return Features.of(image[:0])
+        return Features(pixels=np.zeros((0, 2)), descriptors=np.zeros((0, 128), np.uint8))
     left, top, width, height = cv2.boundingRect(mask)
     seen = Features.of(image, (left, top, left + width, top + height))
     u, v = np.rint(seen.pixels).astype(int).T
