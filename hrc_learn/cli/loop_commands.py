@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from rich.console import Console
 
 from hrc_learn.cli._run import configuration, with_settings, write_values
@@ -62,7 +63,7 @@ MARKER = (0.05, 0.0, -0.08)
 FRAME_TIME = 0.032
 """Time between images of `hrc serve` [s]."""
 CENTRE = (0.35, 0.35, 0.35)
-"""Centre of the box that the tool moves in, in `hrc serve` [m]."""
+"""Centre of the box that the tool moves in, in `hrc serve`, for the Franka hand [m]."""
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
@@ -228,12 +229,15 @@ def serve(args: Serve) -> None:
     if args.ros2:
         _serve_node(args, settings)
         return
-    camera, robot = _camera(), ArmChoice(found_description(args.robot)).work_arm()
+    robot = ArmChoice(found_description(args.robot)).work_arm()
+    # A short arm has a small hand.
+    centre = robot.hand_size * np.array(CENTRE)
+    camera = _camera(centre)
     scene = SceneConfig(timestep=dt)
     world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
     world.reset(robot.chain.ready.numpy())
     connect, safety = _access(args, settings.site, world, SafetyConfig())
-    controller, observation = _controller(robot.chain, camera, dt, safety)
+    controller, observation = _controller(robot.chain, camera, centre, dt, safety)
     began = time.perf_counter()
     if settings.step == "eager":
         runner = EagerRunner(controller, observation)
@@ -275,7 +279,7 @@ def _report(args: Serve, figures: Mapping[str, float | int]) -> None:
     write_values(args.json, figures)
 
 
-def _camera() -> CameraModel:
+def _camera(centre: Float[np.ndarray, "3"]) -> CameraModel:
     """Camera 1.1 m from the middle of the box, looking down with a lean of 0.2 rad.
 
     The image is turned by half a radian from that of the paper's camera, whose image Jacobian
@@ -283,15 +287,18 @@ def _camera() -> CameraModel:
     """
     lean, turn = 0.2, 1.0
     towards = np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)
-    eye = np.array(CENTRE) + 1.1 * np.array(towards)
-    return CameraModel(focal=(1600.0, 1600.0)).look_at(eye, np.array(CENTRE))
+    return CameraModel(focal=(1600.0, 1600.0)).look_at(centre + 1.1 * np.array(towards), centre)
 
 
 def _controller(
-    chain: SerialChain, camera: CameraModel, dt: float, safety: SafetyConfig
+    chain: SerialChain,
+    camera: CameraModel,
+    middle: Float[np.ndarray, "3"],
+    dt: float,
+    safety: SafetyConfig,
 ) -> tuple[AdaptiveController, Observation]:
     """The controller, and an observation with every field that the loop sets."""
-    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    centre = torch.from_numpy(middle)
     down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
     tool = Pose(centre + centre.new_tensor((0.03, -0.02, 0.0)), down)
     target = torch.from_numpy(camera.project(tool.apply(MARKER).numpy()))
