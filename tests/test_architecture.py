@@ -125,6 +125,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
+    "cli": {"huggingface_hub", "httpx", "lerobot"},
     "demos": {
         "av",
         "scipy",
@@ -167,6 +168,8 @@ DISTRIBUTIONS = {
     "trimesh": "viser",
     # Requirements of lerobot's own.
     "torchvision": "lerobot",
+    "huggingface_hub": "lerobot",
+    "httpx": "lerobot",
     "gymnasium": "lerobot",
     "draccus": "lerobot",
 }

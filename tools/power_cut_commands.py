@@ -72,6 +72,7 @@ CASES = {
     "repair .": Case(
         "--json j.json", copies=("set.recording", ".fit.writing"), datasets=("set",)
     ),
+    "push": Case("{inputs}/placing_demos me/set --dry-run --json j.json"),
     "fit": Case("--dataset {inputs}/placing_demos --out out --json j.json"),
     "fit image-jacobian": Case("--dataset {inputs}/aiming_demos --out out --json j.json"),
     "fit image-jacobian marked": Case(

@@ -49,6 +49,7 @@ COMMANDS: dict[str, Command] = {
     "repair": Command("dataset_commands.repair", arguments.Repair, ("dataset", "out")),
     "merge": Command("dataset_commands.merge", arguments.Merge, ("datasets",)),
     "curate": Command("dataset_commands.curate", arguments.Curate, ("dataset",)),
+    "push": Command("dataset_commands.push", arguments.Push, ("dataset", "repo")),
     "fit": Command("fit_command.fit_primitives", arguments.FitPrimitives, ("dataset",)),
     "fit image-jacobian": Command(
         "image_jacobian_commands.fit_image_jacobian", arguments.FitImageJacobian, ("dataset",)

@@ -40,7 +40,7 @@ _LIBRARIES = {
     "ui": ("viser",),
     "gamepad": ("pygame",),
     "haptic": ("forcedimension_core",),
-    "lerobot": ("lerobot", "gymnasium"),
+    "lerobot": ("lerobot", "gymnasium", "huggingface_hub", "httpx"),
     "hardware": ("franky", "pylibfranka", "franky_sim"),
     "meshes": ("example_robot_data",),
 }

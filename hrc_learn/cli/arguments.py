@@ -270,6 +270,31 @@ class Show(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Push(OnDataset):
+    """Check a dataset and have LeRobot upload it to the Hugging Face Hub with a dataset card.
+
+    Creates the repository if needed. Log in with `hf auth login` first. LeRobot takes datasets
+    of version 3.0: `hrc repair` makes one of an older version.
+
+        hrc push pour alice/pour --license cc-by-4.0
+        hrc push pour alice/pour --dry-run
+    """
+
+    repo: str
+    """OWNER/NAME on the Hub."""
+    private: bool = True
+    """Make a new repository private."""
+    license: str | None = None
+    """Licence identifier, such as cc-by-4.0. Without one, others may not use the data."""
+    tags: tuple[str, ...] = ()
+    """Tags in addition to those of LeRobot."""
+    unsound: bool = False
+    """Upload a dataset that has errors."""
+    dry_run: bool = False
+    """Check the dataset without uploading it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Fit(OnDataset, Written):
     """A command that learns a model from demonstrations."""
 

@@ -1,4 +1,4 @@
-"""`hrc import`, `check`, `repair`, `merge`, `curate`: making and mending datasets."""
+"""`hrc import`, `check`, `repair`, `merge`, `curate`, `push`: making and mending datasets."""
 
 import sys
 import webbrowser
@@ -11,8 +11,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
-from hrc_learn.cli._run import configuration, has_screen, updated, write_values
-from hrc_learn.cli.arguments import Check, Curate, Import, Merge, Repair, columns
+from hrc_learn.cli._run import configuration, has_screen, one_line, updated, write_values
+from hrc_learn.cli.arguments import Check, Curate, Import, Merge, Push, Repair, columns
 from hrc_learn.demos import (
     RepairOptions,
     check_dataset,
@@ -21,6 +21,7 @@ from hrc_learn.demos import (
     recover_all,
     repair_dataset,
 )
+from hrc_learn.demos.issues import counted
 from hrc_learn.demos.quality.ranking import (
     Decision,
     Decisions,
@@ -305,3 +306,49 @@ def _browser_decisions(args: Curate, ranking: Ranking) -> Decisions:
         except KeyboardInterrupt:
             print()
         return dict(page.decisions)
+
+
+def push(args: Push) -> int:
+    """Check the dataset, have LeRobot upload it, and print its address.
+
+    Raises:
+        ValueError: The dataset has errors, or the name of the repository has another form.
+    """
+    if args.repo.count("/") != 1:
+        raise ValueError(f"repository name {args.repo!r} must have the form OWNER/NAME")
+    report = check_dataset(args.dataset)
+    if report.errors and not args.unsound:
+        raise ValueError(
+            f"{args.dataset} has {counted(len(report.errors), 'error')}: repair it, or upload "
+            f"it as it is (--unsound). The first: {report.errors[0]}"
+        )
+    sizes = [path.stat().st_size for path in args.dataset.rglob("*") if path.is_file()]
+    place = "nothing sent" if args.dry_run else _uploaded(args)
+    print(
+        f"{counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB: {place or 'nothing sent'}"
+    )
+    counts = {"errors": len(report.errors), "warnings": len(report.warnings)}
+    write_values(args.json, {"files": len(sizes), "bytes": sum(sizes)} | counts)
+    return 0 if place else 1
+
+
+def _uploaded(args: Push) -> str:
+    """Address of the dataset after LeRobot's upload with card and tag; "" if it was refused."""
+    import httpx
+    from huggingface_hub import constants
+    from huggingface_hub.errors import HfHubHTTPError
+    from lerobot.datasets import LeRobotDataset
+
+    try:
+        LeRobotDataset(args.repo, root=args.dataset).push_to_hub(
+            tags=[*args.tags], license=args.license, private=args.private
+        )
+    except HfHubHTTPError as error:
+        status = getattr(error.response, "status_code", None)
+        login = " (`hf auth login` with a token that may write)" if status in (401, 403) else ""
+        print(f"error: refused by the Hub: {one_line(error)}{login}", file=sys.stderr)
+        return ""
+    except httpx.TransportError as error:
+        print(f"error: the Hub cannot be reached: {one_line(error)}", file=sys.stderr)
+        return ""
+    return f"{constants.ENDPOINT}/datasets/{args.repo}"

@@ -325,11 +325,7 @@ def run(monkeypatch, main) -> object:
             "error: mujoco is not",
         ),
         (ModuleNotFoundError("no tyro", name="tyro"), 1, "error: tyro is not installed"),
-        (
-            ModuleNotFoundError("none", name="gymnasium"),
-            1,
-            "error: gymnasium is not installed, which",
-        ),
+        (ModuleNotFoundError("none", name="httpx"), 1, "error: httpx is not installed, which"),
         (MissingModelError("get it", name="robosuite"), 1, "error: get it\n"),
     ],
 )
