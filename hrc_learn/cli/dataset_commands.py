@@ -247,10 +247,7 @@ def curate(args: Curate) -> None:
             progress=partial(progress, description="Writing"),
         )
         values["frames"] = report.frames
-        print(
-            f"{args.folder}: {len(report.changes)} episodes, {report.frames} of "
-            f"{report.frames_before} frames"
-        )
+        print(report)
     elif decisions:
         print(
             f"decisions stored in {decisions_path(args.dataset)}; hrc curate {args.dataset} "
@@ -309,13 +306,11 @@ def _browser_decisions(args: Curate, ranking: Ranking) -> Decisions:
 
 
 def push(args: Push) -> int:
-    """Check the dataset, have LeRobot upload it, and print its address.
+    """Check the dataset, and have LeRobot upload it with a card and a tag.
 
     Raises:
-        ValueError: The dataset has errors, or the name of the repository has another form.
+        ValueError: The dataset has errors.
     """
-    if args.repo.count("/") != 1:
-        raise ValueError(f"repository name {args.repo!r} must have the form OWNER/NAME")
     report = check_dataset(args.dataset)
     if report.errors and not args.unsound:
         raise ValueError(
@@ -323,32 +318,20 @@ def push(args: Push) -> int:
             f"it as it is (--unsound). The first: {report.errors[0]}"
         )
     sizes = [path.stat().st_size for path in args.dataset.rglob("*") if path.is_file()]
-    place = "nothing sent" if args.dry_run else _uploaded(args)
-    print(
-        f"{counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB: {place or 'nothing sent'}"
-    )
+    print(f"{counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB", flush=True)
     counts = {"errors": len(report.errors), "warnings": len(report.warnings)}
     write_values(args.json, {"files": len(sizes), "bytes": sum(sizes)} | counts)
-    return 0 if place else 1
-
-
-def _uploaded(args: Push) -> str:
-    """Address of the dataset after LeRobot's upload with card and tag; "" if it was refused."""
-    import httpx
-    from huggingface_hub import constants
+    if args.dry_run:
+        return 0
+    from httpx import TransportError
     from huggingface_hub.errors import HfHubHTTPError
     from lerobot.datasets import LeRobotDataset
 
+    dataset = LeRobotDataset(args.repo, root=args.dataset)
     try:
-        LeRobotDataset(args.repo, root=args.dataset).push_to_hub(
-            tags=[*args.tags], license=args.license, private=args.private
-        )
-    except HfHubHTTPError as error:
-        status = getattr(error.response, "status_code", None)
-        login = " (`hf auth login` with a token that may write)" if status in (401, 403) else ""
-        print(f"error: refused by the Hub: {one_line(error)}{login}", file=sys.stderr)
-        return ""
-    except httpx.TransportError as error:
-        print(f"error: the Hub cannot be reached: {one_line(error)}", file=sys.stderr)
-        return ""
-    return f"{constants.ENDPOINT}/datasets/{args.repo}"
+        dataset.push_to_hub(tags=[*args.tags], license=args.license, private=args.private)
+    except (HfHubHTTPError, TransportError) as error:
+        print(f"error: not uploaded (`hf auth login`?): {one_line(error)}", file=sys.stderr)
+        return 1
+    print(f"uploaded to {args.repo}")
+    return 0

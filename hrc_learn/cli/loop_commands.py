@@ -31,6 +31,7 @@ from hrc_learn.controller import (
     SafetyConfig,
 )
 from hrc_learn.demos import DatasetWriter
+from hrc_learn.demos.issues import counted
 from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
 from hrc_learn.experiments.real_arm import ArmSite, opened_arm
 from hrc_learn.experiments.simulated_cell import access_by
@@ -51,7 +52,6 @@ from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
     PageSessionConfig,
-    counted,
     place_targets,
 )
 from hrc_learn.vision import CameraModel
@@ -154,7 +154,7 @@ def page(args: ServePage) -> None:
                 figures = _run_page(session, page, guiding.dt, args.duration)
     finally:
         if saved := recorder.status.saved:
-            console.print(f"{args.out}: {counted(saved)}", soft_wrap=True)
+            console.print(f"{args.out}: {counted(saved, 'demonstration')}", soft_wrap=True)
     if not saved:
         console.print("No demonstration was saved, so there is no dataset")
     write_values(args.json, {**figures, "episodes": saved})

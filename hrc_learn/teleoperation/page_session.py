@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.controller import INTERVENTIONS
+from hrc_learn.demos.issues import counted
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Human, OpenedArm, Request
@@ -100,11 +101,6 @@ def place_target_hint(workplace: Workplace, position: Float[np.ndarray, "3"]) ->
         if abs(distance) >= 1  # closer than a centimetre is close enough
     ]
     return f"{nearest} shelf: {', '.join(steps) or 'there'}"
-
-
-def counted(demonstrations: int) -> str:
-    """Number and noun, in singular or plural."""
-    return f"{demonstrations} demonstration{'s' * (demonstrations != 1)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +201,9 @@ class PageSession:
             self.arm.stop()
             self._recorder.finish()
             saved = self._recorder.status.saved
-            self._page.farewell = f"Finished: {counted(saved)} saved. You can close this tab."
+            self._page.farewell = (
+                f"Finished: {counted(saved, 'demonstration')} saved. You can close this tab."
+            )
         elif request == "home":
             # A demonstration must not contain that.
             if self._recorder.state == "recording":

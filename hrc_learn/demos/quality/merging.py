@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hrc_learn.demos.issues import DatasetError, counted
+from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.read.frames import RawFrames, read_frames
@@ -33,10 +33,10 @@ class MergeReport:
     """Differences between the datasets, and the treatment of each."""
 
     def __str__(self) -> str:
-        counts = [
-            counted(getattr(self, f"{noun}s"), noun) for noun in ("episode", "frame", "task")
-        ]
-        return "\n".join([*self.notes, f"{self.path}: {', '.join(counts)}"])
+        counts = (
+            f"{counted(self.episodes, 'episode')}, {self.frames} frames, {self.tasks} tasks"
+        )
+        return "\n".join([*self.notes, f"{self.path}: {counts}"])
 
 
 def merge_datasets(

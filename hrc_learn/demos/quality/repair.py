@@ -40,7 +40,7 @@ from hrc_learn.demos.recorded_episode import to_table
 from hrc_learn.demos.videos import read_segments, video_keys
 from hrc_learn.store import write_json
 
-_LISTS = "meta/episodes"
+_LISTS, _INDEX = "meta/episodes", ("episode_index",)
 _STAMP_TOLERANCE = 1e-3
 """Deviation from a regular clock that is kept [s]: above the rounding of float32 stamps."""
 
@@ -168,9 +168,8 @@ def _finished(root: Path) -> Iterator[tuple[Path, list[str]]]:
         yield root, []
         return
     with TemporaryDirectory(dir=root.parent, prefix=f".{root.name}.finished_") as copy:
-        lost = finish_recording(root, Path(copy))
-        said = f"recorder was killed: {', '.join(unfinished)} had no end"
-        yield Path(copy), [f"{said}; episodes lost: {lost}"]
+        lost, files = finish_recording(root, Path(copy)), ", ".join(unfinished)
+        yield Path(copy), [f"recorder was killed: {files} had no end; episodes lost: {lost}"]
 
 
 def unfinished_files(root: Path) -> list[str]:
@@ -179,14 +178,9 @@ def unfinished_files(root: Path) -> list[str]:
     It writes the rows of each episode at once, but the footers of its files, and the list of
     episodes, only at its end.
     """
-    try:
-        listed = open_folder(root).files
-    except DatasetError:
-        listed = {}
     data, lists = (sorted(root.glob(f"{part}/*/file-*.parquet")) for part in ("data", _LISTS))
     names = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
-    missing = [f"{_LISTS} (missing)"] if data and not lists else []
-    return [name for name in names if name not in listed] + missing
+    return names + ([f"{_LISTS} (missing)"] if data and not lists else [])
 
 
 def finish_recording(root: Path, target: Path) -> int:
@@ -202,11 +196,12 @@ def finish_recording(root: Path, target: Path) -> int:
     """
     info, rows, frames = read_info(root), [], 0
     features = {k: f for k, f in info["features"].items() if f["dtype"] != "video"}
-    lists = [file for file in episode_lists(root) if not is_unfinished(root / file)]
-    known = [row for file in lists for row in read_rows(root, file, ("episode_index",))]
-    listed = {row["episode_index"]: row for row in known}
-    left_out = shutil.ignore_patterns("episodes", "images")
+    left_out = shutil.ignore_patterns("images")
     shutil.copytree(root, target, ignore=left_out, copy_function=put, dirs_exist_ok=True)
+    for file in (file for file in episode_lists(root) if is_unfinished(root / file)):
+        (target / file).unlink()
+    known = [row for file in episode_lists(target) for row in read_rows(target, file, _INDEX)]
+    listed = {row["episode_index"] for row in known}
     for path in sorted(target.glob("data/*/file-*.parquet")):
         if is_unfinished(path):
             content = finished_parquet(path.read_bytes(), _example(features))
@@ -216,19 +211,19 @@ def finish_recording(root: Path, target: Path) -> int:
         table = read_table(open_parquet(target, file), file, ["episode_index"])
         for index, length in Counter(table.column(0).to_pylist()).items():
             row = {"episode_index": index, "length": length, "dataset_from_index": frames}
-            rows.append(listed.get(index, row | _place("data", path)))
+            rows += [] if index in listed else [row | _place("data", path)]
             frames += length
-    if not rows:
+    if not (known or rows):
         raise DatasetError("the recording holds no complete episode", file=root)
     for key in info["features"].keys() - features.keys():
-        _place_videos(target, key, rows, info["fps"])
-    names = dict.fromkeys(name for row in rows for name in row)
-    (target / _LISTS / "chunk-000").mkdir(parents=True)
-    table = pa.table({name: [row.get(name) for row in rows] for name in names})
-    write_parquet(table, target / _LISTS / "chunk-000/file-000.parquet")
-    counts = {"total_episodes": len(rows), "total_frames": frames}
-    write_json(target / INFO_PATH, info | counts)
-    return max(0, info.get("total_episodes", 0) - len(rows))
+        _place_videos(target, key, known, rows, info["fps"])
+    file = target / _LISTS / "chunk-000" / f"file-{len(episode_lists(target)):03d}.parquet"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if rows:
+        write_parquet(pa.Table.from_pylist(rows), file)
+    count = len(known) + len(rows)
+    write_json(target / INFO_PATH, info | {"total_episodes": count, "total_frames": frames})
+    return max(0, info.get("total_episodes", 0) - count)
 
 
 def _example(features: Mapping[str, Mapping]) -> pa.Table:
@@ -250,13 +245,14 @@ def _place(kind: str, path: Path) -> dict[str, int]:
     return dict(zip((f"{kind}/chunk_index", f"{kind}/file_index"), numbers, strict=True))
 
 
-def _place_videos(root: Path, key: str, rows: Sequence[dict], fps: float) -> None:
-    """Add the videos of a camera to the episodes without one, in the order of recording."""
-    kind = f"videos/{key}"
-    left = [row for row in rows if f"{kind}/file_index" not in row]
+def _place_videos(
+    root: Path, key: str, known: Sequence[dict], rows: Sequence[dict], fps: float
+) -> None:
+    """Add videos of a camera that no known episode names to rows, in the order of recording."""
+    kind, left = f"videos/{key}", [*rows]
     for path in sorted(root.glob(f"{kind}/*/file-*.mp4")):
         place, begin = _place(kind, path), 0
-        if any(place.items() <= row.items() for row in rows):
+        if any(place.items() <= row.items() for row in known):
             continue
         with suppress(DatasetError):  # episodes without a video are reported later
             images = read_stream(path).images

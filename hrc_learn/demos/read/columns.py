@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.issues import DatasetError
@@ -179,23 +179,12 @@ def _named_selection(
     )
 
 
-@runtime_checkable
-class HasComponents(Protocol):
-    """Feature of a dataset, or field of a recording."""
-
-    @property
-    def width(self) -> int:
-        """Number of components."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...] | None:
-        """Names of the components, if there are any."""
-        ...
+Components = Mapping[str, Any]
+"""Features of a dataset, or fields of a recording: objects with a `width` and `names`."""
 
 
 def column_places(
-    role: str, text: str, features: Mapping[str, HasComponents], file: str | Path
+    role: str, text: str, features: Components, file: str | Path
 ) -> list[tuple[str, int]]:
     """Feature and component of each column that a text stands for.
 
@@ -241,7 +230,7 @@ def column_places(
 def feature_key(
     role: str,
     text: str,
-    features: Mapping[str, HasComponents],
+    features: Components,
     file: str | Path,
     components: Sequence[str] = (),
 ) -> str:

@@ -239,12 +239,10 @@ def write_parquet(table: pa.Table, path: Path) -> None:
 
 
 _MAGIC = b"PAR1"
-_BOOLEAN, _BYTE, _I64, _BINARY, _LIST, _STRUCT = (1, 2), 3, 6, 8, 9, 12
-"""Types of Thrift's compact protocol; those from 4 to 6 are integers."""
+_TRUE, _FALSE, _BYTE, _I32, _I64, _BINARY, _LIST, _STRUCT = 1, 2, 3, 5, 6, 8, 9, 12
+"""Types of Thrift's compact protocol, in which Parquet writes its headers."""
 _Struct = dict[int, tuple[int, Any]]
 """Type and value of each field of a struct, by its number."""
-_ENCODINGS = (5, [0, 3, 8])
-"""PLAIN, RLE and RLE_DICTIONARY: those of pyarrow's pages."""
 
 
 class _Page(NamedTuple):
@@ -279,38 +277,17 @@ def finished_parquet(content: bytes, example: pa.Table) -> bytes:
     sink = pa.BufferOutputStream()
     pq.write_table(example, sink)
     twin = sink.getvalue().to_pybytes()
-    footer, _ = _read_struct(twin, len(twin) - 8 - int.from_bytes(twin[-8:-4], "little"))
+    footer, _ = _read(twin, len(twin) - 8 - int.from_bytes(twin[-8:-4], "little"), _STRUCT)
     (group,) = footer[4][1][1]
     model = [column[3][1] for column in group[1][1][1]]
-    pages, groups, end, total = [*_pages(content)], [], 4, 0
+    pages, groups, end = [*_pages(content)], [], 4
     while (found := _row_group(pages, model)) is not None:
-        rows, chunks = found
-        columns = [
-            {2: (_I64, 0), 3: (_STRUCT, _column(own, chunk))}
-            for own, chunk in zip(model, chunks, strict=True)
-        ]
-        size = sum(page.plain_size for chunk in chunks for page in chunk)
-        groups.append({1: (_LIST, (_STRUCT, columns)), 2: (_I64, size), 3: (_I64, rows)})
-        pages = pages[sum(map(len, chunks)) :]
-        end, total = chunks[-1][-1].end, total + rows
-    footer |= {3: (_I64, total), 4: (_LIST, (_STRUCT, groups))}
-    made = _value_bytes(_STRUCT, footer)
+        count, group = found
+        groups.append(group)
+        pages, end = pages[count:], pages[count - 1].end
+    footer |= {3: (_I64, sum(group[3][1] for group in groups)), 4: (_LIST, (_STRUCT, groups))}
+    made = _written(_STRUCT, footer)
     return content[:end] + made + len(made).to_bytes(4, "little") + _MAGIC
-
-
-def _column(model: _Struct, pages: Sequence[_Page]) -> _Struct:
-    """Metadata of the pages of a column, with the type, name and codec of a model."""
-    data = next(page for page in pages if page.values)
-    sizes = {
-        5: sum(page.values for page in pages),
-        6: sum(page.plain_size for page in pages),
-        7: pages[-1].end - pages[0].start,
-        9: data.start,
-    }
-    if data is not pages[0]:
-        sizes[11] = pages[0].start
-    made = {number: model[number] for number in (1, 3, 4)} | {2: (_LIST, _ENCODINGS)}
-    return made | {number: (_I64, size) for number, size in sizes.items()}
 
 
 def _pages(content: bytes) -> Iterator[_Page]:
@@ -318,7 +295,7 @@ def _pages(content: bytes) -> Iterator[_Page]:
     at = len(_MAGIC)
     while True:
         try:
-            header, begin = _read_struct(content, at)
+            header, begin = _read(content, at, _STRUCT)
             plain, end = begin - at + header[2][1], begin + header[3][1]
             # Number of values in a data page of either version.
             values = next((header[n][1][1][1] for n in (5, 8) if n in header), 0)
@@ -330,61 +307,71 @@ def _pages(content: bytes) -> Iterator[_Page]:
         at = end
 
 
-def _row_group(
-    pages: Sequence[_Page], model: Sequence[_Struct]
-) -> tuple[int, list[list[_Page]]] | None:
-    """Number of rows and pages of each column of the next row group; None if incomplete.
+def _row_group(pages: Sequence[_Page], model: Sequence[_Struct]) -> tuple[int, _Struct] | None:
+    """Number of pages and metadata of the next row group; None if it is incomplete.
 
     A column begins with its dictionary, unless it holds Booleans. Any page of the first column
     may be its last one.
     """
-    each = [column[5][1] for column in model]  # values of one row
     for first in accumulate(page.values for page in pages):
-        rows, chunks, at = first // each[0], [], 0
-        for count, column in zip(each, model, strict=True):
-            values, begin = 0, at
-            while values < rows * count and at < len(pages):
+        rows, columns, at = first // model[0][5][1], [], 0
+        for column in model:
+            wanted, values, begin = rows * column[5][1], 0, at
+            while values < wanted and at < len(pages):
                 values, at = values + pages[at].values, at + 1
             is_plain = column[1][1] == 0
-            if not rows or values != rows * count or bool(pages[begin].values) != is_plain:
+            if not rows or values != wanted or bool(pages[begin].values) != is_plain:
                 break
-            chunks.append(pages[begin:at])
-        if len(chunks) == len(model):
-            return rows, chunks
+            columns.append({2: (_I64, 0), 3: (_STRUCT, _column(column, pages[begin:at]))})
+        if len(columns) == len(model):
+            size = sum(page.plain_size for page in pages[:at])
+            parts = {1: (_LIST, (_STRUCT, columns)), 2: (_I64, size), 3: (_I64, rows)}
+            return at, parts
     return None
 
 
-def _read_struct(data: bytes, at: int) -> tuple[_Struct, int]:
-    """A struct of Thrift's compact protocol, and the place behind it."""
-    fields: _Struct = {}
-    number = 0
-    while data[at]:
-        step, kind = divmod(data[at], 16)
-        number, at = (number + step, at + 1) if step else _read_value(data, at + 1, 4)
-        value, at = _read_value(data, at, kind)
-        fields[number] = kind, value
-    return fields, at + 1
+def _column(model: _Struct, pages: Sequence[_Page]) -> _Struct:
+    """Metadata of the pages of a column, with the type, name and codec of a model."""
+    sizes = {
+        5: sum(page.values for page in pages),
+        6: sum(page.plain_size for page in pages),
+        7: pages[-1].end - pages[0].start,
+        9: next(page.start for page in pages if page.values),
+        11: pages[0].start,
+    }
+    if pages[0].values:  # no dictionary
+        del sizes[11]
+    made = {number: (_I64, size) for number, size in sizes.items()}
+    # Plain, levels by run length, and dictionary: the encodings of pyarrow.
+    return made | {1: model[1], 2: (_LIST, (_I32, [0, 3, 8])), 3: model[3], 4: model[4]}
 
 
-def _read_value(data: bytes, at: int, kind: int) -> tuple[Any, int]:
-    if kind in _BOOLEAN:
-        return kind == 1, at
+def _read(data: bytes, at: int, kind: int) -> tuple[Any, int]:
+    """A value of Thrift's compact protocol, and the place behind it."""
+    if kind in (_TRUE, _FALSE):
+        return kind == _TRUE, at
     if kind == _BYTE:
         return data[at], at + 1
     if kind == _STRUCT:
-        return _read_struct(data, at)
+        fields, field = {}, 0
+        while data[at]:
+            step, part = divmod(data[at], 16)
+            field, at = (field + step, at + 1) if step else _read(data, at + 1, _I32)
+            value, at = _read(data, at, part)
+            fields[field] = part, value
+        return fields, at + 1
     if kind == _LIST:
         size, part = divmod(data[at], 16)
         size, at = _read_number(data, at + 1) if size == 15 else (size, at + 1)
         values = []
         for _ in range(size):
-            value, at = _read_value(data, at, part)
+            value, at = _read(data, at, part)
             values.append(value)
         return (part, values), at
     number, at = _read_number(data, at)
     if kind == _BINARY:
         return data[at : at + number], at + number
-    if kind in (4, 5, _I64):
+    if kind in (4, _I32, _I64):
         return (number >> 1) ^ -(number & 1), at
     raise ValueError(f"type {kind} of Thrift is not used in Parquet")
 
@@ -398,30 +385,27 @@ def _read_number(data: bytes, at: int) -> tuple[int, int]:
     return number | data[at] << shift, at + 1
 
 
-def _value_bytes(kind: int, value: Any) -> bytes:
+def _written(kind: int, value: Any) -> bytes:
     """A value in Thrift's compact protocol; fields of structs are at most 15 numbers apart."""
-    if kind in _BOOLEAN:
+    if kind in (_TRUE, _FALSE):
         return b""
     if kind == _BYTE:
         return bytes([value])
     if kind == _BINARY:
-        return _number_bytes(len(value)) + value
+        return _number(len(value)) + value
     if kind == _LIST:
         part, values = value
-        parts = b"".join(_value_bytes(part, one) for one in values)
-        return bytes([240 | part]) + _number_bytes(len(values)) + parts
+        head = bytes([240 | part]) + _number(len(values))
+        return head + b"".join(_written(part, one) for one in values)
     if kind == _STRUCT:
         made, last = b"", 0
-        for number, (own, one) in sorted(value.items()):
-            made += bytes([(number - last) << 4 | own]) + _value_bytes(own, one)
-            last = number
+        for field, (own, one) in sorted(value.items()):
+            made += bytes([(field - last) << 4 | own]) + _written(own, one)
+            last = field
         return made + b"\0"
-    return _number_bytes(value << 1 if value >= 0 else ~(value << 1))
+    return _number(value << 1 if value >= 0 else ~(value << 1))
 
 
-def _number_bytes(number: int) -> bytes:
-    made = bytearray()
-    while number > 127:
-        made.append(number & 127 | 128)
-        number >>= 7
-    return bytes([*made, number])
+def _number(number: int) -> bytes:
+    low, high = number & 127, number >> 7
+    return bytes([low | 128]) + _number(high) if high else bytes([low])
