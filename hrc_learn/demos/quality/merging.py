@@ -33,9 +33,7 @@ class MergeReport:
     """Differences between the datasets, and the treatment of each."""
 
     def __str__(self) -> str:
-        counts = (
-            f"{counted(self.episodes, 'episode')}, {self.frames} frames, {self.tasks} tasks"
-        )
+        counts = f"{self.episodes} episodes, {self.frames} frames, {self.tasks} tasks"
         return "\n".join([*self.notes, f"{self.path}: {counts}"])
 
 
