@@ -34,6 +34,9 @@ largest value of a column: a sum of fifty products rounds off as much."""
 CHUNK = {"cpu": 2**16, "cuda": 2**22}
 """Samples processed at a time. On a CPU, their indices and powers fit the cache, which halves
 the time of a million; a GPU is kept busy within a gigabyte."""
+LONG = 2**14
+"""Samples of one grid above which matrices for all of them would take more memory than the
+motion, and longer."""
 
 
 def motion(
@@ -278,6 +281,14 @@ def _gathered(
     if table.others is not None:
         y = y + table.extra(s, y.dtype) @ (coordinates @ table.others).mT
     return y
+
+
+def blocks(s: Float[Tensor, "B T"]) -> Iterator[tuple[slice, slice]]:
+    """Slices of the batch and of time with about `CHUNK` samples each."""
+    T = s.shape[1]
+    for part in chunks(s):
+        for first in range(0, T, CHUNK["cpu"]):
+            yield part, slice(first, first + CHUNK["cpu"])
 
 
 def chunks(s: Float[Tensor, "B T"]) -> Iterator[slice]:

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Mask, Points, Times, to_tensor
-from hrc_learn.dmp.dynamics import cubic_spline
+from hrc_learn.dmp.dynamics import DEGREE, cubic_spline
 
 MINIMUM_SAMPLES = 3
 """Start, goal and one sample between them; two leave nothing to fit."""
@@ -425,19 +425,34 @@ def _cubic(
 class _Spline:
     """Splines on a time grid, in coordinates that diagonalise both samples and penalty."""
 
-    U: Float[Tensor, "T K"]
-    """Maps samples to coordinates, and coordinates to the motion."""
+    first: Int[Tensor, "T"]
+    """First of the four splines that are not zero at each sample."""
+    values: Float[Tensor, "T 4"]
+    """Values of these four."""
+    V: Float[Tensor, "K K"]
+    """Maps coordinates to control points."""
     data: Float[Tensor, "K"]
     """Precision of each coordinate from the samples, 0 to 1; the penalty adds the rest."""
     strengths: Float[Tensor, "L"]
     """Penalties to choose from."""
+
+    def at_samples(self, points: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch T"]:
+        """Splines with these control points."""
+        return sum(points[..., self.first + k] * self.values[:, k] for k in range(4))
+
+    def projected(self, y: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch K"]:
+        """Products of samples with each spline; the transpose of `at_samples`."""
+        total = y.new_zeros(*y.shape[:-1], len(self.V))
+        for k in range(4):
+            total.index_add_(-1, self.first + k, y * self.values[:, k])
+        return total
 
     def smooth(self, y: Float[Tensor, "*batch T"]) -> tuple[Float[Tensor, "*batch T"], Tensor]:
         """Most likely motion and the standard deviation of the noise, for each column."""
         T = y.shape[-1]
         middle = y.mean(-1, keepdim=True)
         y = y - middle
-        c = y @ self.U
+        c = self.projected(y) @ self.V
         e, r = self.data, 1 - self.data
         # The prior precision of coordinate k is lambda r_k, that of the samples e_k.
         total = e + self.strengths[:, None] * r
@@ -452,7 +467,7 @@ class _Spline:
         # The strongest penalty that is not significantly less likely than the best.
         likely = score <= score.amin(-1, keepdim=True) + LIKELIHOOD_MARGIN
         best = (likely * torch.arange(1, STRENGTHS + 1, device=y.device)).argmax(-1)
-        fitted = (c / total[best]) @ self.U.mT
+        fitted = self.at_samples((c / total[best]) @ self.V.mT)
         noise = (misfit.gather(-1, best[..., None])[..., 0] / n).sqrt()
         return fitted + middle, noise
 
@@ -462,14 +477,23 @@ class _Spline:
 def _spline(timestamps: bytes, device: torch.device) -> _Spline:
     s = torch.frombuffer(bytearray(timestamps), dtype=torch.float64).to(device)
     knots = max(4, min(MAXIMUM_KNOTS, len(s) // 2))
-    B = cubic_spline(s[:, None] * knots - torch.arange(-1, knots + 2).to(s))
-    K = B.shape[1]
+    K = knots + DEGREE
+    x = s * knots
+    first = x.long().clamp(max=knots - 1)
+    values = cubic_spline((x - first)[:, None] - torch.arange(-1, DEGREE).to(s))
     D = torch.diff(torch.eye(K, dtype=s.dtype, device=s.device), n=ORDER, dim=0)
     # In units in which penalty and samples have equal weight overall.
-    data, penalty = B.mT @ B, D.mT @ D
+    data, penalty = torch.zeros(K, K).to(s), D.mT @ D
+    for k in range(DEGREE + 1):
+        for m in range(DEGREE + 1):
+            place, value = (first + k, first + m), values[:, k] * values[:, m]
+            data.index_put_(place, value, accumulate=True)
     penalty = penalty * (data.trace() / penalty.trace())
     # The small diagonal keeps splines without samples, which have a penalty only, invertible.
     L = torch.linalg.cholesky(data + penalty + 1e-13 * torch.eye(K).to(s))
-    W = torch.linalg.solve_triangular(L, B.mT, upper=False)
-    e, V = torch.linalg.eigh(W @ W.mT)
-    return _Spline(W.mT @ V, e.clamp(0, 1), torch.logspace(-10, 6, STRENGTHS).to(s))
+    half = torch.linalg.solve_triangular(L, data, upper=False)
+    e, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, half.mT, upper=False))
+    points = torch.linalg.solve_triangular(L.mT, V, upper=True)
+    return _Spline(
+        first, values, points, e.clamp(0, 1), torch.logspace(-10, 6, STRENGTHS).to(s)
+    )

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.dmp.dynamics import balanced_units
-from hrc_learn.dmp.ragged_times import chunks, motion
+from hrc_learn.dmp.ragged_times import LONG, blocks, motion
 from hrc_learn.dmp.response import Response
 from hrc_learn.dmp.samples import Samples
 
@@ -53,7 +53,7 @@ def fit_samples(
     rate = None
     if samples.velocity is not None:
         rate = samples.velocity.double() * samples.duration[:, None, None]
-    if samples.shared_grid:
+    if samples.shared_grid and samples.s.shape[1] <= LONG:
         return _fit(method, response, samples.s[0], position, rate, regularization)
     weights = position.new_empty(*position.shape[:2], response.basis.count)
     start_rate = position.new_empty(position.shape[:2])
@@ -109,20 +109,21 @@ def normal_products(
         positions. The columns are orthonormal on an even grid: if the samples determine all
         functions, squaring them loses no digits.
     """
-    s, M = samples.s, response.size
+    M = response.size
     n = M - known.shape[1]
-    mixing, _ = _orthonormal_columns(response, n, s.device)
-    products = []
-    for part in chunks(s):
+    mixing, _ = _orthonormal_columns(response, n, samples.s.device)
+    D = samples.position.shape[1]
+    products = known.new_zeros(len(known), n + D, n + D)
+    for part, span in blocks(samples.s):
+        s = samples.s[part, span]
         # One motion for each column, at the times of all demonstrations.
-        columns = motion(response, s[part].reshape(1, -1), mixing.mT[None], 0)
-        columns = columns.view(*s[part].shape, M)
-        left = samples.position[part].double().mT - columns[..., n:] @ known[part]
+        columns = motion(response, s.reshape(1, -1), mixing.mT[None], 0).view(*s.shape, M)
+        left = samples.position[part, :, span].double().mT - columns[..., n:] @ known[part]
         columns = torch.cat([columns[..., :n], left], dim=-1)
         if not samples.complete:
-            columns *= samples.mask[part][..., None]
-        products.append(columns.mT @ columns)
-    return torch.cat(products)
+            columns *= samples.mask[part, span][..., None]
+        products[part] += columns.mT @ columns
+    return products
 
 
 def solve_normal(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import broadcast_shapes, full_precision, readable
-from hrc_learn.dmp.ragged_times import motion, spring_rows
+from hrc_learn.dmp.ragged_times import LONG, motion, spring_rows
 from hrc_learn.dmp.response import Response, numpy_limit, product
 
 
@@ -135,7 +135,8 @@ class Trajectory(ArrayOutputs):
         shared = latest is not None or (
             s.ndim == 1 and not s.requires_grad and readable(s, s.detach())
         )
-        if order > 2 or not shared:
+        # On a long grid, the matrices for few motions would be larger than the motions.
+        if order > 2 or not shared or (s.shape[-1] > LONG and X.numel() < 3 * X.shape[-1] ** 2):
             return self._at_ragged_times(X, order)
         y = product(X, self._response.matrices(s, X.dtype)[order]).mT
         single = X.ndim == 2 and not self.duration.ndim  # comparing shapes takes longer

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from demo_motions import arm_motion
+from torch.utils._python_dispatch import TorchDispatchMode
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
@@ -14,7 +15,7 @@ from hrc_learn.dmp import (
     SpringDamper,
     response_of,
 )
-from hrc_learn.dmp.ragged_times import motion, power_by_power
+from hrc_learn.dmp.ragged_times import CHUNK, LONG, motion, power_by_power
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -200,3 +201,42 @@ def test_samples_that_do_not_count_change_no_fit():
         alone = JointDMP.fit(time[i, kept], position[i, kept], 12, velocity[i, kept])
         torch.testing.assert_close(together[i].weights, alone.weights, rtol=1e-6, atol=1e-5)
         torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
+
+
+def test_a_long_recording_is_fitted_piece_by_piece(monkeypatch):
+    """As in one piece, but for rounding."""
+    time, position = arm_motion(300, 3, 2.0)
+    options = {"n_basis": 12, "smooth": True}
+    position = position + 1e-3 * torch.randn(300, 3, generator=torch.Generator().manual_seed(0))
+    whole = JointDMP.fit(time, position, **options)
+    monkeypatch.setattr("hrc_learn.dmp.solvers.LONG", 200)
+    monkeypatch.setattr("hrc_learn.dmp.trajectory.LONG", 200)
+    monkeypatch.setitem(CHUNK, "cpu", 64)
+    pieces = JointDMP.fit(time, position, **options)
+    torch.testing.assert_close(pieces.weights, whole.weights, rtol=1e-6, atol=1e-5)
+    torch.testing.assert_close(pieces.rollout().position, whole.rollout().position)
+    torch.testing.assert_close(pieces.fit_report.rmse, whole.fit_report.rmse)
+
+
+class LargestTensor(TorchDispatchMode):
+    """Largest number of values in a result while the mode is active."""
+
+    size = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for x in result if isinstance(result, tuple | list) else (result,):
+            if isinstance(x, torch.Tensor):
+                self.size = max(self.size, x.untyped_storage().nbytes() // x.element_size())
+        return result
+
+
+def test_a_fit_takes_memory_in_proportion_to_its_samples():
+    """One matrix for all of them would have 69 numbers for each sample."""
+    time = torch.linspace(0, 60, 4 * LONG, dtype=torch.float64)
+    position = torch.sin(time[:, None] * torch.arange(1, 8))
+    JointDMP.fit(time[::100], position[::100], 20)
+    with LargestTensor() as largest:
+        JointDMP.fit(time, position, 20, smooth=True)
+    # Blocks of time have twenty functions and seven columns next to the samples.
+    assert largest.size < 40 * len(time)
