@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry import minimum_jerk
+from hrc_learn.geometry.numerics import polynomial
 
 CRITICAL = 1e-12
 """Bound on |1 - 4 beta / alpha| below which the damping counts as critical. Closer to zero,
@@ -126,20 +126,18 @@ def _cached_propagator(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
         )
 
 
-def minimum_jerk_curve(
-    s: Float[Tensor, "*batch"], fraction: float = 1.0
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Curve m(s) from 0 to 1 over the first `fraction` of a motion, and m' and m''."""
-    u = (s / fraction).clamp(0, 1)
-    m, slope = minimum_jerk(u)
-    curvature = 60 * u * (1 - u) * (1 - 2 * u)
-    return m, slope / fraction, curvature / fraction**2
+def approach_curve(s: Float[Tensor, "*batch"], fraction: float, order: int) -> Tensor:
+    """Derivative of m(s) - 1, m the curve from 0 to 1 over the first `fraction` of a motion."""
+    coefficients = (-1.0, 0.0, 0.0, 10.0, -15.0, 6.0)
+    for _ in range(order):
+        coefficients = tuple(k * c for k, c in enumerate(coefficients))[1:]
+    value = polynomial((s / fraction).clamp(0, 1), (*coefficients, 0.0, 0.0))
+    return torch.where((s < fraction) | (order == 0), value / fraction**order, 0.0)
 
 
 def approach_state(s: Float[Tensor, "*batch"], fraction: float) -> Float[Tensor, "*batch 2"]:
     """State (m - 1, m') of the approach, relative to the goal, per unit of goal - start."""
-    m, slope, _ = minimum_jerk_curve(s, fraction)
-    return torch.stack([m - 1, slope], dim=-1)
+    return torch.stack([approach_curve(s, fraction, order) for order in (0, 1)], dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)

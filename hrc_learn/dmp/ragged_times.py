@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import refuse_nested_forward
+from hrc_learn.dmp.dynamics import approach_curve
 from hrc_learn.dmp.response import (
     Response,
     chebyshev_points,
@@ -108,7 +109,7 @@ class CoefficientTable:
         """Functions of time that multiply the columns of `others`."""
         if self.response.forced.periodic:
             return spring_rows(self.response, s, self.order).to(dtype)
-        return _approach(s, self.response.approach, self.order).to(dtype)[..., None]
+        return approach_curve(s, self.response.approach, self.order).to(dtype)[..., None]
 
 
 def spring_rows(response: Response, s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:
@@ -119,19 +120,6 @@ def spring_rows(response: Response, s: Tensor, order: int) -> Float[Tensor, "*ba
     for _ in range(order):
         first, second = -spring.stiffness * second, first - spring.alpha * second
     return torch.stack([first, second], dim=-1)
-
-
-def _approach(s: Tensor, fraction: float, order: int) -> Tensor:
-    """Derivative of m(s) - 1 by s, with the minimum-jerk curve m of an approach."""
-    # Plain numbers, because a compiler cannot trace NumPy's polynomials.
-    coefficients = [-1.0, 0.0, 0.0, 10.0, -15.0, 6.0]
-    for _ in range(order):
-        coefficients = [k * c for k, c in enumerate(coefficients)][1:]
-    u = (s / fraction).clamp(0, 1)
-    value = torch.zeros_like(u)
-    for c in reversed(coefficients):
-        value = value * u + c
-    return torch.where((s < fraction) | (order == 0), value / fraction**order, 0.0)
 
 
 def _table(response: Response, order: int, like: Tensor) -> CoefficientTable:

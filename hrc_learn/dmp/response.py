@@ -23,9 +23,9 @@ from hrc_learn.dmp._arguments import fits_numpy, refuse_nested_forward, transfor
 from hrc_learn.dmp.dynamics import (
     Basis,
     SpringDamper,
+    approach_curve,
     approach_state,
     basis_config,
-    minimum_jerk_curve,
     restored_basis,
 )
 
@@ -271,8 +271,8 @@ class Response:
 
     def approach_force(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Forcing per unit of goal - start that makes the motion between them m(s)."""
-        m, slope, curvature = minimum_jerk_curve(s, self.approach)
-        return curvature - self.spring.acceleration(m - 1, slope)
+        offset, slope, curvature = (approach_curve(s, self.approach, k) for k in range(3))
+        return curvature - self.spring.acceleration(offset, slope)
 
     def _acceleration(self, s: Tensor, state: Tensor) -> Tensor:
         goal = torch.zeros(self.size, dtype=s.dtype, device=s.device)

@@ -10,7 +10,7 @@ deviation of the noise, whether it comes from encoders, a tracker or a trembling
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -379,31 +379,28 @@ def densified(samples: Samples, n_basis: int) -> Samples:
     few = samples.mask.sum(-1) <= SAMPLES_EACH * n_basis
     if not few.any():
         return samples
-    T, G = samples.mask.shape[-1], DENSE * n_basis + 1
-    grid = torch.linspace(0, 1, G, dtype=torch.float64, device=samples.s.device)
-    more = 0 if few.all() else max(T - G, 0)
-    s = torch.cat([grid, grid[-1:].expand(more)]).repeat(len(few), 1)
-    mask = (torch.arange(G + more, device=s.device) < G).repeat(len(few), 1)
-    position = samples.position.new_zeros(*samples.position.shape[:2], G + more).double()
-    velocity, recorded = torch.zeros_like(position), samples.velocity
-    for to, given in ((s, samples.s), (mask, samples.mask), (position, samples.position)):
-        # Other demonstrations keep their samples, padded at the end.
-        to[~few] = 1 if to is s else 0
-        to[~few, ..., :T] = given[~few].to(to)
-    if recorded is not None:
-        velocity[~few, ..., :T] = recorded[~few].double()
-    for i in few.nonzero()[:, 0].tolist():
+    grid = torch.linspace(0, 1, DENSE * n_basis + 1, dtype=torch.float64).to(samples.s)
+    recorded, rows = samples.velocity, []
+    for i, sparse in enumerate(few.tolist()):
         valid, tau = samples.mask[i], samples.duration[i]
-        knots, y = samples.s[i, valid], samples.position[i][:, valid].double()
-        if recorded is None:
-            (rate,) = torch.gradient(y, spacing=(knots,), dim=-1, edge_order=2)
-        else:
-            rate = recorded[i][:, valid].double() * tau
-        position[i, :, :G], slope = _cubic(knots, y, rate, grid)
-        velocity[i, :, :G] = slope / tau
-    velocity = None if recorded is None else velocity
-    whole = {"mask": mask, "complete": bool(mask.all())}
-    return replace(samples, s=s, position=position, velocity=velocity, **whole)
+        s, y = samples.s[i, valid], samples.position[i][:, valid].double()
+        rate = torch.zeros_like(y) if recorded is None else recorded[i][:, valid].double() * tau
+        if sparse:
+            if recorded is None:
+                (rate,) = torch.gradient(y, spacing=(s,), dim=-1, edge_order=2)
+            s, (y, rate) = grid, _cubic(s, y, rate, grid)
+        rows.append((s, y.mT, rate.mT / tau, torch.ones_like(s)))
+    pad = partial(torch.nn.utils.rnn.pad_sequence, batch_first=True)
+    s, position, velocity, mask = map(pad, zip(*rows, strict=True))
+    return replace(
+        samples,
+        # Padding repeats the last time, so that times do not decrease.
+        s=s.cummax(-1).values,
+        position=position.mT,
+        velocity=None if recorded is None else velocity.mT,
+        mask=mask.bool(),
+        complete=bool(mask.all()),
+    )
 
 
 def _cubic(

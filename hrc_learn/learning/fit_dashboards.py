@@ -8,6 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
@@ -89,8 +90,8 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     if channel is None:
         raise ValueError("orientations alone cannot be shown: learn the pose or positions.")
     motions, lengths = fitted.motions, fitted.motions.demos.length.tolist()
-    demos, made = motions.position(channel), motions.own(fitted.each[channel]).position
-    assert made is not None
+    demos = motions.position(channel)
+    made = cast(Any, fitted.each[channel].rollout()).position.detach()
 
     def cut(padded: Tensor) -> tuple[np.ndarray, ...]:
         return tuple(

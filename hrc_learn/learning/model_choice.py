@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from hrc_learn.demos import DemonstrationSet
 from hrc_learn.dmp import JointDMP, LearnedMotion
 from hrc_learn.dmp.learned_motion import FEWEST, Kind, choose
 from hrc_learn.learning.primitive_fitting import FittedPrimitives, Motions, load_primitive
-from hrc_learn.learning.reproduction_error import Reproduction
 from hrc_learn.store import read_json, write_json
 
 CHOICE = "prediction.json"
@@ -128,9 +127,7 @@ def _choice(folder: Path) -> _Choice:
     return read_json(path, _Choice, "fit again")
 
 
-def predict(
-    folder: Path, channel: str, motions: Motions, demos: DemonstrationSet
-) -> Reproduction:
+def predict(folder: Path, channel: str, motions: Motions, demos: DemonstrationSet) -> Any:
     """Motions that the best model predicts from start, goal and duration.
 
     Args:

@@ -29,11 +29,7 @@ from hrc_learn.dmp import (
 )
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import arm_angle, fr3, panda
-from hrc_learn.learning.reproduction_error import (
-    Reproduction,
-    ReproductionError,
-    reproduction_error,
-)
+from hrc_learn.learning.reproduction_error import ReproductionError, reproduction_error
 
 type Primitive = JointDMP | OrientationDMP | PoseDMP
 
@@ -164,7 +160,7 @@ class Motions:
             )
 
     @torch.no_grad()
-    def adapted(self, channel: str, primitive: Primitive) -> "Reproduction":
+    def adapted(self, channel: str, primitive: Primitive) -> Any:
         """Motion of a common primitive with start, goal and duration of each demonstration."""
         last = (self.demos.length - 1)[:, None]
         columns = [self.column(name) for name in CHANNELS[channel]]
@@ -173,14 +169,9 @@ class Motions:
         start, goal = (Pose(*x) if channel == "pose" else x[0] for x in (starts, goals))
         time = self.demos.time
         lasting = time.take_along_dim(last, dim=1)[:, 0]
-        return Reproduction.of(cast(Any, primitive).rollout(time, start, goal, lasting))
+        return cast(Any, primitive).rollout(time, start, goal, lasting)
 
-    @torch.no_grad()
-    def own(self, primitive: Primitive) -> "Reproduction":
-        """Motion of each demonstration's own primitive."""
-        return Reproduction.of(primitive.rollout())
-
-    def error(self, channel: str, made: Reproduction) -> ReproductionError:
+    def error(self, channel: str, made: Any) -> ReproductionError:
         """Errors of reproductions of a channel at the time stamps of the demonstrations."""
         return reproduction_error(self.demos, CHANNELS[channel][0], made)
 
@@ -261,7 +252,7 @@ class FittedPrimitives:
         count = float(len(self.motions.demos.length))
         values = {"demonstrations": count, "basis_functions": float(self.n_basis)}
         for channel, primitives in self.each.items():
-            own = self.motions.own(primitives)
+            own = primitives.rollout()
             mean = self.motions.adapted(channel, self.common[channel])
             for name, made in ((channel, own), (f"mean_{channel}", mean)):
                 values |= self.motions.error(channel, made).summary(name)

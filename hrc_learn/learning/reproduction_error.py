@@ -13,21 +13,6 @@ from hrc_learn.demos.quality.ranking import log_dimensionless_jerk
 from hrc_learn.geometry import quaternion
 
 
-@dataclass(frozen=True, eq=False)
-class Reproduction:
-    """Motions at the time stamps of demonstrations."""
-
-    position: Float[Tensor, "demos frames D"] | None = None
-    """Joint positions [rad] or position [m]; None for orientations."""
-    orientation: Float[Tensor, "demos frames 4"] | None = None
-    """Unit quaternions; None for joints and positions."""
-
-    @classmethod
-    def of(cls, motion: Any) -> "Reproduction":
-        """Position and orientation of a trajectory, as far as it has them."""
-        return cls(getattr(motion, "position", None), getattr(motion, "orientation", None))
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReproductionError:
     """Errors of each demonstration; None if a measure does not apply to the channel."""
@@ -58,21 +43,22 @@ class ReproductionError:
         return figures
 
 
+@torch.no_grad()
 def reproduction_error(
-    demos: PaddedDemonstrations, column: str, made: Reproduction
+    demos: PaddedDemonstrations, column: str, made: Any
 ) -> ReproductionError:
     """Errors of reproductions.
 
     Args:
         demos: Demonstrations.
         column: Column of the reproduced joint positions or positions.
-        made: Reproductions at their time stamps.
+        made: Trajectories at their time stamps, with a `position`, an `orientation` or both.
     """
     measures: dict[str, Tensor] = {}
     mask, last = demos.mask, (demos.length - 1)[:, None]
-    if made.position is not None:
+    if hasattr(made, "position"):
         measures |= _linear(demos, getattr(demos, column), made.position)
-    if made.orientation is not None:
+    if hasattr(made, "orientation"):
         assert demos.orientation is not None
         angle = quaternion.angle(made.orientation, demos.orientation).rad2deg()
         square = torch.where(mask, angle, 0.0).square().sum(dim=-1)

@@ -1,6 +1,7 @@
 """Fits and evaluations on small data with known answers."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,6 @@ from hrc_learn.learning.primitive_fitting import (
     load_primitive,
     sampled,
 )
-from hrc_learn.learning.reproduction_error import Reproduction
 
 
 def demonstration(episode, frames=120):
@@ -154,7 +154,7 @@ def test_errors_of_a_known_offset(demos):
     made = torch.where(mask, shown + offset, 1e6)
     tilt = quaternion.exp(torch.tensor([math.radians(2.0), 0.0, 0.0], dtype=torch.float64))
     turned = quaternion.multiply(tilt, turn)
-    error = motions.error("pose", Reproduction(made, turned))
+    error = motions.error("pose", SimpleNamespace(position=made, orientation=turned))
     columns = error.columns()
     span = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)
     expected = 0.03 / 3**0.5 / span
