@@ -113,7 +113,9 @@ class StepModule(nn.Module):
         options = {name: inputs[name] for name in ("phase_stopping", "coupling")}
         if self.dmp.error_columns is not None:
             goal = goals.pop("goal")
-            before = _where_new(self.dmp.retarget(before, goal), before)
+            filtered = self.goal_filter is not None
+            new = self.dmp.retarget(before, goal, filtered=filtered)
+            before = _where_new(new, before)
         after = self.dmp.step(before, dt, goal_filter=self.goal_filter, **goals, **options)
         # Copies, because a program must not return its inputs.
         return {name: x.clone() for name, x in _named(after).items()}

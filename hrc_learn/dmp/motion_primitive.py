@@ -104,7 +104,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         return columns
 
     def _retarget(
-        self, columns: DMPState, frame: Any, goal: Any, **options: Any
+        self, columns: DMPState, frame: Any, goal: Any, filtered: bool, **options: Any
     ) -> tuple[DMPState, Any, Any]:
         """Columns, frame and goal in columns for a new goal, with the same value and velocity.
 
@@ -112,6 +112,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             columns: Current state.
             frame: Current frame.
             goal: New goal; None if only `options` are new.
+            filtered: True to keep the acceleration, for a filtered goal.
             options: Goals of this kind.
         """
         return columns, frame, goal
@@ -263,7 +264,9 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             forcing_gain: Factor on the forcing term, (*batch).
             goal_body: New goal of the body, (*batch, K); poses only.
         """
-        columns, frame = self._columns(self.retarget(state, goal, goal_body=goal_body))
+        filtered = goal_filter is not None
+        state = self.retarget(state, goal, goal_body=goal_body, filtered=filtered)
+        columns, frame = self._columns(state)
         columns = self.motion.step_columns(
             columns,
             dt,
@@ -277,7 +280,12 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         return self.state_of(columns, frame)
 
     def retarget(
-        self, state: State, goal: Value | None = None, *, goal_body: Vectors | None = None
+        self,
+        state: State,
+        goal: Value | None = None,
+        *,
+        goal_body: Vectors | None = None,
+        filtered: bool = True,
     ) -> State:
         """State with a new goal, and the same value, velocity and acceleration.
 
@@ -287,12 +295,13 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             state: Current state.
             goal: (*batch).
             goal_body: Goal of the body, (*batch, K); poses only.
+            filtered: False if the next step has no `goal_filter`: faster for orientations.
         """
         if goal is None and goal_body is None:
             return state
         columns, frame = self._columns(state)
         given = self._given(goal_body=goal_body)
-        columns, frame, target = self._retarget(columns, frame, goal, **given)
+        columns, frame, target = self._retarget(columns, frame, goal, filtered, **given)
         target = checked_vector("goal", target, columns.target).expand_as(columns.target)
         return self.state_of(replace(columns, target=target), frame)
 

@@ -260,6 +260,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         columns: DMPState,
         frame: Tensor,
         goal: Value | None,
+        filtered: bool,
         goal_body: Vectors | None = None,
     ) -> tuple[DMPState, Tensor, Tensor]:
         target, (P, B) = columns.target, self._others
@@ -268,7 +269,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             rotation = unit_quaternion(rotation, frame)
             new = reference_of(self.motion.goal[..., self.error_columns], rotation)
             new = new.expand_as(frame)
-            columns = self._to_reference(columns, frame, new)
+            columns = self._to_reference(columns, frame, new, filtered)
             if position is not None:
                 target = _with_columns(target, P, position)
             frame = new
@@ -276,20 +277,30 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             target = _with_columns(target, B, goal_body)
         return columns, frame, target
 
-    def _to_reference(self, columns: DMPState, old: Tensor, new: Tensor) -> DMPState:
+    def _to_reference(
+        self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool
+    ) -> DMPState:
         """Columns with the error to another reference, for the same motion of the orientation.
 
         With a goal filter, the acceleration is continuous.
         """
         motion, E = self.motion, self.error_columns
-        values = columns.position, columns.rate, motion.second_derivative(columns)
-        error, error_rate, curve = (x[..., E] for x in values)
-        turned = orientation_error.retarget(error, error_rate, curve, old, new)
-        position, rate, second = (
-            _with_columns(x, E, part) for x, part in zip(values, turned, strict=True)
+        position, rate = columns.position, columns.rate
+        error = position[..., E], rate[..., E]
+        turned = orientation_error.retarget(*error, old, new)
+        position, rate = (
+            _with_columns(x, E, part) for x, part in zip((position, rate), turned, strict=True)
         )
-        columns = replace(columns, position=position, rate=rate)
-        return replace(columns, goal=motion.equilibrium_goal(columns, second))
+        moved = replace(columns, position=position, rate=rate)
+        if not filtered:
+            return moved
+        second = motion.second_derivative(columns)
+        slope = orientation_error.angular_acceleration(*error, second[..., E])
+        # It is linear in the second derivative, plus a bias from the turning.
+        bias = orientation_error.angular_acceleration(*turned, torch.zeros_like(slope))
+        curve = orientation_error.error_rate(turned[0], slope - bias)
+        goal = motion.equilibrium_goal(moved, _with_columns(second, E, curve))
+        return replace(moved, goal=goal)
 
     def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
         """Second derivatives of the columns for a linear acceleration, an angular one, or both.
@@ -390,10 +401,12 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
     def _parts(self, name: str, value: Any) -> tuple[None, Any]:
         return None, value
 
-    def _to_reference(self, columns: DMPState, old: Tensor, new: Tensor) -> DMPState:
+    def _to_reference(
+        self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool
+    ) -> DMPState:
         if isinstance(self.motion, UdePrimitive):
             return ude_formulation.to_reference(columns, old, new)
-        return super()._to_reference(columns, old, new)
+        return super()._to_reference(columns, old, new, filtered)
 
     def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
         if isinstance(self.motion, UdePrimitive):

@@ -101,19 +101,12 @@ def nearest_turn(
 def retarget(
     error: Float[Tensor, "*batch 3"],
     rate: Float[Tensor, "*batch 3"],
-    second: Float[Tensor, "*batch 3"],
-    old_goal: Float[Tensor, "*batch 4"],
+    old: Float[Tensor, "*batch 4"],
     goal: Float[Tensor, "*#batch 4"],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Error to a new goal and its two derivatives, for the same motion of the orientation."""
-    q = to_orientation(error, old_goal)
-    new = nearest_turn(to_error(q, goal), error)
-    omega = angular_velocity(error, rate)
-    omega_rate = angular_acceleration(error, rate, second)
-    new_rate = error_rate(new, omega)
-    # The angular acceleration is linear in the second derivative, plus a bias from the turning.
-    bias = angular_acceleration(new, new_rate, torch.zeros_like(new))
-    return new, new_rate, error_rate(new, omega_rate - bias)
+) -> tuple[Tensor, Tensor]:
+    """Error to a new goal and its rate, for the same motion of the orientation."""
+    new = nearest_turn(to_error(to_orientation(error, old), goal), error)
+    return new, error_rate(new, angular_velocity(error, rate))
 
 
 def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4"]:

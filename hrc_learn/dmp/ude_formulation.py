@@ -130,17 +130,10 @@ class UdePrimitive(JointDMP):
 
 def to_reference(state: DMPState, old: Tensor, new: Tensor) -> DMPState:
     """State of the error to another reference, for the same motion of the orientation."""
-    q = orientation_error.to_orientation(state.position, old)
-    error = orientation_error.to_error(q, new)
-    error = orientation_error.nearest_turn(error, state.position)
-    v = drift_free_rate(state.position, state.rate)
+    error, rate = orientation_error.retarget(state.position, state.rate, old, new)
     # The spring force alpha beta (e - goal) is unchanged if both move alike.
-    return replace(
-        state,
-        position=error,
-        rate=v + axis_drift(error, v),
-        goal=state.goal + error - state.position,
-    )
+    goal = state.goal + error - state.position
+    return replace(state, position=error, rate=rate, goal=goal)
 
 
 class UdeMotion(Trajectory):
