@@ -85,6 +85,7 @@ def seen(view, position, orientation, rng):
 
 
 @pytest.fixture(scope="module")
+@torch.inference_mode(False)  # the first test is a simulation, a later one exports it
 def network():
     rng, demos = np.random.default_rng(0), []
     for _ in range(3):
