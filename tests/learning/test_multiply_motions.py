@@ -167,13 +167,25 @@ def test_gradients_flow_to_the_scene(source):
     [
         (("lid", "block"), (0, 40, 63), "no frame 'lid'"),
         (("block", "block"), (0, 63), "needs 3 cuts"),
-        (("block", "block"), (0, 61, 63), "6 frames or more apart"),
+        (("block", "block"), (0, 58, 63), "6 frames or more apart"),
+        (("block", "block"), (0, 40, END), f"cuts below {END}"),
     ],
 )
 def test_wrong_segments_are_refused(demos, objects, frames, cuts, message):
     wrong = Segmentation(frames=frames, cuts={demo.episode: cuts for demo in demos})
     with pytest.raises(ValueError, match=message):
         wrong.check(demos, objects)
+
+
+def test_segments_of_six_frames_up_to_the_last_frame_are_taken(demos, objects):
+    cuts = {demo.episode: (0, END - 7, END - 1) for demo in demos}
+    Segmentation(frames=("block", "block"), cuts=cuts).check(demos, objects)
+
+
+def test_a_gripper_that_closes_slowly_switches_where_it_begins_to(demos, objects, tool):
+    slow = np.interp(np.arange(END), [36, 46], [0.08, 0.04])
+    found = find_segments([replace(demo, gripper=slow) for demo in demos], objects, tool)
+    assert {cuts[1] for cuts in found.cuts.values()} == {36}
 
 
 def test_demonstrations_with_other_switches_are_refused(demos, tool, objects):
