@@ -62,3 +62,32 @@ def test_an_unknown_robot_and_another_number_of_joints_are_named(tmp_path):
         arm_of_dataset(source)
     with pytest.raises(DatasetError, match=r"joints \(a, b, c\) are not those of panda"):
         arm_of_dataset(source, "panda")
+
+
+def test_ticks_count_from_the_middle_of_a_turn(tmp_path):
+    """4096 ticks are a turn, so 2048 are no angle."""
+    names = [f"{name}.pos" for name in panda.joint_names]
+    values = 2048 + 4096 / (2 * np.pi) * joint_path(60, 7)
+    source = open_demos(
+        dataset(tmp_path / "set", names, "panda", values), units={"joint_position": "tick"}
+    )
+    found = arm_of_dataset(source).positions(source[0].joint_position)
+    np.testing.assert_allclose(found, joint_path(60, 7), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("robot", "widest", "opened"),
+    # The hand of a Franka opens by 80 mm; of an arm without a hand the data tell.
+    [("panda", 0.04, 0.5), ("panda", 0.08, 1.0), ("panda", 0.1, 1.0), ("iiwa7", 0.05, 1.0)],
+)
+def test_a_gripper_in_metres_opens_by_its_width(tmp_path, robot, widest, opened):
+    names = [*(f"joint_{k}.pos" for k in range(7)), "gripper.pos"]
+    values = np.hstack([joint_path(60, 7), np.linspace(0, widest, 60)[:, None]])
+    if arm_of_robot(robot) is None:
+        pytest.skip("example-robot-data is not installed")
+    root = dataset(tmp_path / "set", names, robot, values)
+    source = open_demos(root, units={"joint_position": "rad", "gripper": "m"})
+    found = arm_of_dataset(source)
+    opening = found.opening(source[0])
+    np.testing.assert_allclose(opening[[0, -1]], [0, opened], atol=1e-6)
+    assert (np.diff(opening) >= 0).all()
