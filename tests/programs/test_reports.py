@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import sys
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -11,15 +10,13 @@ import numpy as np
 import pytest
 from commands import done
 from PIL import Image
+from sample_runs import sample_run
 
-from hrc_learn.viz.film import film_mp4
 from hrc_learn.viz.report import (
-    Film,
     Measurement,
     Picture,
     Report,
     Section,
-    read_report,
     write_report,
 )
 
@@ -125,23 +122,38 @@ def test_lines_keep_their_colours_beside_a_photograph(experiments):
         assert np.abs(shown[row] - colour).max() < 10
 
 
-def test_a_film_becomes_a_picture_that_moves(runs, tmp_path, experiments):
+def test_the_film_shows_a_hand_at_the_elbow_while_it_is_pulled():
+    film = load(ROOT / "tools" / "docs" / "readme_film.py")
+    time = np.linspace(0.0, 30.0, 301)
+    push = np.full((301, 2, 3), np.nan)
+    push[100:140, 0] = push[200:220, 0] = elbow = np.array([0.15, 0.15, 0.56])
+    push[100:140, 1] = push[200:220, 1] = [0.5, 0.0, 0.56]
+    expert = film.expert_in(sample_run(time=time, push=push))
+
+    def reach(at):
+        lines, pulls = expert(at)
+        return min((np.linalg.norm(line.end - elbow) for line in lines), default=9.0), pulls
+
+    for at in (10.0, 12.0, 13.9, 20.5):
+        near, pulls = reach(at)
+        assert pulls
+        assert near < 0.08  # the hand closes round the axis of the elbow
+    waiting, pulls = reach(17.0)
+    assert not pulls
+    assert waiting > 0.3
+    assert expert(5.0) == ([], False)  # not yet there
+    assert expert(29.0) == ([], False)  # gone
+
+
+def test_the_film_is_a_picture_that_moves():
+    film = load(ROOT / "tools" / "docs" / "readme_film.py")
     levels = [20, 90, 160, 230]
-    pictures = [np.full((90, 960, 3), level, np.uint8) for level in levels for _ in range(3)]
-    film = Film(film_mp4(pictures, 15.0), "")
-    write_report(tmp_path / "run", replace(read_report(runs[0]), film=film))
-    page = tmp_path / "page.md"
-    page.write_text("kept")
-    experiments.main(
-        experiments.Args(film=tmp_path / "run", page=page, images=tmp_path / "images")
-    )
-    shown = Image.open(tmp_path / "images" / "film.webp")
+    pictures = (np.full((60, 640, 3), level, np.uint8) for level in levels)
+    shown = Image.open(BytesIO(film.moving_picture(pictures)))
     assert (shown.size, shown.n_frames) == ((640, 60), 4)
     for number, level in enumerate(levels):
         shown.seek(number)
         assert np.asarray(shown.convert("RGB")).mean() == pytest.approx(level, abs=8)
-    with pytest.raises(ValueError, match="has no film"):
-        experiments.main(experiments.Args(film=runs[0], page=page))
 
 
 @pytest.mark.parametrize(

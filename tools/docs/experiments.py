@@ -6,10 +6,7 @@ in the report of that kind of run, and the lines between `<!-- KIND measured -->
 
 python tools/docs/experiments.py --placing outputs/placing --grasping outputs/grasping
 
-The film of a run becomes images/film.webp, which README and page show.
-
-hrc run collaboration --pulls random --worker --out outputs/beside
-python tools/docs/experiments.py --film outputs/beside
+`readme_film.py` makes images/film.webp, which README and site show.
 """
 
 import re
@@ -17,7 +14,6 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
-import av
 from PIL import Image
 
 from hrc_learn import cli
@@ -29,8 +25,6 @@ WIDTH = 1000
 """Of the pictures, at most [px]."""
 COLOURS = 256
 """Of a picture: what flat areas and lines need, in a sixth of the bytes."""
-FILM_WIDTH, FILM_STEP = 640, 3
-"""Of the film's pictures [px], and which of them are shown: a page loads it in a second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +37,6 @@ class Args:
     """Folder of `hrc run grasping`, likewise."""
     collaboration: Path | None = None
     """Folder of `hrc run collaboration`, likewise."""
-    film: Path | None = None
-    """Folder of a run with a film, likewise."""
     page: Path = PAGE
     """The page."""
     images: Path = DOCS / "images"
@@ -58,15 +50,10 @@ def main(args: Args) -> None:
         "collaboration": args.collaboration,
     }
     reports = {kind: read_report(run) for kind, run in runs.items() if run is not None}
-    if not reports and args.film is None:
-        raise ValueError("no run: give --placing, --grasping, --collaboration or --film")
+    if not reports:
+        raise ValueError("no run: give --placing, --grasping or --collaboration")
     text = args.page.read_text()
     pictures: dict[str, bytes] = {}
-    if args.film is not None:
-        film = read_report(args.film).film
-        if film is None:
-            raise ValueError(f"{args.film} has no film: run it without film=false.")
-        pictures["film.webp"] = animation(film.mp4)
     for kind, report in reports.items():
         pictures |= shown_pictures(kind, report, text)
         text = with_table(kind, report, text)
@@ -89,28 +76,6 @@ def shown_pictures(kind: str, report: Report, page: str) -> dict[str, bytes]:
             f"{', '.join(there)}"
         )
     return {f"{kind}_{name}.png": small(there[name].png) for name in wanted}
-
-
-def animation(mp4: bytes) -> bytes:
-    """A film as a picture that moves, which Markdown shows anywhere."""
-    with av.open(BytesIO(mp4)) as file:
-        rate = file.streams.video[0].average_rate
-        assert rate is not None
-        pictures = [frame.to_image() for frame in file.decode(video=0)][::FILM_STEP]
-    for picture in pictures:
-        picture.thumbnail((FILM_WIDTH, FILM_WIDTH))
-    buffer = BytesIO()
-    pictures[0].save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=round(1000 * FILM_STEP / rate),
-        loop=0,
-        quality=55,
-        method=6,
-    )
-    return buffer.getvalue()
 
 
 def small(png: bytes) -> bytes:
