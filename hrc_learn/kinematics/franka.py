@@ -201,7 +201,7 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
         chain=chain,
         shape=ArmShape(masses=(None, *links, 0.0, hand), inertia=_inertias()),
         capsules=LINK_CAPSULES + hand_capsules(TOOL_LINK),
-        overlapping=_LINKS["overlapping"],
+        overlapping=[(a, b) for a, b in _LINKS["overlapping"]],
         closed_form=partial(franka_branches, ranges=ranges),
     )
 

@@ -239,7 +239,7 @@ def _fitted_body(name: str, description: Path) -> FittedBody | None:
     digest = hashlib.sha256(description.read_bytes()).hexdigest()
     if entry is None or entry["description_sha256"] != digest:
         return None
-    return link_capsules(entry["capsules"]), entry["overlapping"]
+    return link_capsules(entry["capsules"]), [(a, b) for a, b in entry["overlapping"]]
 
 
 @dataclass(frozen=True)
