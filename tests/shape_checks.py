@@ -60,10 +60,11 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def first_calls_checked() -> Iterator[None]:
-    """Count checks anew, and leave checks as they were."""
+    """Check anew, although earlier calls, such as those at import, have used up theirs."""
     global _calls
     before = jaxtyping.config.jaxtyping_disable
     _calls = 0
+    jaxtyping.config.update("jaxtyping_disable", False)
     try:
         yield
     finally:
