@@ -50,6 +50,15 @@ def pytest_runtest_protocol(item):
         return (yield)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef, request):
+    """What several tests share is made outside inference mode, whichever test comes first."""
+    if fixturedef.scope == "function" or not torch.is_inference_mode_enabled():
+        return (yield)
+    with torch.inference_mode(False), torch.no_grad():
+        return (yield)
+
+
 NEEDED = {
     "browser": "a headless Chromium (Debian: apt install chromium)",
     "egl": "EGL for rendered images (Debian: apt install libegl1)",

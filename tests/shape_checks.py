@@ -16,6 +16,8 @@ import jaxtyping
 from jaxtyping import _decorator
 
 _MOST = 100
+# A whole number may stand where a float is annotated, as for static type checkers (PEP 484).
+_checking = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))
 _calls = 0
 _prepared = _decorator.jaxtyped
 
@@ -45,7 +47,7 @@ jaxtyping.jaxtyped = _decorator.jaxtyped = _prepared_when_checked
 
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     """Function that checks its arguments and result, and counts the checks."""
-    check = beartype.beartype(function)
+    check = _checking(function)
 
     @functools.wraps(function)
     def counted(*args: Any, **kwargs: Any) -> Any:

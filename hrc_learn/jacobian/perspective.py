@@ -136,7 +136,7 @@ def camera_jacobian(
 
 
 def stepped(
-    camera: Float[Tensor, "*batch 13"], step: Float[Tensor, "*batch 13"]
+    camera: Float[Tensor, "*#batch 13"], step: Float[Tensor, "*#batch 13"]
 ) -> Float[Tensor, "*batch 13"]:
     """Camera after a step: its rotation turns about the camera's axes, all else adds."""
     turn = quaternion.multiply(
