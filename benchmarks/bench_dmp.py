@@ -11,10 +11,13 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from dmp_accuracy import (
@@ -31,9 +34,9 @@ from threadpoolctl import threadpool_info
 from timing import Timing, time_calls
 
 from hrc_learn import cli
-from hrc_learn.dmp import JointDMP, PoseDMP, Stepper, export_dmp
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, Stepper, export_dmp
 from hrc_learn.dmp.exported_dmp import resting_inputs, state_tensors
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Pose, quaternion
 
 JOINTS, SAMPLES, BASIS = 7, 1000, 50
 TARGETS: dict[str, tuple[float, int]] = {
@@ -49,12 +52,16 @@ TARGETS: dict[str, tuple[float, int]] = {
     "fit_1_ms": (0.5, -1),
     "fit_256_ms": (30, -1),
     "step_us": (30, -1),
+    "step_joint_new_goal_of_without": (1.5, -1),
+    "step_orientation_new_goal_of_without": (1.5, -1),
+    "step_pose_new_goal_of_without": (1.5, -1),
+    "fit_of_1000000_of_samples": (12, -1),
     "stepper_us": (8, -1),
     "backward_over_forward": (3, -1),
     "own_durations_4096_per_s": (20_000, +1),
     "own_durations_4096_of_shared": (0.5, +1),
     "duration_gradient_over_forward": (3, -1),
-    "fit_own_stamps_256_ms": (200, -1),
+    "fit_own_stamps_256_ms": (100, -1),
     "joint_gradient_error": (1e-6, -1),
     "orientation_gradient_error": (1e-6, -1),
     "orientation_deg": (1e-3, -1),
@@ -90,6 +97,7 @@ def main(args: Args) -> None:
     for batch in (1, 256):
         figures |= measure_fits(batch, args.repeats)
     figures |= measure_poses(args.repeats) | measure_steps(args.repeats)
+    figures |= measure_new_goals(args.repeats) | measure_memory()
     figures |= measure_gradients(args.repeats) | measure_own_times(args.repeats)
     figures |= measure_turns() | measure_gradient_error()
     if args.recordings:
@@ -198,6 +206,58 @@ def measure_steps(repeats: int) -> dict[str, float]:
             f"{name}_p99_us": 1e6 * t.p99,
             f"{name}_operations": count_operations(call),
         }
+    return figures
+
+
+@torch.no_grad()
+def measure_new_goals(repeats: int) -> dict[str, float]:
+    """Steps that get a new goal, and the same without one, by kind of primitive."""
+    time, columns = (x.double() for x in demonstrations(1))
+    turned, angle = quaternion.exp(columns[:, 3:6]), torch.tensor([0.1, 0.0, 0.0]).double()
+    joint = JointDMP.fit(time, columns, BASIS)
+    orientation = OrientationDMP.fit(time, turned, BASIS)
+    pose = PoseDMP.fit(time, columns[:, :3], turned, BASIS)
+    rotation = quaternion.multiply(quaternion.exp(angle), orientation.goal)
+    figures: dict[str, float] = {}
+    kinds: dict[str, tuple[Any, Any]] = {
+        "joint": (joint, joint.goal + 0.1),
+        "orientation": (orientation, rotation),
+        "pose": (pose, Pose(pose.goal.position + 0.1, rotation)),
+    }
+    for name, (dmp, goal) in kinds.items():
+        state = dmp.step(dmp.initial_state(), 0.5)
+        calls: dict[str, Callable[[], object]] = {
+            "without": lambda dmp=dmp, state=state: dmp.step(state, 1e-3),
+            "with": lambda dmp=dmp, state=state, goal=goal: dmp.step(state, 1e-3, goal=goal),
+        }
+        t = time_calls(calls, 10 * repeats)
+        figures[f"step_{name}_new_goal_us"] = 1e6 * t["with"].median
+        figures[f"step_{name}_new_goal_of_without"] = t["with"].median / t["without"].median
+    return figures
+
+
+LONG_FIT = """
+import resource, sys
+import torch
+from hrc_learn.dmp import JointDMP
+time = torch.linspace(0, 60, int(sys.argv[1]), dtype=torch.float64)
+position = torch.sin(time[:, None] * torch.arange(1, 8))
+JointDMP.fit(time[::50], position[::50])
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+JointDMP.fit(time, position)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+def measure_memory() -> dict[str, float]:
+    """Memory that a fit of one long recording takes at its peak, in a process of its own."""
+    figures: dict[str, float] = {}
+    for samples in (100_000, 1_000_000):
+        command = [sys.executable, "-c", LONG_FIT, str(samples)]
+        made = subprocess.run(command, check=True, capture_output=True, text=True)
+        size = 1024 * float(made.stdout)
+        figures[f"fit_of_{samples}_mb"] = size / 1e6
+        figures[f"fit_of_{samples}_of_samples"] = size / (samples * JOINTS * 8)
     return figures
 
 

@@ -26,9 +26,9 @@ MINIMUM_SAMPLES = 3
 
 MAXIMUM_KNOTS = 120
 """Intervals of the splines: finer than any reasonable number of basis functions."""
-STRENGTHS = 81
-"""Penalties compared, from 1e-10 to 1e6 relative to the samples: a fifth of a decade apart,
-which changes the error by less than a percent."""
+STRENGTHS = -10, 6, 81
+"""Exponents of the first and the last penalty compared, relative to the samples, and their
+number: a fifth of a decade apart, which changes the error by less than a percent."""
 LIKELIHOOD_MARGIN = 1.0
 """Twice the logarithm of a likelihood ratio that is not significant; two standard deviations
 would be four."""
@@ -430,8 +430,6 @@ class _Spline:
     """Maps coordinates to control points."""
     data: Float[Tensor, "K"]
     """Precision of each coordinate from the samples, 0 to 1; the penalty adds the rest."""
-    strengths: Float[Tensor, "L"]
-    """Penalties to choose from."""
 
     def at_samples(self, points: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch T"]:
         """Splines with these control points."""
@@ -451,19 +449,20 @@ class _Spline:
         y = y - middle
         c = self.projected(y) @ self.V
         e, r = self.data, 1 - self.data
+        strengths = torch.logspace(*STRENGTHS)[:, None].to(y)
         # The prior precision of coordinate k is lambda r_k, that of the samples e_k.
-        total = e + self.strengths[:, None] * r
+        total = e + strengths * r
         free = r < 1e-9
         n = T - int(free.sum())
         # Penalty plus squared distance to the samples, at their minimum.
         misfit = y.square().sum(-1, keepdim=True) - c.square() @ (1 / total).mT
         misfit = misfit.clamp(min=torch.finfo(y.dtype).tiny)
-        prior = torch.where(free, 1.0, self.strengths[:, None] * r)
+        prior = torch.where(free, 1.0, strengths * r)
         known = torch.where(free, 1.0, total)
         score = n * misfit.log() + (known.log() - prior.log()).sum(-1)
         # The strongest penalty that is not significantly less likely than the best.
         likely = score <= score.amin(-1, keepdim=True) + LIKELIHOOD_MARGIN
-        best = (likely * torch.arange(1, STRENGTHS + 1, device=y.device)).argmax(-1)
+        best = (likely * torch.arange(1, len(strengths) + 1, device=y.device)).argmax(-1)
         fitted = self.at_samples((c / total[best]) @ self.V.mT)
         noise = (misfit.gather(-1, best[..., None])[..., 0] / n).sqrt()
         return fitted + middle, noise
@@ -491,6 +490,4 @@ def _spline(timestamps: bytes, device: torch.device) -> _Spline:
     half = torch.linalg.solve_triangular(L, data, upper=False)
     e, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, half.mT, upper=False))
     points = torch.linalg.solve_triangular(L.mT, V, upper=True)
-    return _Spline(
-        first, values, points, e.clamp(0, 1), torch.logspace(-10, 6, STRENGTHS).to(s)
-    )
+    return _Spline(first, values, points, e.clamp(0, 1))

@@ -138,11 +138,7 @@ class Trajectory(ArrayOutputs):
         # On a long grid, the matrices for few motions would be larger than the motions.
         if order > 2 or not shared or (s.shape[-1] > LONG and X.numel() < 3 * X.shape[-1] ** 2):
             return self._at_ragged_times(X, order)
-        if latest is not None and latest.matrices[0].dtype is X.dtype:
-            matrices = latest.matrices  # found above: comparing times again takes a microsecond
-        else:
-            matrices = self._response.matrices(s, X.dtype)
-        y = product(X, matrices[order]).mT
+        y = product(X, self._response.matrices(s, X.dtype)[order]).mT
         single = X.ndim == 2 and not self.duration.ndim  # comparing shapes takes longer
         if single or self.duration.shape == X.shape[:-2]:
             return y
