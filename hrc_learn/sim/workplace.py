@@ -399,7 +399,8 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
     if beside:
-        for far, higher, home in product(_BESIDE, (*_HIGHER, _DOWN), _ON_THE_WAY):
+        # The longest way to the shelves first: a short motion drowns in the tremor of a hand.
+        for home, far, higher in product(_ON_THE_WAY, _BESIDE, (*_HIGHER, _DOWN)):
             yield _beside(_placed(usual, scale, 0.0, higher, _DEPTHS[-1], far), home)
         return
     shifts = [(along, higher) for along in _ALONG for higher in _HIGHER]
