@@ -124,6 +124,15 @@ def session(tmp_path_factory):
         yield session
 
 
+def test_leaders_watchers_and_headsets_have_a_link_each(session):
+    page = session.page
+    origin, address = page.address.origin, page.address
+    assert page.url == f"{origin}/#token={address.token}"
+    assert page.watch_url == f"{origin}/#token={address.watch_token}"
+    assert page.headset_url == f"{origin}/xr#token={address.token}"
+    assert http(page, "/xr")[0] == 200
+
+
 async def ask(page, raw: bytes) -> bytes:
     """Answer to a request that then ends; empty where the server closes without one."""
     reader, writer = await asyncio.open_connection("127.0.0.1", page.address.port)
