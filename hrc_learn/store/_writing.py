@@ -130,7 +130,7 @@ class Claim:
         if self._sync:
             disk.sync_folder(self.target.parent)
 
-    def commit(self, kind: Kind, overwrite: bool = False, source: str = "") -> None:
+    def commit(self, kind: Kind, overwrite: bool, source: str) -> None:
         """Move the finished folder `new` to the target.
 
         Args:

@@ -90,13 +90,13 @@ def test_foreign_folders_are_carried_over_whatever_the_new_folder_has(tmp_path, 
     """Also out of a folder that we wrote once and no longer write."""
     out, plain = tmp_path / "out", Kind(name="plain", files=("part",))
     with replacing(out, plain) as folder:
-        (folder / "extra" / "ours").mkdir(parents=True)
+        (folder / "extra" / "shared").mkdir(parents=True)
     (out / "extra" / "own" / "empty").mkdir(parents=True)
     (out / "extra" / "own" / "mine").write_text("years")
-    (out / "extra" / "ours" / "mine").write_text("years")
+    (out / "extra" / "shared" / "mine").write_text("years")
     with replacing(out, plain, overwrite=True) as folder:
         (folder / made).mkdir(parents=True)
-    mine = {"out/extra/own/mine": "years", "out/extra/ours/mine": "years"}
+    mine = {"out/extra/own/mine": "years", "out/extra/shared/mine": "years"}
     assert contents(tmp_path) == mine
     assert (out / "extra" / "own" / "empty").is_dir()
 
