@@ -76,8 +76,9 @@ _CHECK_EVERY = 5
 _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
-# Features of a tool without markers are found less exactly than corners of a marker.
-UNMARKED = CameraConfig(pixel_noise=0.6, bump=6.0)
+UNMARKED = CameraConfig(pixel_noise=0.4, bump=6.0)
+"""Features of a tool without markers are found less exactly than corners of a marker: with this
+noise the predicted error above the object is that which they cause (bench_markerless.py)."""
 # Fractions of the height of a probe that are tried, and distance from joint limits there [rad]:
 # nearer to one the arm is slow.
 _PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
