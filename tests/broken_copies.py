@@ -228,6 +228,7 @@ DEFECTS = {
         finding=r"\d+ names for \d+ components",
         file="meta/info.json",
         key=STATE,
+        error=False,
     ),
     "gap": Defect(
         damage=lambda c: c.change_rows(

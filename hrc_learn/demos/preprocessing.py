@@ -1,6 +1,6 @@
 """Preparation of demonstrations for learning: cutting, filtering, resampling, alignment."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -61,6 +61,9 @@ _MEASURED = (name for name in JOINT_FIELDS if not name.startswith("command_"))
 _SMOOTHED = (*_MEASURED, "position", "orientation")
 """Fields that are smoothed: commands are not."""
 
+_EVEN = 0.01
+"""Largest difference of even steps, as a fraction of a step."""
+
 
 def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) -> Demonstration:
     """Smooth motion and efforts by polynomials around each frame; stamps may be uneven.
@@ -76,13 +79,53 @@ def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) ->
     Raises:
         ValueError: There are too few frames.
     """
+    return _filtered(
+        demo,
+        lambda values: local_polynomial(demo.time, values, window=window, degree=degree)[0],
+    )
+
+
+def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Demonstration:
+    """Smooth motion and efforts by a Butterworth low-pass, forwards and backwards: no lag.
+
+    The cut-off of each pass is raised such that both together halve the power at `cutoff`
+    (Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4). The ends
+    are extended by point reflection.
+
+    Args:
+        demo: Demonstration with even stamps, such as from `resample`.
+        cutoff: Frequency whose power is halved [Hz].
+        order: Order of each pass.
+
+    Raises:
+        ValueError: The stamps are uneven, the cut-off exceeds half the frame rate, or there are
+            too few frames.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    steps = np.diff(demo.time)
+    if not len(steps) or np.ptp(steps) > _EVEN * steps.mean():
+        raise ValueError(
+            "a Butterworth filter needs even stamps: resample(demo, fps) first, or smooth "
+            "with savitzky_golay, which accepts uneven ones"
+        )
+    rate = 1 / steps.mean()
+    correction = (np.sqrt(2) - 1) ** (1 / (2 * order))
+    # Bilinear transform: the correction applies to the frequencies of the analogue filter.
+    raised = np.arctan(np.tan(np.pi * cutoff / rate) / correction) * rate / np.pi
+    sections = np.asarray(butter(order, raised, fs=rate, output="sos"))
+    return _filtered(
+        demo, lambda values: sosfiltfilt(sections, values, axis=0, padlen=3 * (order + 1))
+    )
+
+
+def _filtered(demo: Demonstration, smooth: Callable[[np.ndarray], np.ndarray]) -> Demonstration:
     smoothed = {}
     for name in (name for name in _SMOOTHED if name in demo.recorded):
-        values = getattr(demo, name)
-        smooth, _ = local_polynomial(demo.time, values, window=window, degree=degree)
+        result = smooth(getattr(demo, name))
         if name == "orientation":
-            smooth /= np.linalg.norm(smooth, axis=1, keepdims=True)
-        smoothed[name] = smooth
+            result /= np.linalg.norm(result, axis=1, keepdims=True)
+        smoothed[name] = result
     return replace(demo, **smoothed)
 
 
@@ -360,6 +403,16 @@ def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
     rates = {"joint_velocity", "command_velocity"} & {*demo.recorded}
     scaled = {name: getattr(demo, name) / scale for name in rates}
     return replace(demo, time=demo.time * scale, fps=demo.fps / scale, **scaled)
+
+
+def equalise_durations(demos: DemonstrationSet) -> DemonstrationSet:
+    """Scale all demonstrations to their median duration.
+
+    Raises:
+        ValueError: As in `set_duration`.
+    """
+    duration = float(np.median([demo.duration for demo in demos]))
+    return demos.map(lambda demo: set_duration(demo, duration))
 
 
 def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demonstration:

@@ -114,11 +114,6 @@ FATAL = {
         "info.json",
     ),
     "fps 0": (lambda r: change_info(r, fps=0), "fps must be positive", "info.json"),
-    "names too short": (
-        lambda r: change_feature(r, STATE, names=NAMES[:2]),
-        "2 names for 3 components",
-        "info.json",
-    ),
     "shape wrong": (
         lambda r: change_feature(r, STATE, shape=[4], names=None),
         r"has 3 components, but .* declares the shape \[4\]",

@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from scipy.signal import savgol_filter
+from scipy.signal import butter, freqz, savgol_filter
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.demos.preprocessing import (
     align,
     at_times,
+    butterworth,
     compensate_delay,
     cut,
+    equalise_durations,
     estimate_joint_velocity,
     estimate_twist,
     regular_grid,
@@ -162,6 +164,41 @@ def _continuous(q):
     return q * np.concatenate([[1], np.cumprod(signs)])[:, None]
 
 
+@pytest.mark.parametrize("order", [1, 2, 4])
+def test_the_low_pass_halves_the_power_at_its_cutoff_without_lag(order):
+    time = np.arange(2000) / 200
+    wave = np.sin(2 * np.pi * 5 * time)
+    demo = swing(time, joint_position=np.stack([wave, np.ones_like(wave)], axis=1))
+    filtered = butterworth(demo, cutoff=5, order=order).joint_position
+    middle = slice(600, 1400)
+    np.testing.assert_allclose(filtered[middle, 0], wave[middle] / np.sqrt(2), atol=1e-6)
+    np.testing.assert_allclose(filtered[:, 1], 1, atol=1e-9)
+
+
+def test_the_low_pass_is_scipys_run_twice():
+    time = np.arange(4000) / 200
+    slow, fast = np.sin(2 * np.pi * 1 * time), np.sin(2 * np.pi * 12 * time)
+    demo = swing(time, joint_position=np.stack([slow, fast], axis=1))
+    filtered = butterworth(demo, cutoff=6).joint_position
+    raised = np.arctan(np.tan(np.pi * 6 / 200) / (np.sqrt(2) - 1) ** 0.25) * 200 / np.pi
+    _, gain = freqz(*butter(2, raised, fs=200), worN=[1, 12], fs=200)
+    middle = slice(1500, 2500)
+    for k, wave in enumerate((slow, fast)):
+        np.testing.assert_allclose(
+            filtered[middle, k], np.abs(gain[k]) ** 2 * wave[middle], atol=1e-6
+        )
+
+
+def test_filters_say_what_they_need():
+    with pytest.raises(ValueError, match="needs even stamps"):
+        butterworth(swing(jittered()), cutoff=5)
+    even = swing(np.arange(100) / 50)
+    with pytest.raises(ValueError, match="fs/2"):
+        butterworth(even, cutoff=25)
+    with pytest.raises(ValueError, match="padlen"):
+        butterworth(cut(even, 0, 8), cutoff=5)
+
+
 def with_rests(fps=100):
     """Rest 1 s, minimum-jerk motion 2 s, rest 1 s, motion 1 s, rest 0.5 s, with noise."""
 
@@ -239,9 +276,9 @@ def test_rest_of_poses_is_told_by_the_speed_of_the_hand():
     assert not resting(pose)[150:250].any()
 
 
-def test_a_set_duration_scales_the_velocities_too():
+def test_durations_are_made_equal_and_velocities_with_them():
     demos = DemonstrationSet([swing(np.arange(n) / 50) for n in (101, 151, 251)])
-    equal = demos.map(lambda demo: set_duration(demo, 3))
+    equal = equalise_durations(demos)
     assert [demo.duration for demo in equal] == pytest.approx([3, 3, 3])
     for demo in equal:
         spline = CubicSpline(demo.time, demo.joint_position)

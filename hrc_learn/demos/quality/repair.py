@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from hrc_learn.demos.dataset_assembly import put
-from hrc_learn.demos.issues import DatasetError, counted
+from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.quality.video_checks import read_stream
@@ -106,9 +106,8 @@ class RepairReport:
             lines.append(f"{name}: {'; '.join(changes) or 'unchanged'}")
         lines += [f"episode {old}: left out: {why}" for old, why in self.left_out.items()]
         lines.append(
-            f"{self.path}{' (nothing written)' * self.dry_run}: "
-            f"{counted(len(self.changes), 'episode')}, {self.frames} of "
-            f"{counted(self.frames_before, 'frame')}, {self.changed} changed, "
+            f"{self.path}{' (nothing written)' * self.dry_run}: {len(self.changes)} episodes, "
+            f"{self.frames} of {self.frames_before} frames, {self.changed} episodes changed, "
             f"{len(self.left_out)} left out"
         )
         return "\n".join(lines)
@@ -233,10 +232,8 @@ def _example(features: Mapping[str, Mapping]) -> pa.Table:
         for key, feature in features.items()
         if feature["dtype"] in ("image", "string")
     }
-    numbers = features.keys() - others
-    return to_table(
-        {k: np.zeros((1, *features[k]["shape"])) for k in numbers}, features, others
-    )
+    values = {k: np.zeros((1, *features[k]["shape"])) for k in features.keys() - others}
+    return to_table(values, features, others)
 
 
 def _place(kind: str, path: Path) -> dict[str, int]:

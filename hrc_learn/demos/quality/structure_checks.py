@@ -25,7 +25,7 @@ from hrc_learn.demos.read.dataset_folder import (
     read_tasks,
 )
 from hrc_learn.demos.read.frames import RawFrames, read_each, require_rows
-from hrc_learn.demos.read.metadata import SIDECAR_PATH, read_feature
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, flatten_names, read_feature
 from hrc_learn.demos.read.profiles import FeatureProfiles
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import MANIFEST, changed_files
@@ -243,6 +243,10 @@ def component_names(folder: DatasetFolder) -> Iterator[Issue]:
     """Component names: distinct and printable."""
     for key, feature in folder.features.items():
         names = feature.names or ()
+        declared = flatten_names(folder.info["features"][key].get("names")) or ()
+        if feature.numeric and 1 < len(declared) != feature.width:
+            text = f"{len(declared)} names for {feature.width} components: they are not used"
+            yield warning(message=f"{text}; correct names or shape", file=INFO_PATH, key=key)
         if len({*names}) < len(names):
             text = "two components have the same name"
             yield warning(message=text, file=INFO_PATH, key=key)

@@ -371,7 +371,8 @@ class _Conventions:
         first: dict[str, str] = {}
         for (role, side), slots in groups.items():
             named, role = role, self._encoding(feature, role, slots)
-            assumed = "" if named == role or "w" in slots else f"{role}, by its width"
+            sure = named == role != "rotation_6d" or "w" in slots
+            assumed = "" if sure else f"{role}, by its width"
             if first.setdefault(role, side) != side:
                 self._notes.append(
                     f"{feature.key}: one pose is read, that of the {first[role]} arm; the "
@@ -400,7 +401,7 @@ class _Conventions:
 
     def _encoding(self, feature: Feature, role: str, slots: Mapping[str | int, int]) -> str:
         """Encoding of a rotation by its components, with a note where it is assumed."""
-        if role not in ("quaternion", "rotation"):
+        if role not in ("quaternion", "rotation", "rotation_6d"):
             return role
         known = {3: "rotation_vector", 6: "rotation_6d", 9: "rotation_matrix"}
         if {*slots} == {*"wxyz"}:
@@ -411,6 +412,8 @@ class _Conventions:
             "--mapping quaternion_wxyz with its columns",
             "rotation_vector": "rotation vector; if it holds roll, pitch, yaw, give --mapping "
             "euler_xyz with its columns",
+            "rotation_6d": "matrix of which it holds two columns; if it holds two rows, as "
+            "PyTorch3D writes them, give --mapping rotation_6d_rows with its columns",
         }
         if found in orders:
             self._notes.append(f"{feature.key}: assumed to be a {orders[found]}")

@@ -81,13 +81,8 @@ def read_feature(key: str, declared: dict) -> Feature:
         text = f"the feature's declaration is malformed: {error!r}"
         raise DatasetError(text, file=INFO_PATH, key=key) from error
     names = flatten_names(declared.get("names")) if numeric else None
-    if names is not None and len(names) == 1 < width:
-        names = None  # openpi's converters name the vector, not its components
     if names is not None and len(names) != width:
-        text = (
-            f"{len(names)} names for {width} components; correct names or shape of the feature"
-        )
-        raise DatasetError(text, file=INFO_PATH, key=key)
+        names = None  # openpi's converters name the vector, not its components
     return Feature(key=key, dtype=dtype, shape=shape, names=names)
 
 

@@ -35,6 +35,7 @@ ROLES: dict[str, Role] = {
     "euler_xyz": Role(width=3, unit="rad"),
     "euler_intrinsic_xyz": Role(width=3, unit="rad"),
     "rotation_6d": Role(width=6, unit="1"),
+    "rotation_6d_rows": Role(width=6, unit="1"),
     "rotation_matrix": Role(width=9, unit="1"),
     "pose_matrix": Role(width=16, unit="m"),
     "gripper": Role(width=1, unit="m"),
@@ -46,9 +47,9 @@ ROLES: dict[str, Role] = {
 }
 """Every role. `euler_xyz` is roll, pitch, yaw about the fixed axes x, y, z and
 `euler_intrinsic_xyz` are angles about the moving axes x, y, z; `rotation_6d` is the first two
-columns of the rotation matrix, one after the other; `rotation_matrix` is flattened in row
-order; `pose_matrix` is a flattened 4x4
-homogeneous transform."""
+columns of the rotation matrix, one after the other, and `rotation_6d_rows` its first two rows;
+`rotation_matrix` is flattened in row order; `pose_matrix` is a flattened 4x4 homogeneous
+transform."""
 
 ORIENTATION_ROLES = (
     "quaternion_wxyz",
@@ -57,6 +58,7 @@ ORIENTATION_ROLES = (
     "euler_xyz",
     "euler_intrinsic_xyz",
     "rotation_6d",
+    "rotation_6d_rows",
     "rotation_matrix",
     "pose_matrix",
 )
@@ -127,6 +129,8 @@ def to_quaternion(
             orientation = _from_euler(numbers, (0, 1, 2))
         case "rotation_6d":
             orientation = _from_two_columns(numbers)
+        case "rotation_6d_rows":  # columns of the transpose
+            orientation = quaternion.conjugate(_from_two_columns(numbers))
         case "rotation_matrix":
             orientation = quaternion.from_matrix(_rotations(numbers.reshape(-1, 3, 3)))
         case _:

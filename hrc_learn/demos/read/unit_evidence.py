@@ -42,7 +42,9 @@ _SIZES: dict[str, tuple[tuple[float, str, float, str], ...]] = {
         (2.0, "1", 0.8, "m"),
         (_PERCENT, "%", 0.8, "mm"),
         (_BYTE, "byte", 0.8, "mm"),
-        (math.inf, "mm", 0.8, "tick"),
+        # No gripper opens wider; hobby servos count in ticks, from an unknown zero.
+        (300.0, "mm", 0.8, ""),
+        (math.inf, "mm", 0.3, ""),
     ),
     # One turn and some noise; two turns for an unwrapped vector.
     "euler_xyz": _TURN,
@@ -247,8 +249,10 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
 
 def guess_by_size(role: str, sizes: Sizes) -> Guess:
     """Unit of an opening, a position or the angles of an orientation."""
-    largest, whole = float(sizes.peak.max()), bool(sizes.whole.all())
+    largest = float(sizes.peak.max())
+    # A gripper of 0..255 may be interpolated, but it ends at 255.
+    counts = bool(sizes.whole.all()) or abs(largest - 255) < 0.5
     _, unit, confidence, other = next(
-        row for row in _SIZES[role] if largest <= row[0] and (whole or row[1] != "byte")
+        row for row in _SIZES[role] if largest <= row[0] and (counts or row[1] != "byte")
     )
     return Guess(unit, confidence, f"values usually reach {largest:.3g}", other)
