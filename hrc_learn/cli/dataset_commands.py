@@ -313,10 +313,8 @@ def push(args: Push) -> int:
     """
     report = check_dataset(args.dataset)
     if report.errors and not args.unsound:
-        raise ValueError(
-            f"{args.dataset} has {counted(len(report.errors), 'error')}: repair it, or upload "
-            f"it as it is (--unsound). The first: {report.errors[0]}"
-        )
+        text = f"{args.dataset} has errors: repair it, or upload it so (--unsound); the first:"
+        raise ValueError(f"{text} {report.errors[0]}")
     sizes = [path.stat().st_size for path in args.dataset.rglob("*") if path.is_file()]
     print(f"{counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB", flush=True)
     counts = {"errors": len(report.errors), "warnings": len(report.warnings)}

@@ -61,9 +61,6 @@ _MEASURED = (name for name in JOINT_FIELDS if not name.startswith("command_"))
 _SMOOTHED = (*_MEASURED, "position", "orientation")
 """Fields that are smoothed: commands are not."""
 
-_EVEN = 0.01
-"""Largest difference of even steps, as a fraction of a step."""
-
 
 def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) -> Demonstration:
     """Smooth motion and efforts by polynomials around each frame; stamps may be uneven.
@@ -104,7 +101,7 @@ def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Dem
     from scipy.signal import butter, sosfiltfilt
 
     steps = np.diff(demo.time)
-    if not len(steps) or np.ptp(steps) > _EVEN * steps.mean():
+    if not len(steps) or np.ptp(steps) > 0.01 * steps.mean():  # stamps are rounded
         raise ValueError(
             "a Butterworth filter needs even stamps: resample(demo, fps) first, or smooth "
             "with savitzky_golay, which accepts uneven ones"

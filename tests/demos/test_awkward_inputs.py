@@ -85,17 +85,3 @@ def test_fewer_names_than_components_are_no_names(tmp_path):
     np.testing.assert_array_equal(
         load_demos(tmp_path / "out")[0].joint_position, demo.joint_position
     )
-
-
-def test_actions_that_are_changes_of_the_state_are_no_positions(tmp_path):
-    states = [joint_path(FRAMES, 6, seed) for seed in range(EPISODES)]
-    steps = [np.diff(q, axis=0, append=q[-1:]) for q in states]
-    root = write_folder(
-        tmp_path / "set",
-        [{"observation.state": q, "action": d} for q, d in zip(states, steps, strict=True)],
-        dict.fromkeys(("observation.state", "action"), ARM),
-    )
-    report = check_dataset(root)
-    (found,) = [issue for issue in report.errors if issue.key == "action"]
-    assert "follows the change in a frame of the state with slope" in found.message
-    assert "command_velocity" not in found.message

@@ -369,19 +369,15 @@ def velocity_commands(
     prompt = rate_delay <= PROMPT < position_delay
     fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
     position_fit, key = _median([t.fit for t in positions]), command.columns[0][0]
-    # Slopes between 0.3 and 3: the same unit per second, or per frame, with lag or gain.
-    steps = (np.abs(slope) > 0.3 * fps) & (np.abs(slope) < 3 * fps)
-    speeds = (fit > FOLLOWS) & ((np.abs(slope) > 0.3) & (np.abs(slope) < 3) | steps)
+    # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
+    speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
     speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
     if speeds.sum() > len(speeds) / 2:
         names = listed(command.labels, range(len(command.labels)))
-        what, advice = "velocity", f"'command_velocity': {key!r}, "
-        if steps[speeds].all():
-            what, advice = "change in a frame", ""
         text = (
-            f"is taken for positions, but follows the {what} of the state with slope "
-            f"{float(np.median(slope[speeds])) / (1 if advice else fps):.2f}: {names}; declare "
-            f"it (mapping={{{advice}'command_position': None}})"
+            f"is taken for positions, but follows the velocity of the state with slope "
+            f"{float(np.median(slope[speeds])):.2f}: {names}; declare it "
+            f"(mapping={{'command_velocity': {key!r}, 'command_position': None}})"
         )
         yield Issue(message=text, key=key)
 

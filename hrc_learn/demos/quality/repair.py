@@ -195,8 +195,7 @@ def finish_recording(root: Path, target: Path) -> int:
     """
     info, rows, frames = read_info(root), [], 0
     features = {k: f for k, f in info["features"].items() if f["dtype"] != "video"}
-    left_out = shutil.ignore_patterns("images")
-    shutil.copytree(root, target, ignore=left_out, copy_function=put, dirs_exist_ok=True)
+    shutil.copytree(root, target, copy_function=put, dirs_exist_ok=True)
     for file in (file for file in episode_lists(root) if is_unfinished(root / file)):
         (target / file).unlink()
     known = [row for file in episode_lists(target) for row in read_rows(target, file, _INDEX)]

@@ -42,8 +42,7 @@ _SIZES: dict[str, tuple[tuple[float, str, float, str], ...]] = {
         (2.0, "1", 0.8, "m"),
         (_PERCENT, "%", 0.8, "mm"),
         (_BYTE, "byte", 0.8, "mm"),
-        # No gripper opens wider; hobby servos count in ticks, from an unknown zero.
-        (300.0, "mm", 0.8, ""),
+        # Few grippers open wider; hobby servos count in ticks, from an unknown zero.
         (math.inf, "mm", 0.3, ""),
     ),
     # One turn and some noise; two turns for an unwrapped vector.
