@@ -22,6 +22,9 @@ from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.receiving import Receipt
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 METRICS = {metric.name: metric for metric in collaboration_metrics(1, 0.0)}
 CAMERA, OFFSET = overhead_camera(), np.array([0.01, -0.02, 0.09])
 

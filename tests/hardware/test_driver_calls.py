@@ -18,6 +18,9 @@ from hrc_learn.hardware.gripper import GripperProcess
 from hrc_learn.protocols import ArmState
 from hrc_learn.watchdog import WatchdogError
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 PATIENCE = 20.0
 
 

@@ -13,6 +13,9 @@ from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, franka_arm
 from hrc_learn.hardware.franka_memory import Phase, Report
 from hrc_learn.kinematics import SerialChain, fr3, panda
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 CONFIG = FrankaConfig(realtime=False, compiled=False, gripper=False)
 VELOCITY = np.arange(7) / 10
 

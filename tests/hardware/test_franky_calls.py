@@ -11,6 +11,9 @@ import pytest
 from hrc_learn.hardware import ArmFaultError, FrankyArm, FrankyConfig, GripperError, franky_arm
 from hrc_learn.hardware.franka_settings import RealtimeError
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 CONFIG = FrankyConfig(realtime=False)
 VELOCITY = 0.1 * np.arange(7)
 FIFO = (os.SCHED_FIFO, 99)

@@ -12,6 +12,9 @@ from hrc_learn.hardware.lerobot_arm import led_goal
 from hrc_learn.hardware.lerobot_device import JointUnits, in_words
 from hrc_learn.kinematics.registry import arm as named_arm
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 CHAIN = named_arm("so101").chain
 NAMES = CHAIN.joint_names
 PERIOD = 0.02

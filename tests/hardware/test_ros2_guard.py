@@ -18,6 +18,9 @@ from hrc_learn.hardware.ros2_topics import (
     start_guard,
 )
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 TOPIC, TIMEOUT = "/commands", 0.2
 
 

@@ -13,6 +13,9 @@ from ros2_graph import Graph, stamp
 from hrc_learn.hardware import ArmFaultError, Ros2Arm, Ros2Config, ros2_arm
 from hrc_learn.kinematics import panda
 
+# Stand-ins are not of the annotated types.
+pytestmark = pytest.mark.simulation
+
 NAMES = panda.chain.joint_names
 READY = panda.chain.ready.numpy()
 LIMITS = panda.chain.limits
