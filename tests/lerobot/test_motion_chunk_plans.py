@@ -1,7 +1,6 @@
 """`motion_chunk` knows several ways: averaged where their error explains them, else chosen."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,7 +16,12 @@ from lerobot_samples import (
 )
 
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
-from hrc_learn.lerobot.policy.motion_chunks import ContinuedMotion, MotionChunk, Plans
+from hrc_learn.lerobot.policy.motion_chunks import (
+    ChunkDecoder,
+    ContinuedMotion,
+    MotionChunk,
+    Plans,
+)
 
 SHOWN = reaching(10)
 
@@ -122,7 +126,8 @@ def test_both_ways_round_an_obstacle_are_kept_and_none_between():
 
 def under_way():
     """A motion of ten samples of which two are wide: sample k is at (k, -k), at rate 1."""
-    motion = ContinuedMotion(SimpleNamespace(samples=10), compose=lambda smooth, _: smooth)  # type: ignore[arg-type]
+    motion = ContinuedMotion(ChunkDecoder(9, 0.05, 4), compose=lambda smooth, _: smooth)
+    assert motion.decoder.samples == 10
     k = torch.arange(10.0)
     states = torch.zeros(1, 10, 3, 2)
     states[0, :, 0], states[0, :, 1] = torch.stack([k, -k], 1), torch.tensor([1.0, -1.0])
