@@ -166,7 +166,7 @@ for episode in range(12 if not video else 3):
         frame = {"action": state, "observation.state": state, "task": f"task {episode % 2}"}
         if video:
             frame["observation.images.front"] = np.full((64, 96, 3), 20 * episode + k, np.uint8)
-        dataset.add_frame(frame)
+        dataset.add_frame({**frame})
     dataset.save_episode()
 dataset.add_frame(frame)
 os.kill(os.getpid(), signal.SIGKILL)
