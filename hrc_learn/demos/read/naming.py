@@ -1,24 +1,17 @@
 """Meaning of the names of features and components, as they occur in published datasets.
 
-There is no single convention. Unknown names are left to the caller's explicit mapping.
+There is no single convention: `names.toml` lists those seen. Unknown names are left to the
+caller's explicit mapping.
 """
 
 import re
+import tomllib
 from dataclasses import dataclass
+from importlib.resources import files
 
-JOINT_SUFFIXES = {
-    "joint_position": ("pos", "position", "obs_pos", "cmd_pos", "qpos"),
-    "joint_velocity": ("vel", "velocity", "obs_vel", "cmd_vel", "qvel"),
-    "joint_effort": (
-        "torque",
-        "effort",
-        "obs_torque",
-        "obs_effort",
-        "external_torque",
-        "obs_external_torque",
-    ),
-    "human_effort": ("human_effort", "human_torque"),
-}
+_WORDS_OF = tomllib.loads(files(__package__).joinpath("names.toml").read_text(encoding="utf-8"))
+
+JOINT_SUFFIXES: dict[str, list[str]] = _WORDS_OF["joint_suffixes"]
 """Suffixes of `JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
 
 _JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
@@ -28,22 +21,11 @@ _UNDERSCORED = re.compile(
     r"(.*(?:joint|motor|axis)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)", re.IGNORECASE
 )
 _GRIPPER = re.compile(r"gripper|(?:^|[._/ ])(?:jaw|claw)(?:$|[._/ ])")
-_HAND = re.compile(
-    r"finger|thumb|pinky|knuckle|"
-    r"(?:^|[._/ ])(?:hand|palm|index|middle|ring|little|claw|jaw|gripper)(?:$|[._/ \d])"
-)
+_HAND = re.compile("|".join(_WORDS_OF["hand"]))
 _CAMEL = re.compile(r"(?<=[a-z\d])(?=[A-Z])")
 """Word boundaries of a name such as `kRightHandIndex`."""
 
-_UNITS = {
-    "deg": "degrees|degree|degs|deg|°",
-    "rad": "radians|radian|rads|rad",
-    "mm": "millimeters|millimetres|mm",
-    "cm": "cm",
-    "m": "meters|metres|m",
-    "tick": "ticks|tick|counts|steps",
-    "%": "percent|pct|%",
-}
+_UNITS: dict[str, str] = _WORDS_OF["units"]
 """Unit -> its spellings in names (regular expression)."""
 _SPELLED = "|".join(f"(?P<u{i}>{spelled})" for i, spelled in enumerate(_UNITS.values()))
 # After a separator or in brackets, perhaps before a number: `q_deg`, `q (deg)`, `q_deg_3`.
@@ -55,14 +37,7 @@ _UNIT_AT_END = re.compile(
 _METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|opening)$")
 """Stems after which a lone `m` is the unit, and no name."""
 
-# No joint of an arm, although its name stands among joints.
-_NO_JOINT = re.compile(
-    r"(?:^|[._/ ])(?:object|obj|cube|block|marker|tag|pixels?|px|image|feature|bbox|elevator|"
-    r"mast|wheels?|odom\w*|imu|battery|force|wrench|ft|reward|success|done|pad|padding|dummy|"
-    r"unused)(?:$|[._/ \d])|"
-    r"^(?:lift|torso_lift|base_(?:x|y|th|theta|yaw|vel\w*))(?:$|[._/ \d])|"
-    r"[._/ ](?:current|voltage|temperature)$"
-)
+_NO_JOINT = re.compile("|".join(_WORDS_OF["no_joint"]))
 
 # Words before a component that only name the tool or the robot.
 _TOOL = (
@@ -108,23 +83,7 @@ _SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _QUATERNION_SLOTS = {"w": 0, "x": 1, "y": 2, "z": 3}
 
 _OF_TOOL = r"(?:ee|eef|tcp|tool\d*|end_?effector|flange)_(?:pose_)?"
-KEY_ROLES = {
-    "joint_position": "joint_position|joint_positions|joint_pos|joints|qpos",
-    "joint_velocity": "joint_velocity|joint_velocities|joint_vel|qvel|velocity",
-    "joint_effort": "joint_effort|joint_efforts|joint_torque|joint_torques|torque|effort",
-    "position": rf"{_OF_TOOL}(?:pos|position|xyz|translation)",
-    "rotation_vector": rf"{_OF_TOOL}(?:rotvec|rotation_vector|(?:rot_)?axis_?angle)",
-    "euler_xyz": rf"{_OF_TOOL}(?:euler|rpy)",
-    "rotation_6d": rf"{_OF_TOOL}(?:rot_?6d|rotation_6d)",
-    "quaternion_xyzw": rf"{_OF_TOOL}(?:quat|quaternion|orientation|ori|orn)",
-    "rotation_matrix": rf"{_OF_TOOL}(?:rot|rotation|rot_mat|rotation_matrix|mat)",
-    "cartesian": r"cartesian_position|cartesian_pose|(?:ee|eef|tcp|tool\d*|end_?effector)"
-    r"(?:_pose|_transform)?",
-    "gripper": "gripper|gripper_position|gripper_width|gripper_pos|gripper_qpos",
-    "feature": "image_feature",
-    "human_effort": "human_effort",
-    "time": "time|time_stamp|timestamp|stamp",
-}
+KEY_ROLES = {role: key.replace("TOOL_", _OF_TOOL) for role, key in _WORDS_OF["keys"].items()}
 """Role of a whole feature -> last part of its key (regular expression)."""
 _KEY_PREFIX = re.compile(r"(?:(?:robot\d*|arm\d*|states?|observations?|obs|left|right)_)+")
 

@@ -1,7 +1,9 @@
 """Quantities of a dataset: their roles, and encodings of orientation."""
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -17,39 +19,23 @@ from hrc_learn.geometry import quaternion
 class Role:
     """Quantity that a group of columns can hold."""
 
-    width: int | None
-    """Number of columns; None for one per joint."""
     unit: str
     """Unit in a `Demonstration`."""
+    width: int | None = None
+    """Number of columns; None for one per joint."""
 
 
-ROLES: dict[str, Role] = {
-    "time": Role(width=1, unit="s"),
-    "joint_position": Role(width=None, unit="rad"),
-    "joint_velocity": Role(width=None, unit="rad/s"),
-    "joint_effort": Role(width=None, unit="N m"),
-    "position": Role(width=3, unit="m"),
-    "quaternion_wxyz": Role(width=4, unit="1"),
-    "quaternion_xyzw": Role(width=4, unit="1"),
-    "rotation_vector": Role(width=3, unit="rad"),
-    "euler_xyz": Role(width=3, unit="rad"),
-    "euler_intrinsic_xyz": Role(width=3, unit="rad"),
-    "rotation_6d": Role(width=6, unit="1"),
-    "rotation_6d_rows": Role(width=6, unit="1"),
-    "rotation_matrix": Role(width=9, unit="1"),
-    "pose_matrix": Role(width=16, unit="m"),
-    "gripper": Role(width=1, unit="m"),
-    "feature": Role(width=2, unit="px"),
-    "feature_visible": Role(width=1, unit="1"),
-    "human_effort": Role(width=None, unit="N m"),
-    "command_position": Role(width=None, unit="rad"),
-    "command_velocity": Role(width=None, unit="rad/s"),
-}
+_TABLES = tomllib.loads(files(__package__).joinpath("quantities.toml").read_text("utf-8"))
+
+ROLES = {name: Role(**row) for name, row in _TABLES["roles"].items()}
 """Every role. `euler_xyz` is roll, pitch, yaw about the fixed axes x, y, z and
 `euler_intrinsic_xyz` are angles about the moving axes x, y, z; `rotation_6d` is the first two
 columns of the rotation matrix, one after the other, and `rotation_6d_rows` its first two rows;
 `rotation_matrix` is flattened in row order; `pose_matrix` is a flattened 4x4 homogeneous
 transform."""
+SIZES: dict[str, list[tuple[float, str, float, str]]] = _TABLES["sizes"]
+"""Largest value, unit, confidence, and second candidate, by the quantities whose unit their
+size tells."""
 
 ORIENTATION_ROLES = (
     "quaternion_wxyz",

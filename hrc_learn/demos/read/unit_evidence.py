@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy.lib.stride_tricks import sliding_window_view
 
+from hrc_learn.demos.read.quantities import SIZES
+
 CONFIDENT = 0.75
 """Confidence from which a guessed unit is used without a question."""
 
@@ -26,31 +28,7 @@ _SHORTEST_ARM, _POSE_AND_FINGERS = 5, 8
 # LeRobot clips normalised positions at exactly 100.
 _CLIP, _CLIPPED = 100.0, 0.002
 """Value, and fraction of the frames at it from which a column counts as clipped."""
-# Rows of largest value, unit, confidence, and second candidate.
-_TURN = ((2 * math.pi + 0.1, "rad", 0.95, "deg"), (math.inf, "deg", 0.8, ""))
-_SIZES: dict[str, tuple[tuple[float, str, float, str], ...]] = {
-    # Reach of an arm on a fixed base: 5 m, and what 1.5 m are in cm; poses below 60 mm are
-    # rare.
-    "position": (
-        (5.0, "m", 0.95, ""),
-        (60.0, "cm", 0.5, "mm"),
-        (150.0, "cm", 0.6, "mm"),
-        (math.inf, "mm", 0.9, "cm"),
-    ),
-    "gripper": (
-        (0.2, "m", 0.8, "1"),
-        (2.0, "1", 0.8, "m"),
-        (_PERCENT, "%", 0.8, "mm"),
-        (_BYTE, "byte", 0.8, "mm"),
-        # Few grippers open wider; hobby servos count in ticks, from an unknown zero.
-        (math.inf, "mm", 0.3, ""),
-    ),
-    # One turn and some noise; two turns for an unwrapped vector.
-    "euler_xyz": _TURN,
-    "euler_intrinsic_xyz": _TURN,
-    "rotation_vector": ((_RADIANS, "rad", 0.95, "deg"), (math.inf, "deg", 0.8, "")),
-}
-GUESSED_BY_SIZE = tuple(_SIZES)
+GUESSED_BY_SIZE = tuple(SIZES)
 """Quantities, apart from joints, whose unit their size tells."""
 _UNIT_LENGTH = 2e-3
 """Deviation of a quaternion's length, of float32 and of few printed digits."""
@@ -252,6 +230,6 @@ def guess_by_size(role: str, sizes: Sizes) -> Guess:
     # A gripper of 0..255 may be interpolated, but it ends at 255.
     counts = bool(sizes.whole.all()) or abs(largest - 255) < 0.5
     _, unit, confidence, other = next(
-        row for row in _SIZES[role] if largest <= row[0] and (counts or row[1] != "byte")
+        row for row in SIZES[role] if largest <= row[0] and (counts or row[1] != "byte")
     )
     return Guess(unit, confidence, f"values usually reach {largest:.3g}", other)
