@@ -10,7 +10,7 @@ deviation of the noise, whether it comes from encoders, a tracker or a trembling
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache, partial, reduce
 from typing import Any
 
 import numpy as np
@@ -391,7 +391,7 @@ def densified(samples: Samples, n_basis: int) -> Samples:
             s, (y, rate) = grid, _cubic(s, y, rate, grid)
         rows.append((s, y.mT, rate.mT / tau, torch.ones_like(s)))
     pad = partial(torch.nn.utils.rnn.pad_sequence, batch_first=True)
-    s, position, velocity, mask = map(pad, zip(*rows, strict=True))
+    s, position, velocity, mask = (pad(list(column)) for column in zip(*rows, strict=True))
     return replace(
         samples,
         # Padding repeats the last time, so that times do not decrease.
@@ -433,7 +433,8 @@ class _Spline:
 
     def at_samples(self, points: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch T"]:
         """Splines with these control points."""
-        return sum(points[..., self.first + k] * self.values[:, k] for k in range(4))
+        parts = (points[..., self.first + k] * self.values[:, k] for k in range(4))
+        return reduce(torch.add, parts)
 
     def projected(self, y: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch K"]:
         """Products of samples with each spline; the transpose of `at_samples`."""

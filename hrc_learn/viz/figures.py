@@ -15,6 +15,7 @@ from cycler import cycler
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
@@ -184,15 +185,18 @@ def stack_panels(figure: Figure) -> None:
         axes.tick_params(labelbottom=True)
         axes.set_title(fill(axes.get_title("left"), _TITLE), loc="left", fontsize=8)
         if (legend := axes.get_legend()) is not None:
-            names = [text.get_text() for text in legend.texts]
-            look = {"fontsize": 8, "frameon": False, "ncols": 2, "bbox_to_anchor": (0, -0.2)}
-            axes.legend(legend.legend_handles, names, loc="upper left", **look)
+            axes.legend(**_narrow(legend), loc="upper left", bbox_to_anchor=(0, -0.2))
     for legend in [*figure.legends]:
-        names = [text.get_text() for text in legend.texts]
         legend.remove()
-        look = {"fontsize": 8, "frameon": False, "ncols": 2}
-        figure.legend(legend.legend_handles, names, loc="outside upper center", **look)
+        figure.legend(**_narrow(legend), loc="outside upper center")
     figure.set_size_inches(_NARROW, sum(rows) + _AROUND * len(rows) + 0.3)
+
+
+def _narrow(legend: Legend) -> dict[str, Any]:
+    """Entries and look of a legend in two columns."""
+    handles = [handle for handle in legend.legend_handles if handle is not None]
+    labels = [text.get_text() for text in legend.texts]
+    return {"handles": handles, "labels": labels, "fontsize": 8, "frameon": False, "ncols": 2}
 
 
 def plots_figure(
