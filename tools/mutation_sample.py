@@ -8,13 +8,19 @@ the top of a module or as defaults of settings are choices, not logic, and are l
 
     python tools/mutation_sample.py controller jacobian --number 25 --seed 1 --json out.json
     python tools/mutation_sample.py dmp/joint.py --list
+
+With `--executed` (files that `executed_lines.py` wrote) only tests that execute the changed
+line run, the quickest first and at most `--cap` seconds of them, in a process forked from one
+that has loaded the libraries: a few seconds a mutant. `.` stands for all packages.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import copy
+import importlib
 import json
 import os
 import random
@@ -256,16 +262,97 @@ class Checkout:
                 os.killpg(process.pid, signal.SIGKILL)
                 return None
 
-    def judge(self, mutant: Mutant, tests: list[str], timeout: float) -> str:
+    def passes_forked(self, tests: list[str], timeout: float) -> bool | None:
+        """As `passes`, in a fork of this process, which has imported the libraries."""
+        child = os.fork()
+        if child == 0:
+            os.setpgrp()
+            os.chdir(self.folder)
+            sys.path.insert(0, str(self.folder))
+            os.environ |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
+            nothing = os.open(os.devnull, os.O_RDWR)
+            for descriptor in (0, 1, 2):
+                os.dup2(nothing, descriptor)
+            import pytest
+
+            status = 3
+            try:
+                status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]))
+            finally:
+                os._exit(status)
+        end = time.monotonic() + timeout
+        while time.monotonic() < end:
+            ended, status = os.waitpid(child, os.WNOHANG)
+            if ended:
+                return os.waitstatus_to_exitcode(status) == 0
+            time.sleep(0.05)
+        os.killpg(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return None
+
+    def judge(self, mutant: Mutant, tests: list[str], timeout: float, forked: bool) -> str:
         """`killed`, `timeout` (which also counts as killed) or `survived`."""
         file = self.folder / mutant.path
         whole = file.read_text(encoding="utf-8")
         file.write_text(mutant.source, encoding="utf-8")
         try:
-            result = self.passes(tests, timeout)
+            result = (self.passes_forked if forked else self.passes)(tests, timeout)
         finally:
             file.write_text(whole, encoding="utf-8")
         return {True: "survived", False: "killed", None: "timeout"}[result]
+
+
+class Executed:
+    """Which tests execute a line, and how long each takes."""
+
+    def __init__(self, files: list[Path]):
+        self.seconds: dict[str, float] = {}
+        self.tests: dict[tuple[str, int], list[str]] = {}
+        for file in files:
+            for test, (seconds, lines) in json.loads(file.read_text(encoding="utf-8")).items():
+                self.seconds[test] = seconds
+                for name, line in lines:
+                    self.tests.setdefault((name, line), []).append(test)
+
+    def of(self, mutant: Mutant, cap: float, most: int = 400) -> list[str]:
+        """The quickest tests of the line, `cap` seconds of them."""
+        name = str(mutant.path.relative_to("hrc_learn"))
+        found = sorted(self.tests.get((name, mutant.line), ()), key=self.seconds.__getitem__)
+        chosen, used = [], 0.0
+        for test in found[:most]:
+            used += self.seconds[test]
+            if chosen and used > cap:
+                break
+            chosen.append(test)
+        return sorted(chosen)
+
+
+def preload() -> None:
+    """Import the libraries that tests use, but nothing of the package."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    for name in (
+        "torch",
+        "scipy.optimize",
+        "mujoco",
+        "cv2",
+        "pyarrow.parquet",
+        "pandas",
+        "rerun",
+        "matplotlib.pyplot",
+        "pytorch_kinematics",
+        "beartype",
+        "jaxtyping",
+        "lerobot",
+        "datasets",
+        "torch._dynamo",
+        "av",
+        "PIL.Image",
+        "numpy.testing",
+        "hypothesis",
+    ):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    sys.modules["torch"].set_num_threads(1)
 
 
 def main() -> int:
@@ -287,6 +374,10 @@ def main() -> int:
     parser.add_argument(
         "--check", action="store_true", help="first see that the tests pass without mutants"
     )
+    parser.add_argument("--executed", type=Path, nargs="+", help="files of executed_lines.py")
+    parser.add_argument(
+        "--cap", type=float, default=40.0, help="tests of a mutant, with it [s]"
+    )
     parser.add_argument("--list", action="store_true", help="show the sample, run nothing")
     args = parser.parse_args()
 
@@ -298,6 +389,9 @@ def main() -> int:
         print(*sample, sep="\n")
         return 0
 
+    executed = Executed(args.executed) if args.executed else None
+    if executed:
+        preload()
     fates: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         checkout = Checkout(Path(folder))
@@ -312,7 +406,13 @@ def main() -> int:
                 return 2
         for mutant in sample:
             tests, start = args.tests or tests_of(mutant.path), time.monotonic()
-            fate = checkout.judge(mutant, tests, args.timeout) if tests else "survived"
+            found = executed.of(mutant, args.cap) if executed else []
+            # What runs in another process or at import only is not seen: the nearest file.
+            tests = found or (tests[:1] if executed else tests)
+            timeout = 60 + 5 * args.cap if executed else args.timeout
+            fate = "survived"
+            if tests:
+                fate = checkout.judge(mutant, tests, timeout, executed is not None)
             seconds = time.monotonic() - start
             print(f"{fate:9}{seconds:6.0f} s  {mutant}", flush=True)
             fates.append(
