@@ -18,6 +18,9 @@ from hrc_learn.demos.preprocessing import (
     equalise_durations,
     estimate_joint_velocity,
     estimate_twist,
+    local_polynomial,
+    motion_range,
+    nearest_frames,
     regular_grid,
     resample,
     resting,
@@ -417,3 +420,255 @@ def test_a_grid_allows_for_rounded_stamps_and_no_more():
         assert len(regular_grid(1 - missing / 50, 50)) == frames
     assert len(regular_grid(0.02, 50)) == 2
     np.testing.assert_allclose(np.diff(regular_grid(2.0, 8)), 1 / 8)
+
+
+def at_speed(values, time=None, **fields):
+    """Joints or a hand whose components move at these speeds [1/s], frame by frame."""
+    time = np.arange(len(values)) / 100 if time is None else time
+    path = np.cumsum(np.asarray(values, float), axis=0) * 0.01
+    name = fields.pop("name", "joint_position")
+    names = tuple(f"j{i}" for i in range(path.shape[1])) if name == "joint_position" else ()
+    return Demonstration(
+        **{"time": time, name: path, "joint_names": names, "fps": 100}, **fields
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "slow", "fast"), [("joint_position", 0.01, 0.04), ("position", 0.003, 0.01)]
+)
+def test_bounds_of_rest_of_joints_and_of_the_hand(name, slow, fast):
+    """A rest begins below the lower bound and ends above the upper one."""
+    for before, still in ((0.99 * slow, True), (1.01 * slow, False)):
+        speed = np.full(300, before)
+        speed[:100] = 9 * fast
+        demo = at_speed(np.outer(speed, [0, -1, 0]), name=name)
+        assert resting(demo)[120:].tolist() == [still] * 180
+    for after, still in ((0.99 * fast, True), (1.01 * fast, False)):
+        speed = np.full(300, after)
+        speed[:100] = 0
+        demo = at_speed(np.outer(speed, [0, 1, 0]), name=name)
+        assert resting(demo)[120:].tolist() == [still] * 180
+
+
+def test_the_fastest_joint_counts_and_of_a_hand_the_speed_along_its_path():
+    """Each of three components alone is below the bound, together they are above."""
+    speed = np.full((300, 3), 0.0035 / 2)
+    assert not resting(at_speed(speed, name="position")).any()
+    assert resting(at_speed(speed * [1, 1, 0], name="position")).all()
+    assert resting(at_speed(np.full((300, 3), 0.009))).all()
+    assert not resting(at_speed(np.full((300, 3), [0.0, 0.009, -0.02]))).any()
+
+
+def test_joints_decide_on_rest_where_a_pose_is_recorded_too():
+    demo = at_speed(np.zeros((100, 2)), position=np.cumsum(np.ones((100, 3)), axis=0))
+    assert resting(demo).all()
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.1, 0.25])
+def test_motions_keep_a_margin_at_either_end(keep):
+    """Motion of frames 100 to 199 and 300 to 339, at 100 Hz."""
+    rest = np.ones(440, bool)
+    rest[100:200] = rest[300:340] = False
+    demo = at_speed(np.zeros((440, 1)))
+    margin = round(100 * keep)
+    assert motion_range(demo, rest, keep) == (100 - margin, 340 + margin)
+    assert motion_range(demo, ~rest, 9.0) == (0, 440)
+    speed = np.where(rest, 0.0, 1.0)[:, None]
+    parts = split_at_rest(at_speed(speed), keep=keep)
+    first = [round(100 * part.start_time) for part in parts]
+    # The window of speeds is 15 frames wide: motion is seen half of it too early.
+    assert np.abs(np.subtract(first, [100 - margin, 300 - margin])).max() <= 8
+    assert len(split_at_rest(at_speed(speed), shortest=0.6)) == 1
+    assert len(split_at_rest(at_speed(speed), shortest=1.2)) == 0
+    one = trim_rest(at_speed(speed), keep)
+    assert abs(round(100 * one.start_time) - 100 + margin) <= 8
+    assert abs(len(one) - 240 - 2 * margin) <= 16
+
+
+def test_margins_are_a_tenth_of_a_second_unless_told():
+    rest = np.ones(400, bool)
+    rest[100:300] = False
+    demo = at_speed(np.zeros((400, 1)))
+    assert motion_range(demo, rest) == (90, 310)
+    moving = at_speed(np.where(rest, 0.0, 1.0)[:, None])
+    assert len(trim_rest(moving)) == len(trim_rest(moving, 0.1))
+    (one,) = split_at_rest(moving)
+    assert len(one) == len(trim_rest(moving))
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, 5), (5, 5), (6, 5), (0, 11), (11, 12)])
+def test_a_range_that_is_no_part_of_a_demonstration(start, stop):
+    demo = at_speed(np.zeros((10, 1)))
+    with pytest.raises(ValueError, match=f"frames {start} to {stop} are no part"):
+        cut(demo, start, stop)
+    assert len(cut(demo, 0, 10)) == 10
+    assert cut(demo, 9, 10).time.tolist() == [0]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_short_window_holds_two_samples_more_than_the_degree_made_odd(degree):
+    values = np.random.default_rng(0).normal(size=(40, 1))
+    time = np.arange(40) / 50
+    taps = (degree + 2) | 1
+    smooth, _ = local_polynomial(time, values, window=1e-3, degree=degree)
+    np.testing.assert_allclose(
+        smooth, savgol_filter(values, taps, degree, axis=0, mode="interp"), atol=1e-9
+    )
+    few, _ = local_polynomial(time[: degree + 1], values[: degree + 1], window=9, degree=degree)
+    np.testing.assert_allclose(few, values[: degree + 1], atol=1e-9)
+    for bad in (degree, 1):
+        with pytest.raises(ValueError, match=f"{bad} samples do not determine"):
+            local_polynomial(time[:bad], values[:bad], window=1, degree=degree)
+    with pytest.raises(ValueError, match="must be positive"):
+        local_polynomial(time, values, window=0.1, degree=0)
+
+
+def test_commands_and_measurements_of_cameras_are_not_smoothed():
+    time = np.arange(80) / 50
+    noise = np.random.default_rng(1).normal(size=(80, 2))
+    demo = swing(
+        time,
+        joint_position=noise,
+        joint_velocity=noise,
+        joint_effort=noise,
+        human_effort=noise,
+        command_position=noise,
+        command_velocity=noise,
+        feature=noise,
+        feature_visible=np.ones(80, bool),
+        gripper=noise[:, 0],
+    )
+    for smooth in (savitzky_golay(demo, 0.3), butterworth(demo, 4)):
+        for name in demo.recorded:
+            same = np.array_equal(getattr(smooth, name), getattr(demo, name))
+            assert same == (name.startswith(("command", "feature", "gripper", "time")))
+        np.testing.assert_allclose(np.linalg.norm(smooth.orientation, axis=1), 1)
+
+
+def test_stamps_of_a_low_pass_may_be_rounded_but_not_uneven():
+    steps = np.full(99, 0.02)
+    for odd, refused in ((1.0099, False), (1.0101, True)):
+        steps[50] = 0.02 * odd
+        demo = swing(np.r_[0, np.cumsum(steps)])
+        if refused:
+            with pytest.raises(ValueError, match="needs even stamps"):
+                butterworth(demo, 5)
+        else:
+            butterworth(demo, 5)
+    with pytest.raises(ValueError, match="needs even stamps"):
+        butterworth(cut(demo, 0, 1), 5)
+
+
+def test_smooth_fields_follow_a_spline_and_others_lines():
+    time = jittered(40)
+    rng = np.random.default_rng(4)
+    demo = swing(
+        time,
+        joint_effort=rng.normal(size=(40, 2)),
+        command_position=rng.normal(size=(40, 2)),
+        gripper=rng.normal(size=40),
+    )
+    at = np.linspace(0, time[-1], 77)
+    moved = at_times(demo, at)
+    for name in ("joint_position", "joint_velocity", "position"):
+        expected = CubicSpline(time, getattr(demo, name))(at)
+        np.testing.assert_allclose(getattr(moved, name), expected)
+    for name in ("joint_effort", "command_position", "gripper"):
+        values = getattr(demo, name).reshape(40, -1)
+        expected = np.stack([np.interp(at, time, v) for v in values.T], axis=1)
+        np.testing.assert_allclose(getattr(moved, name).reshape(77, -1), expected, atol=1e-12)
+    assert len(resample(demo, 20)) == int(time[-1] * 20) + 1
+    assert resample(demo, 20).fps == 20
+    for outside in (np.array([-1e-6, 0.1]), np.array([0.1, time[-1] + 1e-6])):
+        with pytest.raises(ValueError, match="exceed the demonstration"):
+            at_times(demo, outside)
+
+
+def test_of_two_frames_equally_near_the_earlier_one_counts():
+    known = np.array([0.0, 1, 2, 4])
+    at = np.array([-1.0, 0, 0.5, 0.51, 1.49, 1.5, 1.51, 3.0, 3.01, 4, 9])
+    expected = [np.flatnonzero(abs(known - t) == abs(known - t).min())[0] for t in at]
+    assert nearest_frames(known, at).tolist() == expected
+
+
+def test_a_change_of_duration_scales_rates():
+    demo = swing(np.arange(101) / 50, command_velocity=np.ones((101, 2)))
+    demo = replace(demo, joint_effort=np.ones((101, 2)))
+    slow = set_duration(demo, 5.0)
+    assert (slow.duration, slow.fps) == (pytest.approx(5), pytest.approx(20))
+    np.testing.assert_allclose(slow.joint_velocity, demo.joint_velocity * 0.4)
+    np.testing.assert_allclose(slow.command_velocity, 0.4)
+    np.testing.assert_array_equal(slow.joint_effort, demo.joint_effort)
+    for bad in (0, -1, float("nan")):
+        with pytest.raises(ValueError, match="101 frames cannot be made to last"):
+            set_duration(demo, bad)
+    with pytest.raises(ValueError, match="of 1 frames cannot be made to last 2 s"):
+        set_duration(FRAME, 2)
+
+
+def test_an_image_that_is_late_takes_its_visibility_along():
+    time = np.arange(50) / 50
+    seen = np.arange(50) >= 20
+    demo = swing(time, feature=np.outer(time, [1, 2]), feature_visible=seen, gripper=time)
+    moved = compensate_delay(demo, {"feature": 0.1, "gripper": 0.04})
+    assert len(moved) == 45
+    np.testing.assert_allclose(moved.feature[:, 0], time[5:])
+    np.testing.assert_array_equal(moved.feature_visible, seen[5:])
+    np.testing.assert_allclose(moved.gripper, time[2:47])
+    still = compensate_delay(demo, {"gripper": 0.04})
+    np.testing.assert_array_equal(still.feature_visible, seen[:48])
+    assert len(compensate_delay(demo, {})) == 50
+    assert len(compensate_delay(demo, {"gripper": 0})) == 50
+    with pytest.raises(ValueError, match=r"between 0 and 0\.98 s, got 0\.98"):
+        compensate_delay(demo, {"gripper": demo.duration})
+
+
+def test_the_demonstration_of_median_duration_leads():
+    """Of four the second; the leader and equal motions stay as they are."""
+
+    def motion(seconds):
+        time = np.linspace(0, seconds, 60)
+        return at_speed(np.zeros((60, 1)), time=time, episode=round(10 * seconds))
+
+    def moved(demo):
+        return replace(demo, joint_position=demo.time[:, None] / demo.duration)
+
+    demos = [moved(motion(seconds)) for seconds in (3.0, 1.0, 2.0, 4.0)]
+    aligned = align(DemonstrationSet(demos))
+    for demo in aligned:
+        np.testing.assert_array_equal(demo.time, demos[2].time)
+        np.testing.assert_allclose(demo.joint_position, demos[2].joint_position, atol=1e-9)
+        assert demo.fps == demos[2].fps
+    assert aligned[2] is demos[2]
+
+
+def test_timing_may_differ_by_a_fifth_of_the_duration():
+    """A step at a third of one motion and at two thirds of another: too far to be matched."""
+    time = np.arange(101) / 100
+
+    def step(at):
+        q = np.clip((time - at) * 20, 0, 1)[:, None]
+        return Demonstration(time=time, joint_position=q, joint_names=("a",), fps=100)
+
+    for late, matched in ((0.55, True), (0.75, False)):
+        demos = [step(0.4), replace(step(late), episode=1)]
+        aligned = align(DemonstrationSet(demos))
+        apart = np.abs(aligned[1].joint_position - aligned[0].joint_position).max()
+        assert (apart < 0.2) == matched
+    # Without recorded velocities none are made up.
+    assert aligned[1].joint_velocity is None
+
+
+def test_joints_are_aligned_by_their_own_ranges():
+    """A small joint that tells the timing weighs as much as a large one that rests nearly."""
+    s = np.linspace(0, 1, 101)
+    late = np.interp(s, [0, 0.5, 1], [0, 0.4, 1])
+
+    def demo(phase, size):
+        q = np.stack([size * np.sin(2 * np.pi * phase), 5 * (phase > 2)], axis=1)
+        return Demonstration(time=s, joint_position=q, joint_names=("a", "b"), fps=100)
+
+    for size in (1.0, 1e-3):
+        aligned = align(DemonstrationSet([demo(s, size), demo(late, size)]))
+        apart = np.abs(aligned[1].joint_position - aligned[0].joint_position).max()
+        assert apart < 0.1 * size
