@@ -375,7 +375,7 @@ def fit_delay(
     # Of images of before the first reading nothing is known.
     known = taken - longest >= time[0]
     taken, pixel = taken[known], pixel[known]
-    delays = np.arange(-1, math.ceil(longest / _STEP) + 1) * _STEP
+    delays = np.arange(-1, math.ceil(longest / _STEP) + 2) * _STEP  # and one beyond each end
     rest = np.array(
         [_rest(np.interp(taken - delay, time, position), pixel) for delay in delays]
     )
