@@ -400,3 +400,51 @@ def test_the_far_end_of_a_load_keeps_the_cap_on_the_tool():
 
     assert fastest(Load(far_end=tuple(far_end[:3].tolist()))) == pytest.approx(0.25, rel=0.02)
     assert fastest(Load()) > 0.4
+
+
+def test_a_velocity_holds_to_just_before_its_time_and_not_from_before_a_recovery(box):
+    """In binary fractions of a second, so that the clock is exact."""
+    cycles = loop(box, replace(CONFIG, timeout=0.25))
+    box.now = 10.0
+    for stamp, recovered, holds in (
+        (9.75, -np.inf, False),
+        (9.75 + 2**-20, -np.inf, True),
+        (10.0, 10.0, False),
+        (10.0, 10.0 - 2**-20, True),
+    ):
+        box.order(stamp=stamp, joint_velocity=WANTED)
+        cycles._read_orders()
+        cycles._recovered = recovered
+        np.testing.assert_array_equal(cycles._wanted(), WANTED if holds else np.zeros(7))
+
+
+def test_the_step_is_warm_before_the_arm_waits_for_it(box):
+    steps = []
+    with shapes_unchecked():
+        runner = step_of(fr3, CONFIG)()
+    step = runner.step
+
+    def counted():
+        assert not box.calls, "the arm is connected already"
+        steps.append(bool(runner.observation["stop"]))
+        return step()
+
+    runner.step = counted
+    franka_loop.ControlLoop(box.shared, "arm", CONFIG, runner, os.getppid())
+    assert steps == [True] * 20
+    assert box.calls
+
+
+def test_a_stopped_arm_without_a_connection_is_asked_a_hundred_times_a_second(box):
+    box.command([10])
+    box.at[20] = lambda: (box.command([21]), setattr(box, "failure", NetworkError("gone.")))
+    slept, sleep = [], box.sleep
+
+    def counted(duration):
+        slept.append(duration)
+        sleep(duration)
+
+    box.sleep = counted
+    run(box, 60)
+    assert slept == [0.01] * len(slept)
+    assert len(slept) >= 3

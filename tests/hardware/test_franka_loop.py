@@ -1,5 +1,6 @@
 """The memory between the loop of a Franka arm and who commands it, and its settings."""
 
+import math
 import multiprocessing
 import time
 from dataclasses import dataclass, field
@@ -207,3 +208,52 @@ def test_settings_at_their_ends_are_taken():
     FrankaConfig(dynamics=1.0)
     rod = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0))  # without a width
     assert Load(mass=0.0, inertia=rod, far_end=(0.0, 0.0, 0.3)).centre == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("cost", [0.9e-3, 1e-3])
+def test_an_answer_within_a_cycle_is_given(cost):
+    punctuality = Punctuality()
+    punctuality.late(0.0, 1e-3)
+    assert not punctuality.overdue(cost)
+    assert punctuality.overdue(1.000001e-3)
+
+
+@pytest.mark.parametrize(("moment", "late"), [(2e-3, False), (2.000001e-3, True)])
+def test_a_state_is_late_a_cycle_after_its_period(moment, late):
+    punctuality = Punctuality()
+    assert not punctuality.late(0.0, 1e-3)
+    assert punctuality.late(moment, 1e-3) == late
+
+
+@pytest.mark.parametrize("period", [0.0, -1e-3])
+def test_a_state_without_a_period_is_not_judged(period):
+    punctuality = Punctuality()
+    assert not punctuality.late(0.0, period)
+    assert not punctuality.late(0.5, period)
+    assert not punctuality.late(0.501, 1e-3)
+    assert punctuality.overdue(1.001e-3)  # nothing was learned of the pace
+
+
+@pytest.mark.parametrize(("slowness", "learned"), [(0.5, 1.0), (2.5, 2.5), (10.0, 4.0)])
+@pytest.mark.parametrize("cycles", [40, 300])
+def test_the_pace_of_a_slow_robot_is_learned_by_two_percent_a_cycle(slowness, learned, cycles):
+    punctuality = Punctuality()
+    for k in range(cycles + 1):
+        punctuality.late(1e-3 * slowness * k, 1e-3)
+    pace = 1e-3 * (1 + (learned - 1) * (1 - 0.98**cycles))
+    while punctuality.late(math.nan, 0.0) or punctuality.overdue(0.0):
+        pass  # of two in a row one is answered
+    assert not punctuality.overdue(pace * (1 - 1e-9))
+    assert punctuality.overdue(pace * (1 + 1e-9))
+
+
+def test_a_velocity_that_differs_by_single_precision_came_back():
+    v, one = np.full(7, 0.3), np.eye(7)[2]
+    for off, lost in ((0.99e-5, False), (1.01e-5, True)):
+        assert answer_was_lost(v + off * one, np.zeros(7), v - 1, v) == lost
+        assert answer_was_lost(v - off * one, np.zeros(7), v - 1, v) == lost
+    # The report of before again, by an acceleration that would be seen in a cycle.
+    for off, lost in ((0.5e-9, False), (2e-9, True)):
+        assert answer_was_lost(v, 4.0 * one, v - off * one, v + 0.1) == lost
+    for acceleration, lost in ((0.0101, False), (-0.0101, False), (0.0099, True)):
+        assert answer_was_lost(v, acceleration * one, v, v + 0.1) == lost

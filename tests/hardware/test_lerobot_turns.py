@@ -2,12 +2,19 @@
 
 import math
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hrc_learn.hardware import ArmFaultError, LeRobotArm, LeRobotConfig, lerobot_arm
+from hrc_learn.hardware import (
+    ArmFaultError,
+    LeRobotArm,
+    LeRobotConfig,
+    lerobot_arm,
+    lerobot_device,
+)
 from hrc_learn.hardware.lerobot_arm import led_goal
 from hrc_learn.hardware.lerobot_device import JointUnits, in_words
 from hrc_learn.kinematics.registry import arm as named_arm
@@ -57,7 +64,7 @@ class Servos:
         )
         self.turns = threading.Condition()
         self.waits, self.free, self.main = False, 0, threading.current_thread()
-        self.freed = False
+        self.freed, self.period = False, PERIOD
 
     def get_observation(self):
         with self.turns:
@@ -66,7 +73,7 @@ class Servos:
                 self.turns.notify_all()
                 assert self.turns.wait_for(lambda: self.free or self.freed, PATIENCE)
                 self.waits = False
-                self.clock += self.free * PERIOD
+                self.clock += self.free * self.period
                 self.free = 0
         if self.error is not None:
             raise self.error
@@ -126,7 +133,7 @@ def connect(servos):
     arms = []
 
     def connect(**settings):
-        arms.append(LeRobotArm({}, CHAIN, LeRobotConfig(rate=1 / PERIOD, **settings)))
+        arms.append(LeRobotArm({}, CHAIN, LeRobotConfig(**{"rate": 1 / PERIOD} | settings)))
         return arms[-1]
 
     yield connect
@@ -292,6 +299,141 @@ def test_the_goal_keeps_within_the_description_and_the_calibrated_range(servos, 
         assert servos.goal[joint] == pytest.approx(reached, abs=1e-9)
 
 
+def test_limits_of_time_are_exclusive(servos, connect):
+    """By a clock in 64ths of a second, which is exact."""
+    servos.period = 1 / 64
+    arm = connect(rate=64.0, lag=0.1, blocked=0.25, silence=0.375)
+    servos.turn(65)
+    assert servos.asked == 2  # at once, and after more than half a second
+    servos.blocked = {"elbow_flex.pos"}
+    arm.command(one(2, 1.0))
+    turns = 0
+    while not arm._fault:
+        arm.command(one(2, 1.0))
+        servos.turn()
+        turns += 1
+    # At 0.099 of 0.1 rad after seven turns; a quarter of a second is sixteen more.
+    assert turns == 7 + 17
+    servos.error = TimeoutError("no reply")
+    servos.turn(24)
+    arm.read()
+    servos.turn()
+    with pytest.raises(ArmFaultError, match=r"for 0\.39 s"):
+        arm.read()
+
+
+def test_readings_keep_their_rate_and_are_not_made_up_for_after_a_stall(servos, monkeypatch):
+    begun, readings = servos.clock, []
+    takes = iter([0.0, 0.005, 0.012, 0.07, 0.001, 0.02, 0.003, 0.0])
+
+    class Event(threading.Event):
+        def wait(self, timeout=None):
+            servos.clock += timeout
+            return self.is_set()
+
+    monkeypatch.setattr(
+        lerobot_arm,
+        "threading",
+        SimpleNamespace(Lock=threading.Lock, Thread=threading.Thread, Event=Event),
+    )
+
+    def read():
+        readings.append(servos.clock - begun)
+        servos.clock += next(takes, 0.0)
+        return dict(servos.at)
+
+    monkeypatch.setattr(servos, "get_observation", read)
+    monkeypatch.setattr(Event, "is_set", lambda self: len(readings) >= 8)
+    arm = LeRobotArm({}, CHAIN, LeRobotConfig(rate=50.0))
+    arm._thread.join(PATIENCE)
+    arm.close()
+    # The first is the constructor's. The fourth takes 70 ms: the one that was due meanwhile
+    # comes at once and one more after it, but not all that were missed.
+    expected = [0.0, 0.0, 0.02, 0.04, 0.11, 0.111, 0.131, 0.15]
+    np.testing.assert_allclose(readings, expected, atol=1e-9)
+
+
+def test_a_device_is_tried_three_times_and_its_port_given_back_after_each():
+    made = []
+
+    def make(config):
+        device = SimpleNamespace(released=[])
+        device.bus = SimpleNamespace(disconnect=lambda **how: device.released.append(how))
+
+        def connect(*, calibrate):
+            assert not calibrate
+            if len(made) <= config:
+                raise ConnectionError("no reply")
+
+        device.connect = connect
+        made.append(device)
+        return device
+
+    for failures in (0, 1, 2, 3):
+        made.clear()
+        if failures < 3:
+            assert lerobot_device._connected(make, failures) is made[failures]
+        else:
+            with pytest.raises(ConnectionError, match="no reply"):
+                lerobot_device._connected(make, failures)
+        assert len(made) == min(failures + 1, 3)
+        held = [{"disable_torque": False}]
+        assert [device.released for device in made] == [held] * failures + [[]] * (failures < 3)
+
+
+@pytest.mark.parametrize("kind", ["robot", "teleop"])
+def test_a_device_that_cannot_be_used_says_why(monkeypatch, kind):
+    pytest.importorskip("lerobot")
+    folder, maker = {
+        "robot": ("robots", "make_robot_from_config"),
+        "teleop": ("teleoperators", "make_teleoperator_from_config"),
+    }[kind]
+    device = SimpleNamespace(is_calibrated=True, gone=[], error=None)
+    device.disconnect = lambda: device.gone.append(1)
+
+    def connect(calibrate):
+        if device.error is not None:
+            raise device.error
+
+    device.connect = connect
+    config = SimpleNamespace(id="mine", port="/dev/a")
+    monkeypatch.setattr(lerobot_device, "_config", lambda *_: config)
+    monkeypatch.setattr(f"lerobot.{folder}.utils.{maker}", lambda given: device)
+    open_it = partial(lerobot_device.open_device, kind, {"type": "x"})
+    assert open_it() is device
+    device.is_calibrated = False
+    text = f"--{kind}.type=x has no calibration 'mine'.*lerobot-calibrate --{kind}.type=x "
+    with pytest.raises(ConnectionError, match=f"{text}--{kind}.id=mine first"):
+        open_it()
+    assert device.gone == [1]
+    device.error = OSError("two\nlines")
+    text = rf"--{kind}.type=x cannot be reached at /dev/a \(two lines\): check cable"
+    with pytest.raises(ConnectionError, match=text):
+        open_it()
+    config.port = None
+    with pytest.raises(ConnectionError, match=r"cannot be reached \(two lines\)"):
+        open_it()
+    device.error = ImportError("scservo_sdk")
+    with pytest.raises(ModuleNotFoundError, match=r"maker's SDK: .*; scservo_sdk"):
+        open_it()
+
+
+def test_a_leader_arm_gives_radians_and_the_fraction_of_its_handle(monkeypatch):
+    servos = Servos()
+    servos.get_action = lambda: dict.fromkeys(servos.at, 30.0)
+    opened = []
+    monkeypatch.setattr(
+        lerobot_device, "open_device", lambda *asked: opened.append(asked) or servos
+    )
+    leader = lerobot_device.LeaderArm({"type": "so101_leader"}, NAMES)
+    assert opened == [("teleop", {"type": "so101_leader"})]
+    position, fraction = leader.read()
+    np.testing.assert_allclose(position, math.pi / 6)
+    assert fraction == pytest.approx(0.3)
+    leader.close()
+    assert servos.gone == 1
+
+
 def test_closing_ends_the_thread_and_disconnects(servos):
     arm = LeRobotArm({}, CHAIN)
     servos.let_go()
@@ -383,6 +525,30 @@ class TestUnits:
         assert units.observed(dict.fromkeys(features, 1.0))[1] == 0.0
         assert "gripper.pos" not in units.action(np.zeros(5), 0.5)
         assert units.alarms(bare) == {}
+
+    def test_a_joint_without_range_or_resolution_has_a_unit_only_in_degrees(self):
+        for lacks in ("calibration", "model_resolution_table"):
+            for mode in ("DEGREES", "RANGE_M100_100", "RANGE_0_100"):
+                servos = Servos(mode)
+                setattr(servos.bus, lacks, {})
+                if mode == "DEGREES":
+                    units = JointUnits.of(servos, NAMES)
+                    np.testing.assert_allclose(units.scale, math.pi / 180)
+                    assert np.isinf(units.span).all()
+                    continue
+                with pytest.raises(ValueError, match="is in no calibration"):
+                    JointUnits.of(servos, NAMES)
+        with pytest.raises(ValueError, match="is in no calibration"):
+            JointUnits.of(Servos("RANGE_0_100"), NAMES)
+
+    def test_one_servo_without_the_register_leaves_all_without_a_status(self):
+        servos = Servos()
+        units = JointUnits.of(servos, NAMES)
+        other = SimpleNamespace(model="other")
+        servos.bus.motors = {**servos.bus.motors, "wrist_roll": other}
+        assert units.alarms(servos) == {}
+        servos.bus.motors = {}
+        assert units.alarms(servos) == {}
 
     def test_the_status_comes_from_the_register_that_all_servos_have(self):
         servos, asked = Servos(), []
