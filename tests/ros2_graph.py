@@ -17,21 +17,24 @@ class Graph:
     Attributes:
         listeners: Subscriptions that its publishers count.
         greeting: Joint states that come as soon as it listens.
+        qualities: Quality of service of each topic that it takes or sends.
+        sleeps: Durations for which it was waited [s].
     """
 
     def __init__(self):
         self.takers, self.sent, self.closed = {}, [], False
         self.now, self.listeners, self.greeting = 50.0, 1, [(10.0, READY)]
         self.node, self.trips, self.parameters, self.log = self, [], {}, []
-        self.forms = {}
+        self.forms, self.qualities, self.sleeps = {}, {}, []
 
     def create_subscription(self, kind, topic, take, quality):
-        self.takers[topic] = take
+        self.takers[topic], self.qualities[topic] = take, quality
         if topic.endswith("joint_states"):
             for greeting in self.greeting:
                 self.state(*greeting)
 
     def create_publisher(self, kind, topic, quality):
+        self.qualities[topic] = quality
         return SimpleNamespace(
             topic_name=topic,
             publish=lambda message: self.sent.append((topic, message)),
@@ -84,6 +87,7 @@ class Graph:
         return self.now
 
     def sleep(self, duration):
+        self.sleeps.append(duration)
         self.now += duration
 
     # As the watchdog.
@@ -95,6 +99,23 @@ class Graph:
             feed=lambda: self.trips.append("feed"),
             close=lambda: self.trips.append("close"),
         )
+
+
+def qualities_of(graph):
+    """Whether each topic is reliable and keeps its last message for those that come later.
+
+    All keep one message alone.
+    """
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+    assert {quality.depth for quality in graph.qualities.values()} == {1}
+    return {
+        topic: (
+            quality.reliability == ReliabilityPolicy.RELIABLE,
+            quality.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        for topic, quality in graph.qualities.items()
+    }
 
 
 def stamp(at):

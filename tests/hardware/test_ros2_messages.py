@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from ros2_graph import Graph, stamp
+from ros2_graph import Graph, qualities_of, stamp
 
 from hrc_learn.hardware import ArmFaultError, Ros2Arm, Ros2Config, ros2_arm
 from hrc_learn.kinematics import panda
@@ -238,3 +238,41 @@ def test_a_newer_state_is_waited_for(graph):
 def test_settings_are_checked(settings, message):
     with pytest.raises(ValueError, match=message):
         Ros2Config(**settings)
+
+
+def test_limits_of_time_are_exclusive(graph):
+    """By clocks in binary fractions of a second, which are exact."""
+    arm = position_arm(graph, silence=0.25)
+    graph.state(11.5, READY)
+    graph.state(10.5, READY + 1)  # a whole second back: reordered still
+    assert arm.ignored == 1
+    graph.now = 50.5
+    graph.state(12.0, READY)
+    graph.now += 0.25
+    arm.read()
+    graph.now += 2**-20
+    with pytest.raises(ArmFaultError):
+        arm.read()
+
+
+def test_states_are_the_newest_and_commands_arrive(graph):
+    arm = position_arm(graph, gripper="/hand", gripper_joint="knuckle")
+    assert qualities_of(graph) == {
+        STATES: (False, False),
+        COMMANDS: (True, False),
+        "/hand": (True, False),
+    }
+    assert arm.read().gripper_width == 0.0  # its joint has not been seen
+    arm.close()
+    assert graph.closed
+    assert 0.05 in graph.sleeps  # for the last message to leave
+
+
+def test_controllers_are_waited_for_and_then_missed_by_their_topic(graph):
+    begun, graph.listeners = graph.now, 0
+    text = f"no controller listens on {COMMANDS}: is it active"
+    with pytest.raises(ConnectionError, match=text):
+        position_arm(graph, startup=4.0)
+    assert begun + 4 < graph.now <= begun + 4.03
+    assert set(graph.sleeps) == {0.02}
+    assert graph.closed

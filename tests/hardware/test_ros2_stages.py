@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from ros2_graph import READY, Graph, stamp
+from ros2_graph import READY, Graph, qualities_of, stamp
 from unchecked import shapes_unchecked
 
 from hrc_learn.deploy import EagerRunner
@@ -47,6 +47,7 @@ class Arm:
         )
 
     def wait(self, after, timeout):
+        assert timeout == 0.2 / 4  # of the silence
         with self.waits:
             self.waiting = True
             self.waits.notify_all()
@@ -96,15 +97,16 @@ def node(graph, arm, monkeypatch):
     monkeypatch.setattr(ros2_node, "Ros2Session", lambda name, make: graph)
     monkeypatch.setattr(ros2_node, "Ros2Arm", lambda chain, config: arm)
     monkeypatch.setattr(ros2_node, "time", graph)
-    runners = []
+    runners, controllers = [], []
 
     def make(controller, observation):
+        controllers.append(controller)
         runners.append(EagerRunner(controller, observation))
         return runners[-1]
 
     with shapes_unchecked():
         node = ros2_node.ControllerNode(panda.chain, Ros2Config(silence=0.2), None, make)
-        node.runners = runners
+        node.runners, node.controllers = runners, controllers
         yield node
         node.close()
 
@@ -178,9 +180,10 @@ def test_the_tool_goes_to_the_box_of_a_goal_within_the_caps_that_are_parameters(
     assert box.type == box.CUBE
     assert path.type == path.LINE_STRIP
     assert box.id != path.id
-    assert box.color.b > box.color.r
-    assert path.color.r > path.color.b
-    assert 0 < box.color.a < path.color.a == 1
+    colours = [[getattr(one.color, part) for part in "rgba"] for one in (box, path)]
+    np.testing.assert_allclose(colours, [[0.2, 0.6, 1.0, 0.3], [1.0, 0.6, 0.1, 1.0]], rtol=1e-6)
+    assert path.scale.x == 0.004
+    assert (box.id, path.id) == (0, 1)
     shown = len(sent(graph, "~/markers"))
     assert 12 <= shown <= 15  # one in 0.1 s of 1.46 s
     assert len(path.points) == shown
@@ -267,7 +270,7 @@ def test_a_target_switches_vision_on_and_none_off_and_pushes_have_their_size(
     np.testing.assert_array_equal(values["nullspace_input"], push)
 
 
-@pytest.mark.parametrize("marker", [7.0, -1.0])
+@pytest.mark.parametrize("marker", [7.0, 0.0, -1.0])
 def test_a_marker_in_an_image_is_the_feature_if_one_is_looked_for(graph, arm, node, marker):
     import cv2
     from sensor_msgs.msg import CompressedImage
@@ -277,7 +280,7 @@ def test_a_marker_in_an_image_is_the_feature_if_one_is_looked_for(graph, arm, no
     values = node.runners[-1].observation
     arm.turn()
     drawn = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    for number, seen in ((7, True), (8, False)):
+    for number, seen in ((max(round(marker), 0), True), (8, False)):
         image = np.full((240, 320), 255, np.uint8)
         image[100:180, 150:230] = cv2.aruco.generateImageMarker(drawn, number, 80)
         data = cv2.imencode(".png", image)[1].tobytes()
@@ -357,3 +360,98 @@ def test_parameters_are_described_with_their_range(graph, node):
         assert form.description == text
         (bounds,) = form.floating_point_range
         assert (bounds.from_value, bounds.to_value) == (low, high)
+
+
+def test_limits_of_time_are_exclusive(graph, arm, node):
+    """By a clock in 64ths of a second, which is exact."""
+    graph.parameters["heartbeat"].value = 0.25
+    assert node.start()
+    for _ in range(16):
+        arm.turn(1 / 64)
+    assert node.stopped == ""  # a quarter of a second without a heartbeat
+    assert len(arm.commands) == 16
+    # Markers in the first step, and in those more than 0.1 s after the last: each seventh.
+    assert len(sent(graph, "~/markers")) == 3
+    arm.turn(1 / 64)
+    for _ in range(2000):
+        if node.stopped:
+            break
+        threading.Event().wait(0.01)
+    assert node.stopped == "no heartbeat for 0.27 s: send ~/heartbeat"
+
+
+def test_diagnostics_come_each_second(graph, arm, node, values):
+    # In the first step, and in those more than a second after the last: each fifth.
+    for k in range(12):
+        arm.turn(0.25)
+        assert len(sent(graph, "/diagnostics")) == 1 + k // 5
+
+
+def test_activating_forgets_goals_features_and_pushes(graph, arm, node, values):
+    from std_msgs.msg import Float64MultiArray
+
+    graph.takers["~/goal"](goal_at(CENTRE + 0.1, [0, 1, 0, 0]))
+    graph.takers["~/target"](marked(320.0, 240.0))
+    graph.takers["~/push"](Float64MultiArray(data=[1.0] * 7))
+    arm.turn()
+    graph.takers["~/feature"](marked(310.0, 220.0))
+    graph.trigger_deactivate()
+    assert "stop" in arm.calls
+    arm.calls.clear()
+    arm.q = READY + 0.05
+    graph.parameters["region_size"].value = 0.03
+    assert graph.trigger_activate() == node._done.SUCCESS
+    pose = panda.chain.forward(arm.q)
+    np.testing.assert_allclose(values["goals.position.centre"], pose.position.numpy())
+    np.testing.assert_allclose(values["goals.orientation.goal"], pose.orientation.numpy())
+    np.testing.assert_array_equal(values["goals.position.half_size"], [0.03] * 3)
+    np.testing.assert_array_equal(values["nullspace_input"], np.zeros(7))
+    assert values["goals.vision_enabled"] == values["feature_visible"] == 0
+    assert arm.calls == ["recover"]
+
+
+def test_the_step_begins_with_the_parameters_and_the_image_jacobian_of_the_paper(graph, node):
+    from hrc_learn.controller import INITIAL_IMAGE_JACOBIAN
+
+    settings = {"linear_speed": 0.2, "angular_speed": 0.7, "tcp_speed": 0.4, "null_damping": 9}
+    for name, value in settings.items():
+        graph.parameters[name].value = float(value)
+    assert graph.trigger_configure() == node._done.SUCCESS
+    (runner,), (controller,) = node.runners, node.controllers
+    config = controller.config
+    found = [config.linear_speed, config.angular_speed, config.safety.tcp_speed]
+    assert [*found, config.null_damping] == list(settings.values())
+    assert runner.observation["dt"] == 0.002
+    network = controller.estimator.network
+    assert float(network.width) == pytest.approx(0.1)
+    first = np.ravel(INITIAL_IMAGE_JACOBIAN)
+    for weights in network.weight.detach().numpy().T:  # of every neuron
+        np.testing.assert_allclose(weights, first)
+
+
+def test_states_and_features_are_the_newest_and_commands_arrive(graph, node):
+    assert {topic: reliable for topic, (reliable, _) in qualities_of(graph).items()} == {
+        "~/goal": True,
+        "~/region": True,
+        "~/target": True,
+        "~/feature": False,
+        "~/image": False,
+        "~/image/compressed": False,
+        "~/push": False,
+        "~/heartbeat": False,
+        "/diagnostics": True,
+        "~/markers": True,
+    }
+
+
+def test_latencies_are_percentiles_in_milliseconds_of_the_newest(node):
+    rng = np.random.default_rng(0)
+    times = rng.exponential(2e-3, size=700)
+    node.latencies.extend(times)
+    for recent in (0, 500, 1):
+        figures = node.figures(recent)
+        chosen = 1e3 * times[-recent:]
+        assert figures["commands"] == 700
+        assert figures["latency_p50_ms"] == pytest.approx(np.median(chosen))
+        assert figures["latency_p99_ms"] == pytest.approx(np.quantile(chosen, 0.99))
+        assert figures["latency_p100_ms"] == chosen.max()
