@@ -34,6 +34,17 @@ WORKPLACE = Workplace()
 REACH = (0.1, 0.08)
 
 
+class Changed:
+    """The panda with a hand of another size, or with slower joints."""
+
+    def __init__(self, size=1.0, velocity=1.0):
+        self.hand_size = size
+        self.limits = replace(panda.limits, velocity=velocity * panda.limits.velocity)
+
+    def __getattr__(self, name):
+        return getattr(panda, name)
+
+
 def constant(furniture, itself):
     return lambda q: (furniture + 0 * q[..., 0], itself + 0 * q[..., 0])
 
@@ -75,11 +86,9 @@ def starts():
     return torch.stack([WORKPLACE.home_joints(), WORKPLACE.home_joints(q7_offset=0.3)])
 
 
-@pytest.mark.parametrize(
-    ("order", "clear"), [((0, 1, 2, 3), 1.0), ((0, 1, 2, 3), 0.1), ((0, 3, 0, 3, 0, 3), 1.0)]
-)
-def test_a_path_is_as_good_as_its_worst_sample_and_as_fast_as_the_job_asks(order, clear):
-    points = WORKPLACE.path_to_shelf("upper")[list(order)]
+@pytest.mark.parametrize(("slower", "clear"), [(1.0, 1.0), (1.0, 0.1), (1.0, -0.1), (0.2, 1.0)])
+def test_a_path_is_as_good_as_its_worst_sample_and_as_fast_as_the_job_asks(slower, clear):
+    points, arm = WORKPLACE.path_to_shelf("upper"), Changed(velocity=slower)
     ends = np.append(0, np.cumsum(np.linalg.norm(np.diff(points.numpy(), axis=0), axis=1)))
     at = np.linspace(0, ends[-1], 60)
     position = np.stack([np.interp(at, ends, column) for column in points.numpy().T], axis=-1)
@@ -88,12 +97,12 @@ def test_a_path_is_as_good_as_its_worst_sample_and_as_fast_as_the_job_asks(order
     q, error = follow_poses(panda, path, starts())
     # Largest speed of a minimum-jerk motion of 14 s along 60 samples.
     speed = np.abs(np.diff(q.numpy(), axis=0)).max(axis=0) * 60 * 1.875 / 14
-    load = (speed / panda.limits.velocity.numpy()).max(-1)
+    load = (speed / (slower * panda.limits.velocity.numpy())).max(-1)
     expected = quality(q, error, clear).min(axis=0) * np.minimum(1, 0.8 / load)
-    assert expected.max() > 0.05
-    assert (load > 0.8).any() == (len(order) > 4)
+    assert (expected.max() > 0.02) == (clear > 0)
+    assert (load > 0.8).all() == (slower < 1)
     clearances = constant(0.04 * clear, 1.0)
-    found = path_quality(panda, clearances, points, WORKPLACE.level_at, starts())
+    found = path_quality(arm, clearances, points, WORKPLACE.level_at, starts())
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
@@ -212,10 +221,9 @@ def test_a_nearer_table_keeps_its_height_and_a_shifted_cabinet_its_width():
 
 
 def test_a_smaller_hand_works_in_a_smaller_place():
-    arm = replace(SceneConfig().arm, robot=HALF)
+    arm = replace(SceneConfig().arm, robot=Changed(size=0.5))
     usual = replace(SceneConfig(), arm=arm)
     whole, half = (_placed(scene, 0.8, 0.1, 0.1, 0.1) for scene in (SceneConfig(), usual))
-    assert HALF.hand_size == pytest.approx(0.5)
     names = ("table_centre", "shelf_x", "hover_height", "fingertip", "palm", "clearance")
     for name in (*names, "approach", "shelf_depth", "level_at"):
         np.testing.assert_allclose(
@@ -232,18 +240,6 @@ def test_a_smaller_hand_works_in_a_smaller_place():
     np.testing.assert_allclose(half.scaled((0.2, 0.4, 0.6)), (0.1, 0.2, 0.3))
     front, goal = (half.path_to_shelf("upper", lift)[1, 2] for lift in (0.03, 0.0))
     assert front - goal == pytest.approx(0.015)
-
-
-class HalfHand:
-    """The panda with a hand of half the size."""
-
-    hand_size = 0.5
-
-    def __getattr__(self, name):
-        return getattr(panda, name)
-
-
-HALF = HalfHand()
 
 
 def test_beside_the_first_axis_cabinet_home_and_shelves_lie_in_one_plane():
