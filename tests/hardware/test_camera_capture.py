@@ -139,6 +139,7 @@ def test_what_does_not_open_is_named_with_a_hint(backend, source, hint):
 def test_the_newest_image_is_rgb_with_its_age_until_it_is_too_old(backend, camera):
     np.testing.assert_array_equal(camera.read(), BGR[..., ::-1])
     assert camera.age == 0.25
+    assert camera._thread.daemon  # a program that forgets to close it may end
     backend.show(BGR + 100)
     backend.show(BGR + 200)
     backend.now += 0.1

@@ -33,6 +33,7 @@ class Thread(threading.Thread):
     killed = False
 
     def __init__(self, *, target, args, name, daemon):
+        assert daemon  # it ends with the program
         connection, *arguments = args
         own = Connection(os.dup(connection.fileno()))
 
@@ -259,3 +260,61 @@ def test_a_library_that_is_missing_is_named_with_the_advice(monkeypatch):
     monkeypatch.setitem(sys.modules, "no_such_driver", None)
     with pytest.raises(ImportError, match=r"pip install it \(.*no_such_driver.*\)"):
         imported("no_such_driver", "pip install it")
+
+
+def test_an_arm_has_a_minute_to_rest_and_its_process_a_second_to_end():
+    calls = []
+    process = ArmProcess(Arm, timeout=0.5)
+    driver = process._driver
+    process._driver = SimpleNamespace(
+        call=lambda name, timeout: calls.append((name, timeout)) or True,
+        end=lambda timeout: calls.append(timeout),
+    )
+    process.close()
+    assert calls == [("close", 60.5), 1.5]
+    driver.end(PATIENCE)
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_a_process_is_killed_if_it_hangs_and_only_then(hangs):
+    let, arm = threading.Event(), Arm()
+    process = ArmProcess(lambda: arm, timeout=0.05 if hangs else PATIENCE)
+    driver = process._driver
+    if hangs:
+        arm.read = let.wait
+        with pytest.raises(WatchdogError):
+            process.read()
+        threading.Timer(0.05, let.set).start()
+    driver.end(0.01 if hangs else PATIENCE)
+    assert driver.process.killed == hangs
+    with pytest.raises(WatchdogError, match="has not answered" if hangs else "is closed"):
+        process.read()
+
+
+def test_an_answer_to_an_earlier_call_is_passed_over():
+    """As after a signal that has cut off the wait for it."""
+    ours, theirs = driver_process.multiprocessing.Pipe()
+    driver = object.__new__(driver_process.DriverProcess)
+    driver._name, driver._lost, driver._number, driver.news = "arm", "", 7, 0
+    driver._calling, driver._connection = threading.Lock(), ours
+    for number, value, news in ((6, "late", 1), (7, "interrupted", 2), (8, "now", 3)):
+        theirs.send((number, value, "", news))
+    assert driver.call("read", 5) == "now"
+    assert theirs.recv() == (8, "read", 5)
+    assert driver.news == 3
+    theirs.close()
+    for _ in range(2):
+        with pytest.raises(WatchdogError, match="the process of the arm has ended"):
+            driver.call("read", timeout=PATIENCE)
+
+
+def test_patience_with_an_arm_that_does_not_stop_is_five_seconds_unless_told(monkeypatch):
+    waited = []
+    monkeypatch.setattr(
+        driver_process, "bring_to_rest", lambda stop, patience: waited.append(patience) or True
+    )
+    with ending_at_rest(lambda: None):
+        pass
+    with ending_at_rest(lambda: None, patience=7.0):
+        pass
+    assert waited == [5.0, 7.0]

@@ -62,6 +62,10 @@ class Box:
         self.q, self.v, self.a = fr3.ready.numpy().copy(), np.zeros(7), np.zeros(7)
         self.moves, self.answered, self.failure, self.shared = False, True, None, Shared()
 
+    def schedule(self, thread, policy, parameters):
+        assert (thread, policy) == (0, os.SCHED_FIFO)
+        assert parameters.sched_priority == os.sched_get_priority_max(os.SCHED_FIFO)
+
     def order(self, **orders):
         self.shared.orders.write(Orders(**orders))
 
@@ -155,7 +159,7 @@ def box(monkeypatch):
     box = Box()
     monkeypatch.setattr(franka_loop, "time", box)
     monkeypatch.setattr(franka_loop, "import_pylibfranka", lambda: box)
-    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: None)
+    monkeypatch.setattr(os, "sched_setscheduler", box.schedule)
     return box
 
 

@@ -39,6 +39,7 @@ class Loop:
         return self
 
     def Process(self, *, target, args, name, daemon):
+        assert daemon  # it ends with the program
         self.shared = args[0]
         return self
 
@@ -314,3 +315,72 @@ def test_only_arms_of_seven_joints_are_driven():
     )
     with pytest.raises(ValueError, match="7 joints"):
         FrankaArm("127.0.0.1", short, CONFIG)
+
+
+@pytest.mark.parametrize(("lockstep", "longest"), [(False, 0.2), (True, 2.0)])
+def test_a_reading_may_be_as_old_as_its_limit(loop, lockstep, longest):
+    arm = FrankaArm("arm", fr3, replace(CONFIG, lockstep=lockstep))
+    loop.now = 0.0
+    loop.publish()
+    loop.now = longest
+    arm.read()
+    loop.now = math.nextafter(longest, 3)
+    with pytest.raises(DriverError, match="something holds its process up"):
+        arm.read()
+
+
+def test_what_is_waited_for_may_come_at_the_last_moment(loop, arm):
+    loop.now, loop.pause = 0.0, 1.0
+    loop.publish(phase=Phase.FAULTED)
+    loop.turn = lambda orders: loop.now == 16 and loop.publish(recoveries=1, phase=Phase.IDLE)
+    arm.recover()  # a look at 15 s is the last but one
+    loop.now = 0.0
+    loop.publish(phase=Phase.FAULTED)
+    loop.turn = lambda orders: None
+    with pytest.raises(DriverError, match="cannot recover within 15 s"):
+        arm.recover()
+    assert loop.now == 16.0
+
+
+def test_a_joint_at_just_the_speed_of_rest_moves(loop, arm):
+    """0.0004 rad in 0.02 s, by readings at exact times."""
+    times = {0: (0.0, 0.0), 1: (0.02, 0.0004), 2: (0.0625, 0.0004)}
+    turns = iter(range(1, 20))
+    loop.publish(resting=True, time=0.0, joint_position=np.zeros(7))
+
+    def turn(orders):
+        time, way = times[min(next(turns), 2)]
+        loop.publish(time=time, joint_position=way * np.eye(7)[6])
+
+    loop.turn = turn
+    arm.stop()
+    assert next(turns) == 3  # at rest by the second reading
+
+
+def test_a_gripper_of_the_driver_has_the_settings_and_reports_its_width(loop, monkeypatch):
+    opened = []
+
+    class Gripper:
+        width, closed = 0.03, False
+
+        def __init__(self, open_driver, startup):
+            opened.append((open_driver, startup))
+
+        def close(self):
+            self.closed = True
+
+        def move(self, width):
+            opened.append(width)
+
+    monkeypatch.setattr(franka_arm, "GripperThread", Gripper)
+    config = replace(CONFIG, gripper=True, grip_speed=0.07, grip_force=33.0)
+    with FrankaArm("arm", fr3, config) as arm:
+        assert arm.read().gripper_width == 0.03
+        arm.move(0.05)
+        gripper = arm.gripper
+    assert gripper.closed
+    (open_process, startup), width = opened
+    assert (startup, width) == (60.0, 0.05)
+    (hand,) = open_process.args
+    assert hand.func is franka_arm.FrankaHand
+    assert (hand.args, hand.keywords) == (("arm",), {"speed": 0.07, "force": 33.0})

@@ -116,7 +116,8 @@ def franky(monkeypatch):
     franky = Franky()
     monkeypatch.setattr(franky_arm, "imported", lambda *_: franky)
 
-    def schedule(_, policy, parameters):
+    def schedule(thread, policy, parameters):
+        assert thread == 0  # the one that calls
         franky.scheduling = (policy, parameters)
 
     monkeypatch.setattr(os, "sched_setscheduler", schedule)
@@ -297,3 +298,23 @@ def test_the_gripper_moves_and_squeezes_with_the_settings(franky, arm):
                 break
             threading.Event().wait(0.01)
         assert call in franky.calls
+
+
+@pytest.mark.parametrize("mode", ["Idle", "Move"])
+def test_an_arm_that_is_ready_is_connected_to(franky, mode):
+    franky.mode = Franky.RobotMode[mode]
+    with FrankyArm("arm", FrankyConfig(realtime=False, timeout=0.0625)) as arm:
+        arm.command(np.zeros(7))
+        assert ("move", (*[0.0] * 7, 62)) in franky.calls  # milliseconds
+
+
+def test_the_gripper_moves_at_its_speed_and_squeezes_whatever_is_there(franky):
+    config = FrankyConfig(realtime=False, grip_speed=0.05, grip_force=17.0)
+    gripper = franky_arm._FrankyGripper(franky, "arm", config)
+    assert gripper.read_width() == 0.06
+    assert gripper.move(0.03)
+    assert gripper.squeeze()
+    assert franky.calls == [
+        ("fingers", 0.03, 0.05),
+        ("fingers", 0.0, 0.05, 17.0, {"epsilon_outer": 1.0}),
+    ]

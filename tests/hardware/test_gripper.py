@@ -1,10 +1,13 @@
 """A gripper on its threads: what is asked for, told and waited for."""
 
 import threading
+from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 
 from hrc_learn.hardware import GripperError
+from hrc_learn.hardware import gripper as gripper_module
 from hrc_learn.hardware.gripper import GripperThread
 
 PATIENCE = 20.0
@@ -184,3 +187,76 @@ def test_its_threads_end_with_it(driver):
     threads = gripper._threads
     gripper.close()
     assert not any(thread.is_alive() for thread in threads)
+    assert all(thread.daemon for thread in threads)  # a program that forgets it may end
+
+
+def test_a_width_of_exactly_the_narrowest_is_moved_to(driver, gripper):
+    for width, call in (
+        (0.005, ("move", 0.005)),
+        (0.0, ("squeeze",)),
+        (0.005, ("move", 0.005)),
+    ):
+        gripper.move(width)
+        assert driver.begun.acquire(timeout=PATIENCE)
+        driver.let.release()
+        assert driver.calls[-1] == call
+    # What differs by less is the same.
+    gripper.move(0.0099)
+    assert gripper._last == 0.005
+
+
+def test_it_is_read_fifty_times_a_second_and_connected_again_each_second(driver, monkeypatch):
+    waits, open_it = [], []
+
+    class Condition(threading.Condition):
+        def wait_for(self, reached, longest=None):
+            waits.append(longest)
+            return super().wait_for(reached, longest and min(longest, 0.01))
+
+    class Opening(threading.Condition):
+        """Its first wait is the constructor's."""
+
+        def wait_for(self, reached, longest=None):
+            waits.append(longest)
+            found = super().wait_for(reached, longest and min(longest, PATIENCE / 10))
+            if longest == PATIENCE:
+                open_it.append(found)
+            return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(gripper_module.threading, "Condition", Opening)
+        gripper = GripperThread(lambda: driver, startup=PATIENCE)
+    assert open_it == [True]  # by the reading, not by the time
+    wait_until(lambda: waits.count(0.02) > 2)
+    assert set(waits) == {None, 0.02, PATIENCE}
+    gripper.close()
+    waits.clear()
+    monkeypatch.setattr(gripper_module.threading, "Condition", Condition)
+    gripper = GripperThread(lambda: driver)
+    driver.broken = True
+    wait_until(lambda: waits.count(1.0) > 2)
+    gripper.close()
+
+
+def test_a_gripper_opened_while_it_is_closed_is_closed_again():
+    begun, let, closed = threading.Event(), threading.Event(), []
+
+    def open_it():
+        begun.set()
+        assert let.wait(PATIENCE)
+        return SimpleNamespace(close=lambda: closed.append(1), read_width=lambda: 0.0)
+
+    def construct():
+        with suppress(GripperError):
+            GripperThread(open_it, startup=0.01)
+
+    opening = threading.Thread(target=construct)
+    opening.start()
+    assert begun.wait(PATIENCE)
+    wait_until(lambda: any(t.name == "gripper reader" for t in threading.enumerate()))
+    reader = next(t for t in threading.enumerate() if t.name == "gripper reader")
+    wait_until(lambda: not any(t.name == "gripper mover" for t in threading.enumerate()))
+    let.set()
+    reader.join(PATIENCE)
+    opening.join(PATIENCE)
+    assert closed == [1]

@@ -436,6 +436,7 @@ def test_a_leader_arm_gives_radians_and_the_fraction_of_its_handle(monkeypatch):
 
 def test_closing_ends_the_thread_and_disconnects(servos):
     arm = LeRobotArm({}, CHAIN)
+    assert arm._thread.daemon  # a program that forgets to close it may end
     servos.let_go()
     arm.close()
     assert servos.gone == 1

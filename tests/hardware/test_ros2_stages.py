@@ -369,6 +369,7 @@ def test_limits_of_time_are_exclusive(graph, arm, node):
     for _ in range(16):
         arm.turn(1 / 64)
     assert node.stopped == ""  # a quarter of a second without a heartbeat
+    assert node._thread.daemon
     assert len(arm.commands) == 16
     # Markers in the first step, and in those more than 0.1 s after the last: each seventh.
     assert len(sent(graph, "~/markers")) == 3

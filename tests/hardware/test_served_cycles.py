@@ -122,6 +122,7 @@ def test_a_world_steps_in_cycles_while_it_is_served(link):
         assert server.address == "127.1.2.3"
         assert link.calls == ["init"]
         assert server.cycles == 0
+        assert server._thread.daemon
     assert link.model.opt.timestep == 0.002
     assert link.calls == ["init", "cleanup", "reset", "hand"]
 
