@@ -83,7 +83,7 @@ class Field:
 
     def numbers(self) -> Shaped[np.ndarray, "_frames _components"]:
         """All frames as rows of numbers."""
-        return np.asarray(self.read(0, self.frames), np.float64).reshape(self.frames, -1)
+        return np.asarray(self.read(0, self.frames), float).reshape(self.frames, self.width)
 
 
 @dataclass(frozen=True, kw_only=True)
