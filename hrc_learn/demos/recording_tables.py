@@ -61,7 +61,7 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     if not rows:
         raise DatasetError("holds a header and no numbers", file=path)
     width = len(_split(rows[0][1], delimiter))
-    if len(header) == width - 1:
+    if header and len(header) == width - 1:
         header = ["", *header]  # R and pandas name no column of row numbers
     names = header or list(columns) or [str(place) for place in range(width)]
     if len(names) != width:

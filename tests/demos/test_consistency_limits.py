@@ -1,6 +1,7 @@
 """Comparisons between episodes, on statistics at both sides of every limit."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -601,3 +602,37 @@ def test_positions_that_follow_at_once_are_not_examined():
         EpisodeProfile(entry=entry(0), columns={}, tracking={"command_position": tracking()})
     ]
     assert [*checks.velocity_commands(COMMAND, profiles, 50)] == []
+
+
+@pytest.mark.parametrize("scale", [0.02, 30.0])
+def test_other_units_make_no_other_findings(scale):
+    """Values of all episodes in another unit: nothing changes but the figures that are said."""
+    values = ("levels", "start", "goal", "step", "noise", "low", "high")
+
+    def scaled(one):
+        return replace(one, **{name: getattr(one, name) * scale for name in values})
+
+    def found(check, *given, **options):
+        own = feature([*given], **options)
+        other = feature([scaled(one) for one in given], **options)
+        once, twice = ([(i.episode, i.components) for i in check(f)] for f in (own, other))
+        assert once == twice
+        return bool(once)
+
+    usual = (RISING, FALLING, ARCH)
+    odd = {
+        True: (profile(noise=0.0101), profile(distinct=19), profile(held=16)),
+        False: (profile(noise=0.0099), profile(distinct=20), profile(held=15)),
+    }
+    for told, (noisy, coarse, held) in odd.items():
+        assert found(checks.noise, *alike(noisy)) == told
+        assert found(checks.noise, *alike(coarse)) == told
+        assert found(checks.holds, *alike(held)) == told
+    switched = [gripper(0, 1)] * 4
+    for start, goal, told in ((0.91, 0.09, True), (0.89, 0, False), (1, 0.11, False)):
+        given = (*switched, gripper(start, goal))
+        assert found(checks.switches, *given, smooth=False) == told
+    same = [figures(*usual)] * 4
+    for column, told in ((moved(RISING, 0.46), True), (moved(RISING, 0.44), False)):
+        odd_one = figures(column, FALLING, ARCH)
+        assert found(checks.exchanged_columns, *same, odd_one) == told
