@@ -38,6 +38,7 @@ if (location.protocol === "file:") {
   window.Worker = function () { return new Native(URL.createObjectURL(source)) }
 }
 """
+LINE_ANCHOR = re.compile(r'<a id="__codelineno-[^>]*></a>')
 COLOUR = re.compile(r"\x1b\[[\d;]*m")
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
@@ -260,6 +261,9 @@ def stage(root: Path, folder: Path) -> list:
         (folder / name).write_text(text, "utf-8")
     if (root / "docs" / "images").exists():
         shutil.copytree(root / "docs" / "images", folder / "images")
+    for name in ("site.css", "site.js"):
+        if (root / "docs" / name).exists():
+            shutil.copy2(root / "docs" / name, folder)
     # Pages of classes are reached from their package, by links and by search.
     packages = [
         {name.removeprefix(f"{PACKAGE}."): f"api/{name}.md"}
@@ -291,7 +295,8 @@ def search_from_disk(site: Path) -> None:
     for page in site.rglob("*.html"):
         up = "../" * (len(page.relative_to(site).parts) - 1)
         ours = f'src="{up}assets/javascripts/worker_from_blob.js"'
-        html = REMOTE_SHIM.sub(ours, page.read_text("utf-8"))
+        # The anchor of each line of code is a link without a name to keyboards and readers.
+        html = LINE_ANCHOR.sub("", REMOTE_SHIM.sub(ours, page.read_text("utf-8")))
         if remote := REMOTE.search(html):
             raise SystemExit(f"{page.name} would load {remote[1]} from the network")
         page.write_text(html, "utf-8")

@@ -1,5 +1,7 @@
-"""Pages of runs under axe, an automatic checker of accessibility, on phone and desktop."""
+"""Pages of runs and of the site under axe, a checker of accessibility, on phone and desktop."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -42,10 +44,15 @@ def report(title: str) -> Report:
     )
 
 
-@pytest.mark.parametrize("runs", [1, 2])
-def test_reports_are_accessible_and_fit_a_phone(runs, tmp_path):
+@pytest.fixture(scope="module")
+def axe():
     if not AXE.is_file():
         pytest.skip(f"no axe-core: run npm ci in {CLIENT}")
+    return AXE.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_reports_are_accessible_and_fit_a_phone(axe, runs, tmp_path):
     page = tmp_path / "report.html"
     content = reports_page("Runs", [report(f"Run {i}") for i in range(runs)])
     page.write_text(content, encoding="utf-8")
@@ -57,6 +64,33 @@ def test_reports_are_accessible_and_fit_a_phone(runs, tmp_path):
                 tab.goto(page.as_uri())
                 tab.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
                 assert tab.evaluate("document.documentElement.scrollWidth") <= width
-                tab.evaluate(AXE.read_text(encoding="utf-8"))
+                tab.evaluate(axe)
                 found = tab.evaluate("axe.run()")["violations"]
                 assert [(v["id"], v["nodes"][0]["html"]) for v in found] == []
+
+
+def test_the_site_has_no_serious_fault_and_fits_a_phone(axe, tmp_path):
+    root = Path(__file__).parents[2]
+    build = [sys.executable, root / "tools" / "build_docs.py", "--out", tmp_path / "site"]
+    subprocess.run(build, check=True)
+    names = ("index", "tutorial", "howto/index", "benchmarks/dmp", "api/hrc_learn.dmp")
+    with chromium(tmp_path / "profile") as tab:
+        for name in names:
+            for width in (390, 1280):
+                for scheme in ("default", "slate"):
+                    tab.set_viewport_size({"width": width, "height": 844})
+                    tab.goto((tmp_path / "site" / f"{name}.html").as_uri())
+                    # Colours that fade to the other scheme would be measured on their way.
+                    tab.evaluate(
+                        "document.head.appendChild(document.createElement('style')).textContent"
+                        " = '* {transition: none !important}'"
+                    )
+                    tab.evaluate(f"document.body.dataset.mdColorScheme = '{scheme}'")
+                    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+                    tab.evaluate(axe)
+                    found = tab.evaluate("axe.run()")["violations"]
+                    assert [
+                        (name, v["id"], v["nodes"][0]["html"])
+                        for v in found
+                        if v["impact"] in {"serious", "critical"}
+                    ] == []
