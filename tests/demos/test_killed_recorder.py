@@ -1,4 +1,4 @@
-"""Episodes that LeRobot's recorder saved before it was killed are recovered, value by value."""
+"""Episodes that LeRobot's recorder saved before it ended early come back, value by value."""
 
 import itertools
 import json
@@ -116,6 +116,59 @@ def test_nothing_saved_is_said(root, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def fail_to_save(root, index, *, again, listed):
+    """Leave what the recorder leaves after the save of an episode fails; it went on or ended.
+
+    The rows of the episode are there. If it is recorded `again`, the new one has its index.
+    """
+    (lists,) = (root / "meta/episodes").glob("*/*.parquet")
+    (file,) = (root / "data").glob("*/*.parquet")
+    rows, table = pq.read_table(lists), pq.read_table(file)
+    begin, end = (rows[f"dataset_{edge}_index"][index].as_py() for edge in ("from", "to"))
+    if again:
+        failed = table.slice(begin, end - begin - 7)  # the operator began anew
+        spoilt = pa.array((np.array(failed["action"].to_pylist()) + 1.0).tolist())
+        place = failed.schema.get_field_index("action")
+        failed = failed.set_column(place, "action", spoilt.cast(failed["action"].type))
+        table = pa.concat_tables([table.slice(0, begin), failed, table.slice(begin)])
+    else:
+        rows = rows.slice(0, index)
+        info = json.loads((root / "meta/info.json").read_text())
+        info |= {"total_episodes": index, "total_frames": begin}
+        (root / "meta/info.json").write_text(json.dumps(info))
+    pq.write_table(table, file)
+    if listed:
+        pq.write_table(rows, lists)
+    else:
+        lists.unlink()
+
+
+@pytest.mark.parametrize("listed", [True, False])
+@pytest.mark.parametrize(("index", "again"), [(4, False), (2, True), (0, True)])
+def test_an_episode_whose_save_failed_takes_no_other_along(
+    root, tmp_path, index, again, listed
+):
+    before = load_demos(root)
+    fail_to_save(root, index, again=again, listed=listed)
+    found = check_dataset(root)
+    assert "hrc repair recovers" in str(found.errors[0])
+    report = repair_dataset(root, tmp_path / "out", AS_IT_IS)
+    assert ("1 episode whose save failed" if listed else "is missing") in str(report)
+    assert "episodes lost: 0" in str(report)
+    same(load_demos(tmp_path / "out"), before)
+    assert check_dataset(tmp_path / "out").ok
+
+
+def test_repeated_frames_are_no_failed_save(root, tmp_path):
+    (file,) = (root / "data").glob("*/*.parquet")
+    table = pq.read_table(file)
+    pq.write_table(
+        pa.concat_tables([table.slice(0, 20), table.slice(10, 10), table[20:]]), file
+    )
+    with pytest.raises(DatasetError, match="the list of episodes promises"):
+        repair_dataset(root, tmp_path / "out", AS_IT_IS)
+
+
 @pytest.mark.parametrize("rows", [(3,), (1, 400, 7), (25_000,)])
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
 def test_a_new_footer_gives_every_kind_of_column_back(rows, version):
@@ -195,3 +248,64 @@ def test_lerobot_loads_what_its_killed_recorder_had_saved(kind, tmp_path):
                 level = 255 * float(frame["observation.images.front"].mean())
                 assert level == pytest.approx(20 * episode + k, abs=4)
         row += 40 + episode
+
+
+FAILED = """
+import sys
+import numpy as np
+from lerobot.datasets import LeRobotDataset
+root, ending = sys.argv[1:]
+names = [f"joint{i}.pos" for i in range(1, 7)]
+features = {key: {"dtype": "float32", "shape": (6,), "names": names}
+            for key in ("action", "observation.state")}
+dataset = LeRobotDataset.create("local/x", 30, features, root=root, use_videos=False)
+def record(take):
+    for k in range(40 + take):
+        state = np.sin(0.05 * k + np.arange(6, dtype=np.float32)) + np.float32(take)
+        dataset.add_frame({"action": state, "observation.state": state, "task": "reach"})
+    dataset.save_episode()
+def full(*args):
+    raise OSError(28, "No space left on device")
+record(0), record(1)
+if ending == "frame":
+    dataset.add_frame({"action": np.zeros(5)})
+sound, dataset.meta.save_episode = dataset.meta.save_episode, full
+try:
+    record(2)
+except OSError:
+    pass
+dataset.meta.save_episode = sound
+dataset.clear_episode_buffer()
+if "on" in ending:
+    record(3), record(4)
+if "finalized" in ending:
+    dataset.finalize()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ending", "takes"),
+    [
+        ("frame", [0, 1]),
+        ("exit", [0, 1, 2]),
+        ("exit, finalized", [0, 1, 2]),
+        ("on", [0, 1, 3, 4]),
+        ("on, finalized", [0, 1, 3, 4]),
+    ],
+)
+def test_lerobot_loads_what_its_recorder_had_saved_before_it_raised(ending, takes, tmp_path):
+    lerobot = pytest.importorskip("lerobot.datasets")
+    given = [sys.executable, "-c", FAILED, str(tmp_path / "failed"), ending]
+    subprocess.run(given, env={**os.environ, "HF_HUB_OFFLINE": "1"}, capture_output=True)
+    repair_dataset(tmp_path / "failed", tmp_path / "out", AS_IT_IS)
+    dataset = lerobot.LeRobotDataset("local/x", root=tmp_path / "out")
+    assert dataset.num_episodes == len(takes)
+    row = 0
+    for take in takes:
+        for k in (0, 39 + take):
+            wanted = np.sin(0.05 * k + np.arange(6, dtype=np.float32)) + np.float32(take)
+            np.testing.assert_array_equal(
+                dataset[row + k]["observation.state"], wanted.astype("f4")
+            )
+        row += 40 + take

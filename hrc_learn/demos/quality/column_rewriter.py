@@ -195,7 +195,7 @@ class ColumnRewriter:
             if key not in found:
                 raise edit.fault(
                     "the video of this episode is missing: copy it, or leave out the videos "
-                    "(--no-videos) or the episode (drop_bad_episodes)",
+                    "(--no-videos) or the episode (--drop bad-episodes)",
                     key=key,
                 )
         if self._cameras and (edit.resampled or (np.diff(edit.kept) != 1).any()):

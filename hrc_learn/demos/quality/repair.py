@@ -5,14 +5,16 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from hrc_learn.demos.dataset_assembly import put
-from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.issues import DatasetError, counted
 from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.quality.video_checks import read_stream
@@ -168,24 +170,50 @@ def _finished(root: Path) -> Iterator[tuple[Path, list[str]]]:
         return
     with TemporaryDirectory(dir=root.parent, prefix=f".{root.name}.finished_") as copy:
         lost, files = finish_recording(root, Path(copy)), ", ".join(unfinished)
-        yield Path(copy), [f"recorder was killed: {files} had no end; episodes lost: {lost}"]
+        yield Path(copy), [f"the recorder ended early: {files}; episodes lost: {lost}"]
 
 
 def unfinished_files(root: Path) -> list[str]:
-    """Files without an end in what LeRobot's recorder left when it was killed (version 3.0).
+    """Unfinished files of LeRobot's recorder, which was killed or failed (version 3.0).
 
     It writes the rows of each episode at once, but the footers of its files, and the list of
-    episodes, only at its end.
+    episodes, only at its end. An episode whose save fails has its rows, but is not listed.
     """
     data, lists = (sorted(root.glob(f"{part}/*/file-*.parquet")) for part in ("data", _LISTS))
-    names = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
-    return names + ([f"{_LISTS} (missing)"] if data and not lists else [])
+    files = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
+    names = [f"{file} has no end" for file in files]
+    if data and not lists:
+        names.append(f"{_LISTS} is missing")
+    if not names and data:
+        known = [row["length"] for file in episode_lists(root) for row in _listed(root, file)]
+        # The columns of a sound recording need not be read.
+        if sum(pq.read_metadata(path).num_rows for path in data) > sum(known):
+            takes = [end - begin for path in data for _, begin, end in _takes(root, path)]
+            if (extra := len(takes) - len(known)) > 0 and not Counter(known) - Counter(takes):
+                names.append(f"data/ holds {counted(extra, 'episode')} whose save failed")
+    return names
+
+
+def _listed(root: Path, file: str) -> list[dict]:
+    return read_rows(root, file, ("episode_index", "length"), ())
+
+
+def _takes(root: Path, path: Path) -> list[tuple[int, int, int]]:
+    """Index of each episode in a file, its first row and the one after its last.
+
+    After a failed save, the recorder gives the next episode the same index.
+    """
+    file = str(path.relative_to(root))
+    table = read_table(open_parquet(root, file), file, ["episode_index", "frame_index"])
+    episode, frame = (column.to_numpy() for column in table.columns)
+    starts = np.flatnonzero((frame == 0) | (np.diff(episode, prepend=-1) != 0))
+    return [(int(episode[a]), a, b) for a, b in pairwise([*starts.tolist(), len(frame)])]
 
 
 def finish_recording(root: Path, target: Path) -> int:
-    """Copy what a killed recorder left into an empty folder, such that it can be read.
+    """Copy what a recorder left that ended early into an empty folder, to be read there.
 
-    Files that are complete are linked.
+    Files that are complete are linked. Of episodes of the same index, the last one counts.
 
     Returns:
         Number of episodes that `meta/info.json` counts and that are not there.
@@ -199,18 +227,24 @@ def finish_recording(root: Path, target: Path) -> int:
     for file in (file for file in episode_lists(root) if is_unfinished(root / file)):
         (target / file).unlink()
     known = [row for file in episode_lists(target) for row in read_rows(target, file, _INDEX)]
-    listed = {row["episode_index"] for row in known}
+    listed, takes = {row["episode_index"] for row in known}, {}
     for path in sorted(target.glob("data/*/file-*.parquet")):
         if is_unfinished(path):
             content = finished_parquet(path.read_bytes(), _example(features))
             path.unlink()  # it may be the file of the recording itself
             path.write_bytes(content)
-        file = str(path.relative_to(target))
-        table = read_table(open_parquet(target, file), file, ["episode_index"])
-        for index, length in Counter(table.column(0).to_pylist()).items():
-            row = {"episode_index": index, "length": length, "dataset_from_index": frames}
+        takes[path] = _takes(target, path)
+    last = {index: (path, begin) for path in takes for index, begin, _ in takes[path]}
+    for path, found in takes.items():
+        kept = [one for one in found if last[one[0]] == (path, one[1])]
+        if len(kept) < len(found):
+            table = pq.read_table(path)
+            path.unlink()
+            write_parquet(pa.concat_tables(table[b:e] for _, b, e in kept), path)
+        for index, begin, end in kept:
+            row = {"episode_index": index, "length": end - begin, "dataset_from_index": frames}
             rows += [] if index in listed else [row | _place("data", path)]
-            frames += length
+            frames += end - begin
     if not (known or rows):
         raise DatasetError("the recording holds no complete episode", file=root)
     for key in info["features"].keys() - features.keys():

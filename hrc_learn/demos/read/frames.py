@@ -169,7 +169,8 @@ def require_rows(folder: DatasetFolder, file: str, rows: int) -> None:
     if rows != promised:
         text = (
             f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
-            f"lost or repeated, or the metadata belong to another copy"
+            f"lost or repeated, the save of an episode failed (hrc repair recovers it), or the "
+            f"metadata belong to another copy"
         )
         episode = entries[0].index if len(entries) == 1 else None
         raise DatasetError(text, file=file, episode=episode)
