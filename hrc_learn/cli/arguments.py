@@ -72,12 +72,13 @@ class Columns:
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
     mapping: dict[str, str] = field(default_factory=dict)
-    """Columns by quantity, such as: joint_position "observation.state[0:7]"."""
+    """Columns by quantity, such as: joint_position "observation.state[0:7]" gripper none."""
 
 
-def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str]]:
-    """Columns by quantity: a feature, a range of it, or a list of names from "a,b"."""
-    return {role: text.split(",") if "," in text else text for role, text in mapping.items()}
+def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str] | None]:
+    """Columns by quantity: a feature, a range of it, a list of names from "a,b", or none."""
+    texts = {role: text.split(",") if "," in text else text for role, text in mapping.items()}
+    return {role: None if text == "none" else text for role, text in texts.items()}
 
 
 @dataclass(frozen=True, kw_only=True)

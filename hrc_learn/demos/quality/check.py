@@ -147,6 +147,7 @@ def _check_content(
     if commanded:
         command, state = (columns.selections[f"{who}_position"] for who in ("command", "joint"))
         report.run(consistency.velocity_commands, command, commanded, folder.fps)
+    if commanded and not decisions["command_position"].steps.any():
         report.run(consistency.command_tracking, command, commanded)
         report.run(consistency.command_offsets, command, state, commanded, features)
     for feature in features:

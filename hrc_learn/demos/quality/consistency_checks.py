@@ -12,13 +12,15 @@ from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
     FOLLOWS,
+    LOST,
     MOST_NAMED,
-    PROMPT,
     EpisodeProfile,
     FeatureProfiles,
     Tracking,
+    commanded_rates,
     gain_over,
     listed,
+    over_episodes,
 )
 
 FEWEST = 3
@@ -33,8 +35,8 @@ _HALF_TURN = 0.9 * np.pi
 """Length of a rotation vector [rad] above which noise of the hand can flip its sign."""
 _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
-_LOST = 0.4
-"""R squared below which a state does not follow its command."""
+_SPEED = (2 / 3, 1.5)
+"""Joint rates per velocity command, in the same unit."""
 _OFFSET = 0.1
 """Distance between command and state at rest that is reported, relative to the joint's range:
 hobby servos stop within a few degrees under load."""
@@ -276,10 +278,10 @@ def command_tracking(
     """
     trackings = [profile.tracking["command_position"] for profile in profiles]
     place = {"key": command.columns[0][0], "components": command.labels}
-    follow = _median([tracking.fit for tracking in trackings]) > FOLLOWS
+    follow = over_episodes([tracking.fit for tracking in trackings]) > FOLLOWS
     if not follow.any():
         return
-    usual_slope = _median([t.slope for t in trackings])
+    usual_slope = over_episodes([t.slope for t in trackings])
     delays = np.array([t.delay for t in trackings])
     delay = float(np.median(delays))
     if delay < -1:
@@ -356,36 +358,19 @@ def velocity_commands(
         profiles: Profiles of the episodes that have commands.
         fps: Frame rate [1/s].
     """
-    positions, rates = (
-        [p.tracking[name] for p in profiles if name in p.tracking]
-        for name in ("command_position", "rates")
-    )
-    if not rates:
-        return
-    rate_delay, position_delay = (
-        abs(float(np.median([t.delay for t in group]))) / fps for group in (rates, positions)
-    )
-    # If both readings fit a smooth motion, the one without a long delay is meant.
-    prompt = rate_delay <= PROMPT < position_delay
-    fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
-    position_fit, key = _median([t.fit for t in positions]), command.columns[0][0]
-    # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
-    speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
-    speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
-    if speeds.sum() > len(speeds) / 2:
+    found, key = commanded_rates([p.tracking for p in profiles], fps), command.columns[0][0]
+    # The same unit per second, with lag or gain.
+    if (
+        found is not None
+        and _SPEED[0] < (slope := float(np.nanmedian(found.slope))) < _SPEED[1]
+    ):
         names = listed(command.labels, range(len(command.labels)))
         text = (
             f"is taken for positions, but follows the velocity of the state with slope "
-            f"{float(np.median(slope[speeds])):.2f}: {names}; declare it "
+            f"{slope:.2f}: {names}; declare it "
             f"(mapping={{'command_velocity': {key!r}, 'command_position': None}})"
         )
         yield Issue(message=text, key=key)
-
-
-def _median(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " components"]:
-    """Median over episodes; components that rest count as 0."""
-    with np.errstate(all="ignore"):
-        return np.nan_to_num(np.median(np.nan_to_num(np.stack(rows)), axis=0))
 
 
 def _component_tracking(
@@ -397,7 +382,7 @@ def _component_tracking(
     """Components that follow their command in the other episodes, but not in this one."""
     fit, slope = tracking.fit, tracking.slope
     follows = follow & (fit > FOLLOWS)
-    lost = np.flatnonzero(follow & ~(fit > _LOST) & ~np.isnan(fit))
+    lost = np.flatnonzero(follow & ~(fit > LOST) & ~np.isnan(fit))
     # The slope equals minus the usual one, within half of it.
     opposite = np.abs(slope + usual_slope) < 0.5 * np.abs(usual_slope)
     against = np.flatnonzero(follows & opposite)

@@ -319,7 +319,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
 
     Raises:
         DatasetError: The episode is shorter than a period, or it holds transforms, which cannot
-            be interpolated by their entries.
+            be interpolated by their entries, or changes per step.
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 
@@ -334,6 +334,9 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
             "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
             key="pose_matrix",
         )
+    if "command_position" in edit.units and edit.units["command_position"].steps.any():
+        text = "holds changes per step, which are not those of another rate: keep the frames"
+        raise edit.fault(text, key="command_position")
     time = np.minimum(grid, known[-1])
     smooth = fix_signs(_unwrapped_all(edit))
     frames = {

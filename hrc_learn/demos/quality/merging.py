@@ -219,6 +219,11 @@ class _Merge:
         own, other = self.first.units.get((key, index)), source.units.get((key, place))
         if own is None or other is None or own.unit == other.unit:
             return 1.0
+        if (
+            own.steps & other.steps & own.guessed
+            and 0.7 < np.divide(other.factor, own.factor) < 1.4
+        ):
+            return 1.0  # estimates of one scale
         for asked, decision in ((self.first, own), (source, other)):
             if decision.doubt:
                 advice = f"hrc check {asked.root} --units {decision.role} UNIT --keep-contract"

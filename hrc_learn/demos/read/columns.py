@@ -359,7 +359,9 @@ class _Conventions:
         groups: dict[tuple[str, str], dict[str | int, int]] = {}
         for index, meaning in enumerate(meanings):
             if meaning is not None:
-                groups.setdefault((meaning.role, meaning.side), {})[meaning.slot] = index
+                # Of two fingers of one name, the first counts.
+                slots = groups.setdefault((meaning.role, meaning.side), {})
+                slots.setdefault(meaning.slot, index)
         for role, side in [*groups]:
             if role == "pose_matrix" and len(groups[role, side]) in _CARTESIAN:
                 # Numbered components of a pose in one of the encodings without names.

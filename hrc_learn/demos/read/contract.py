@@ -360,7 +360,9 @@ def _describe(
         confidence=decision.confidence,
         evidence=decision.evidence or "declared",
     )
-    tracked = [p.tracking[role] for p in profiles if role in p.tracking]
+    changes = part.unit.endswith("/step")
+    name = "rates" if changes else role
+    tracked = [p.tracking[name] for p in profiles if name in p.tracking]
     fits = [fit for t in tracked if np.isfinite(fit := t.fit[number])]
     fit = float(np.median(fits)) if fits else 0.0
     if not fit > _FOLLOWS:
@@ -374,4 +376,5 @@ def _describe(
         f"state follows it with slope {slope:.2f}, R2 {fit:.2f}, "
         f"same delay in {agreeing} of {len(tracked)} episodes"
     )
-    return replace(part, sign=int(np.sign(slope)), delay=delay / fps, evidence=evidence)
+    part = replace(part, sign=int(np.sign(slope)), delay=delay / fps)
+    return part if changes else replace(part, evidence=evidence)

@@ -39,44 +39,18 @@ _METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|ope
 
 _NO_JOINT = re.compile("|".join(_WORDS_OF["no_joint"]))
 
-# Words before a component that only name the tool or the robot.
-_TOOL = (
-    r"(?:(?:ee|eef|tcp|tool\d*|end_?effector|flange|fingertip|cartesian)"
-    r"(?:_(?:pose|transform))?_?)"
-)
-_OWNER = r"(?:(?P<side>left|right)_)?"
-_OTHER_OWNER = r"(?:(?P<side2>left|right)_)?"
-_WORDS = r"(?:(?:robot\d*|arm\d*|states?|observations?|obs|actions?|actual|measured)_)*"
-_BEFORE = rf"{_WORDS}{_OWNER}{_WORDS}(?P<tool>{_TOOL}|(?:pose|transform)_)?{_OTHER_OWNER}"
-_POSITION = r"(?:p|pos|position|translation|trans|xyz|location)"
-_QUATERNION = r"(?:q|quat|quaternion|rot_?quat|orientation_quat(?:ernion)?)"
-_ROTATION = r"(?:orientation|orient|ori|orn|rotation|rot)"
-_VECTOR = r"(?:rotvec|rot_?vec|rotation_vector|axis_angle|axisangle|rot_axis_angle)"
-_EULER = r"(?:(?:rot_|orientation_)?(?:euler|rpy))"
-_SIX = r"(?:rot_?6d|r6d|rotation_6d|ortho6d|rot6)"
-_COMPONENTS: list[tuple[str, str]] = [
-    # Role of the component, and the rest of its name with its slot.
-    ("position", rf"{_POSITION}?_?(?P<slot>[xyz])"),
-    ("quaternion_wxyz", rf"{_QUATERNION}_?(?P<slot>[wxyz])"),
-    ("quaternion", r"(?:quat|quaternion|rot_?quat)_?(?P<slot>[0-3])"),
-    ("rotation_vector", rf"(?:{_VECTOR}|w)_?(?P<slot>[xyz])"),
-    ("rotation_vector", rf"{_VECTOR}_?(?P<slot>[0-2])"),
-    ("euler_xyz", rf"{_EULER}_?(?P<slot>[xyz0-2])"),
-    ("euler_xyz", rf"(?:{_EULER}_|{_ROTATION}_)?(?P<slot>roll|pitch|yaw)"),
-    ("rotation_6d", rf"{_SIX}_?(?P<slot>[0-5])"),
-    ("rotation", rf"{_ROTATION}_?(?P<slot>[wxyz0-8])"),
-    ("rotation", r"r_?(?P<slot>[wxyz])"),
-    ("rotation", rf"(?:{_ROTATION}_)?(?:matrix|mat)_?(?P<slot>[0-8])"),
-]
-# A number after `pos` may count joints: only with a word for the tool before it.
-_NUMBERED = [
-    ("position", rf"{_POSITION}_?(?P<slot>[0-2])"),
-    ("pose_matrix", r"(?:pose|matrix|transform)?_?(?P<slot>0?\d|1[0-5])"),
-]
+
+def _part(found: re.Match[str]) -> str:
+    """Pattern that stands for {NAME} in other patterns."""
+    pattern = _WORDS_OF["parts"][found[1]]
+    return f"(?:{re.sub(_PART, _part, pattern)})"
+
+
+_PART = r"\{([a-z]+)\}"
 _NAMES = [
-    (role, re.compile(_BEFORE + rest), rows is _NUMBERED)
-    for rows in (_COMPONENTS, _NUMBERED)
-    for role, rest in rows
+    (role, re.compile(re.sub(_PART, _part, "{before}" + rest)), table == "numbered")
+    for table in ("components", "numbered")
+    for role, rest in _WORDS_OF[table]
 ]
 """Role, pattern of the whole name, and True if it needs a word for the tool."""
 _SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}

@@ -33,8 +33,18 @@ _REST_MOTION = 0.005
 """Motion at rest, relative to the range."""
 FOLLOWS = 0.8
 """R squared above which a state follows its command."""
+LOST = 0.4
+"""R squared below which a state does not follow its command."""
+_SAME_SLOPE = 0.3
+"""Largest difference of slopes of components in the same unit, relative to the usual one."""
+_SAME_UNIT, _LATE = 1.1, 0.75
+"""Logarithm of a slope (a third to three times as far), and delay [s], up to which a state may
+follow positions."""
 PROMPT = 0.2
 """Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
+RATE_WINDOW = 0.2
+"""Time over which joint rates, and commands that they are compared with, are averaged [s]: a
+change from frame to frame is mostly noise."""
 MOST_NAMED = 6
 """Components named in a message."""
 # Relative variance of a window in which a component rests, up to rounding.
@@ -104,7 +114,7 @@ class EpisodeProfile:
     tracking: dict[str, Tracking] = field(default_factory=dict)
     """Tracking by role: `command_position` against the joints, `command_velocity` against the
     joint rates, `rates` for position commands against rates, where the joints do not follow
-    them at once."""
+    them at once. Rates are means over `RATE_WINDOW`."""
 
 
 def profile_columns(
@@ -369,14 +379,82 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
     position, velocity = (
         quantities.get(f"command_{kind}") for kind in ("position", "velocity")
     )
-    rates = np.gradient(joints, 1 / fps, axis=0)
+    window = min(max(2, round(RATE_WINDOW * fps)), len(joints) - 1)
+    rates = (joints[window:] - joints[:-window]) * fps / window
     if position is not None and position.shape == joints.shape:
         found["command_position"] = tracking = track(position, joints, fps)
         if tracking is None or not _at_once(tracking, fps):
-            found["rates"] = track(position, rates, fps)
+            found["rates"] = track(_means(position, window), rates, fps)
     if velocity is not None and velocity.shape == joints.shape:
-        found["command_velocity"] = track(velocity, rates, fps)
+        found["command_velocity"] = track(_means(velocity, window), rates, fps)
     return {name: tracking for name, tracking in found.items() if tracking is not None}
+
+
+def _means(
+    values: Float64[np.ndarray, "frames components"], window: int
+) -> Float64[np.ndarray, "_windows components"]:
+    """Means over windows that begin at each frame, as many as differences over a window."""
+    sums = np.cumsum(values, axis=0)
+    return (sums[window:] - sums[:-window] - values[window:] + values[:-window]) / window
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandedRates:
+    """Evidence that commands named like positions are changes or velocities."""
+
+    slope: Float64[np.ndarray, " components"]
+    """Joint rate per unit of the command [1/s]; NaN for components that do not follow."""
+    fit: float
+    """Typical fraction of the variance of rates that the commands explain (R squared)."""
+
+
+def commanded_rates(
+    trackings: Sequence[Mapping[str, Tracking]], fps: float
+) -> CommandedRates | None:
+    """Relation of position commands to joint rates; None if most joints do not follow so.
+
+    Args:
+        trackings: Tracking in each episode, as `track_quantities` gives it.
+        fps: Frame rate [1/s].
+    """
+    positions, rates = (
+        [known[name] for known in trackings if name in known]
+        for name in ("command_position", "rates")
+    )
+    if not rates or 2 * len(rates) < len(trackings):
+        return None
+    rate_delay, position_delay = (
+        abs(float(np.median([t.delay for t in group]))) / fps for group in (rates, positions)
+    )
+    fit, slope = (over_episodes([getattr(t, name) for t in rates]) for name in ("fit", "slope"))
+    position_fit = over_episodes([t.fit for t in positions])
+    # If both readings fit a smooth motion, the one without a long delay is meant.
+    prompt = rate_delay <= PROMPT < position_delay
+    followed = (fit > FOLLOWS) & ((position_fit < LOST) | (prompt & (position_fit < fit)))
+    # Joints that move together follow any command by their own factors.
+    typical = np.median(slope[followed]) if followed.any() else 0.0
+    followed &= np.abs(slope - typical) < _SAME_SLOPE * abs(typical)
+    if 2 * followed.sum() <= len(slope):
+        return None
+    return CommandedRates(
+        slope=np.where(followed, slope, np.nan), fit=float(np.median(fit[followed]))
+    )
+
+
+def are_positions(trackings: Sequence[Mapping[str, Tracking]], fps: float) -> bool:
+    """True if the joints follow commands as positions, in the same unit; also if none moves."""
+    votes = []
+    for tracking in (known["command_position"] for known in trackings if len(known)):
+        near = (tracking.fit > LOST) & (np.abs(np.log(np.abs(tracking.slope))) < _SAME_UNIT)
+        near &= (tracking.slope > 0) & (-PROMPT <= tracking.delay / fps <= _LATE)
+        votes.append(near[np.isfinite(tracking.fit)].mean() >= 0.5)
+    return not votes or bool(np.mean(votes) >= 0.5)
+
+
+def over_episodes(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " components"]:
+    """Median over episodes; components that rest count as 0."""
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(np.median(np.nan_to_num(np.stack(rows)), axis=0))
 
 
 def _at_once(tracking: Tracking, fps: float) -> bool:

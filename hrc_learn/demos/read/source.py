@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, overload, runtime_checkable
@@ -16,7 +16,12 @@ from hrc_learn.demos.demonstration import (
 )
 from hrc_learn.demos.image_features import extracted_features
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
-from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
+from hrc_learn.demos.read.columns import (
+    ColumnMapping,
+    ColumnSelection,
+    MappingSpec,
+    map_columns,
+)
 from hrc_learn.demos.read.contract import Contract, Sidecar, fingerprint, read_sidecar
 from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
@@ -33,7 +38,15 @@ from hrc_learn.demos.read.frames import (
     read_quantities,
 )
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
+from hrc_learn.demos.read.naming import is_hand
+from hrc_learn.demos.read.profiles import (
+    Tracking,
+    are_positions,
+    commanded_rates,
+    track_quantities,
+)
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, demonstration_fields
+from hrc_learn.demos.read.unit_evidence import FEWEST_JOINTS
 from hrc_learn.demos.read.units import (
     Quantities,
     UnitDecision,
@@ -43,6 +56,10 @@ from hrc_learn.demos.read.units import (
 
 _SAMPLED = 32
 """Episodes that decide on units."""
+_COMMAND = "command_position"
+_TRACKED = ("joint_position", _COMMAND)
+_WHOLE_STEP = (0.1, 1.5)
+"""Motion per step and unit of the command that counts as 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +136,9 @@ class OpenedDataset:
         """
         known = {*self.declared_units, *given}
         guessed = guessed_from_values(self.columns.selections, known)
-        roles = [*guessed, *({"time"} & self.columns.selections.keys() - known)]
+        # The joints show what their commands are.
+        more = {"time"} - known | ({"joint_position"} if _COMMAND in guessed else set())
+        roles = {*guessed, *(more & self.columns.selections.keys())}
         sample = {entry.index for entry in _spread(self.folder.episodes, _SAMPLED)}
         wanted = {entry.index for entry in entries}
         chosen = wanted | sample if guessed else {entries[0].index} if roles else set()
@@ -139,16 +158,69 @@ class OpenedDataset:
         given: Mapping[str, str],
         sample: Collection[int] | None = None,
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
-        """Decide on units as `units_from_episodes` does."""
-        return units_from_episodes(
+        """Decide on units as `units_from_episodes` does, and whether commands are changes."""
+        fps, trackings = self.folder.fps, []
+
+        def tracked() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+            for entry, quantities in episodes:
+                if len(trackings) < _SAMPLED:
+                    known = {r: quantities[r] for r in _TRACKED if r in quantities}
+                    trackings.append(track_quantities(known, fps))
+                yield entry, quantities
+
+        decisions, faults = units_from_episodes(
             self.columns.selections,
-            episodes,
-            self.folder.fps,
+            tracked(),
+            fps,
             self.declared_units,
             given,
             sample,
             self.folder.robot_type or "",
         )
+        if _COMMAND in decisions.keys() - {*self.declared_units, *given}:
+            decisions |= _meaning_of_commands(
+                self.columns.selections, decisions, trackings, fps
+            )
+        return decisions, faults
+
+
+def _meaning_of_commands(
+    selections: Mapping[str, ColumnSelection],
+    decisions: Mapping[str, UnitDecision],
+    trackings: Sequence[Mapping[str, Tracking]],
+    fps: float,
+) -> dict[str, UnitDecision]:
+    """Decisions that change where commands are no positions of the joints."""
+    command, selection = decisions[_COMMAND], selections[_COMMAND]
+    if (found := commanded_rates(trackings, fps)) is None:
+        if not selection.numbered or are_positions(trackings, fps):
+            return {}
+        text = "names no components, and the joints do not follow it"
+        evidence = f"{selection.columns[0][0]} {text}"
+        return {_COMMAND: replace(command, confidence=0.3, evidence=evidence, leader="")}
+    scale = float(np.nanmedian(found.slope)) / fps
+    # A controller that lags makes a part of each step.
+    factor = "" if _WHOLE_STEP[0] < scale < _WHOLE_STEP[1] else f"{scale:.2g} "
+    # A gripper without a name of its own comes last.
+    hands = [is_hand(label) for label in selection.labels[:-1]]
+    hands.append(selection.numbered or is_hand(selection.labels[-1]))
+    units = tuple(
+        command.unit_of(i) if no and hand else f"{factor}{command.unit}/step"
+        for i, (no, hand) in enumerate(zip(np.isnan(found.slope), hands, strict=True))
+    )
+    evidence = (
+        f"the joints follow its sum ({scale:.2g} {command.unit} per unit, R2 {found.fit:.2f}), "
+        f"so that it holds changes, not positions"
+    )
+    steps = replace(command, unit=units[0], units=units, guessed=True, evidence=evidence)
+    joints = decisions["joint_position"]
+    if not selections["joint_position"].numbered or len(units) >= FEWEST_JOINTS:
+        return {_COMMAND: steps}
+    text = (
+        f"{joints.evidence}; {len(units)} columns without names that move by changes per step"
+    )
+    text += " may be a pose, which is read with --mapping position KEY[0:3]"
+    return {_COMMAND: steps, joints.role: replace(joints, confidence=0.5, evidence=text)}
 
 
 def _spread(entries: Sequence[EpisodeEntry], most: int) -> list[EpisodeEntry]:
@@ -392,6 +464,8 @@ class DemonstrationSource(Sequence[Demonstration]):
         except ValueError as error:
             key = next(role for role in ORIENTATION_ROLES if role in quantities)
             raise entry.error(str(error), key=key) from error
+        if _COMMAND in fields and (steps := self.units[_COMMAND].steps).any():
+            fields[_COMMAND] = fields[_COMMAND] + steps * fields.get("joint_position", 0.0)
         task = entry.tasks[0] if entry.tasks else ""
         if not entry.tasks and "task_index" in frames:
             task = self.folder.tasks.get(int(frames["task_index"][0, 0]), "")

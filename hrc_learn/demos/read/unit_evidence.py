@@ -23,7 +23,7 @@ _SLIDE = 0.12
 """Longest stroke of a gripper's finger [m]."""
 # Old datasets of LeRobot name the columns of joints and of poses alike.
 _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
-_SHORTEST_ARM, _POSE_AND_FINGERS = 5, 8
+FEWEST_JOINTS, _POSE_AND_FINGERS = 5, 8
 """Joints of the smallest usual arms; columns of a pose with two fingers."""
 # LeRobot clips normalised positions at exactly 100.
 _CLIP, _CLIPPED = 100.0, 0.002
@@ -211,9 +211,9 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
     if not (named_alike or numbered) or count > _POSE_AND_FINGERS:
         return guess
     last = float(sizes.peak[-1])
-    if count > _SHORTEST_ARM and 1e-3 < last <= _SLIDE and largest > 10 * last:
+    if count > FEWEST_JOINTS and 1e-3 < last <= _SLIDE and largest > 10 * last:
         reason = f"the last column stays within {last:.2g}, as a gripper in m does"
-    elif named_alike and count < _SHORTEST_ARM:
+    elif named_alike and count < FEWEST_JOINTS:
         reason = f"{count} columns are few for an arm"
     else:
         return guess

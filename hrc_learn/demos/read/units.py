@@ -5,11 +5,12 @@ that states a unit decides; else the values and the type of the robot are the ev
 """
 
 import math
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read import unit_evidence
@@ -32,6 +33,10 @@ _DIMENSIONS: dict[str, dict[str, float]] = {
 """Dimension -> unit -> factor to the SI unit. A tick is 1/4096 of a turn, as the encoders of
 hobby servos count; the position of their zero is unknown. A byte counts from 0 to 255, as
 grippers and hands of Robotiq and Inspire do."""
+
+_STEP = re.compile(r"(?:(\d+\.?\d*(?:e-?\d+)?) )?(.+)/step")
+"""Unit of commands that are added to the joint positions: rad/step, or 0.05 rad/step for values
+that were scaled."""
 
 _FOLLOWERS = {
     "joint_velocity": "joint_position",
@@ -71,9 +76,14 @@ class UnitDecision:
         return np.array([unit_factor(self.role, unit) for unit in self.units])
 
     @property
+    def steps(self) -> Bool[np.ndarray, " components"]:
+        """True for each component, or for all, that holds changes per step."""
+        return np.array([unit.endswith("/step") for unit in self.units or (self.unit,)])
+
+    @property
     def converts(self) -> bool:
         """True if a guess changes the values."""
-        return self.guessed and bool(np.any(self.factor != 1))
+        return self.guessed and bool(np.any(self.factor != 1) or self.steps.any())
 
     @property
     def note(self) -> str | None:
@@ -99,13 +109,14 @@ class UnitDecision:
         return (
             f"{self.role} is in {' or '.join(candidates)}? {self.evidence} (taken for "
             f"{self.unit}, {100 * self.confidence:.0f} % sure): say {ways}, or leave columns "
-            f"out with --mapping {self.role} COLUMNS"
+            f"out with --mapping {self.role} COLUMNS|none"
         )
 
     @property
     def si_unit(self) -> str:
         """Unit after the conversion: that of the quantity, or "1" for a fraction of a range."""
-        return "1" if self.unit in _DIMENSIONS["ratio"] else ROLES[self.role].unit
+        own = "1" if self.unit in _DIMENSIONS["ratio"] else ROLES[self.role].unit
+        return own + "/step" * bool(self.steps.any())
 
     def unit_of(self, component: int) -> str:
         """Unit of one component."""
@@ -122,6 +133,8 @@ def unit_factor(role: str, unit: str) -> float:
         raise DatasetError(
             f"units are given for the unknown quantity {role!r}; known are {', '.join(ROLES)}"
         )
+    if role == "command_position" and (step := _STEP.fullmatch(unit)):
+        return float(step[1] or 1) * unit_factor("joint_position", step[2])
     options = units_of(role)
     if unit not in options:
         raise DatasetError(
@@ -131,7 +144,7 @@ def unit_factor(role: str, unit: str) -> float:
 
 
 def units_of(role: str) -> dict[str, float]:
-    """Units of a quantity with their factors."""
+    """Units of a quantity with their factors; commands come in units per step as well."""
     own = ROLES[role].unit
     options = next(units for units in _DIMENSIONS.values() if own in units)
     if role in ("gripper", "joint_position", "command_position"):
