@@ -15,11 +15,10 @@ from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.contract import Sidecar
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
 from hrc_learn.demos.read.metadata import Statistics, episode_statistics
-from hrc_learn.demos.read.quantities import ROLES
+from hrc_learn.demos.read.quantities import RECORDED, ROLES
 from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
 
-STATE_KEY = "observation.state"
 TIME_KEY = "time"
 """Feature of the true stamps. A policy would take `observation.time` for an input, and no robot
 has such an observation."""
@@ -43,24 +42,9 @@ class RecordedColumn:
     """Component names within that feature; in `_COLUMNS`, `{joint}` stands for each joint."""
 
 
-# One `observation.state` for every quantity of the robot, distinguished by name, as written by
-# lerobot-record: LeRobot's own tools and viewers understand it.
 _COLUMNS = tuple(
-    RecordedColumn(given=given, role=role or given, key=key, names=names)
-    for given, role, key, names in (
-        ("joint_position", "", STATE_KEY, ("{joint}.pos",)),
-        ("gripper", "", STATE_KEY, ("gripper.pos",)),
-        ("joint_velocity", "", STATE_KEY, ("{joint}.vel",)),
-        ("joint_effort", "", STATE_KEY, ("{joint}.torque",)),
-        ("position", "", STATE_KEY, ("ee.x", "ee.y", "ee.z")),
-        ("orientation", "rotation_vector", STATE_KEY, ("ee.wx", "ee.wy", "ee.wz")),
-        ("feature", "", "observation.image_feature", ("u", "v")),
-        ("feature_visible", "", "observation.image_feature", ("visible",)),
-        ("human_effort", "", "observation.human_effort", ("{joint}.effort",)),
-        ("command_position", "", "action", ("{joint}.pos",)),
-        ("command_velocity", "", "action", ("{joint}.vel",)),
-        ("time", "", TIME_KEY, ("time",)),
-    )
+    RecordedColumn(given=given, role=role or given, key=key, names=tuple(names))
+    for given, (role, key, *names) in RECORDED.items()
 )
 FRAME_WIDTHS = {
     column.given: 4 if column.given == "orientation" else ROLES[str(column.role)].width

@@ -15,7 +15,7 @@ from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.read.columns import ColumnSelection, map_columns, replaced_roles
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.naming import joint_of
-from hrc_learn.demos.read.profiles import track
+from hrc_learn.demos.read.profiles import are_positions, track
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.units import UnitDecision, unit_factor, units_from_episodes
 from hrc_learn.demos.recording_files import UNNAMED, Recording, is_time
@@ -35,8 +35,6 @@ _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 _ALIKE = 0.3
 """Distance of a command from its joint, as a fraction of that of any other command, below which
 their order is known."""
-_SLOPES = (0.5, 2.0)
-"""Change of the joints per change of the command, if both are in the same unit."""
 
 
 @dataclass(kw_only=True)
@@ -148,7 +146,12 @@ def _by_name(
         },
         cameras=find_cameras(first, options.images),
         left_out=search.left_out,
-        notes=[search.explained(note) for note in found.notes if _is_news(note)],
+        # The preview shows the others already.
+        notes=[
+            search.explained(n)
+            for n in found.notes
+            if "left among" not in n and "assumed" not in n
+        ],
     )
     for role, places in explicit.items():
         if role in ROLES:
@@ -180,11 +183,6 @@ def _question_of_angles(
         return []
     text = "rx, ry, rz are taken for a rotation vector; if they are angles about x, y, z,"
     return [f"{text} name them euler_xyz"]
-
-
-def _is_news(note: str) -> bool:
-    """True for notes of the reader that the preview does not show already."""
-    return "left among" not in note and "assumed" not in note
 
 
 def _explicit(first: Recording, options: ImportOptions) -> dict[str, list[Place]]:
@@ -438,14 +436,9 @@ def _followed(
     votes = []
     for one in recordings[:: max(1, len(recordings) // _CHECKED_EPISODES)]:
         given, measured = _matched(one, command, state)
-        span = np.ptp(measured, axis=0)
-        near = np.median(np.abs(given - measured), axis=0) <= 0.1 + 0.5 * span
+        apart = np.median(np.abs(given - measured), axis=0)
+        near = apart <= 0.1 + 0.5 * np.ptp(measured, axis=0)
         tracking = track(given, measured, _CHECK_RATE)
-        if tracking is None:
-            votes.append(bool(near.all()))
-            continue
-        moving = np.isfinite(tracking.slope) & (span > 0.02 * span.max())
-        slopes = tracking.slope[moving]
-        good = (tracking.fit[moving] > 0.5) & (slopes > _SLOPES[0]) & (slopes < _SLOPES[1])
-        votes.append(bool(np.mean(good) > 0.5 and near.mean() > 0.5))
+        known = [] if tracking is None else [{"command_position": tracking}]
+        votes.append(near.mean() > 0.5 and are_positions(known, _CHECK_RATE))
     return bool(np.mean(votes) > 0.5)

@@ -10,57 +10,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
+from hrc_learn.demos.read import naming
 from hrc_learn.demos.read.columns import ColumnSelection, feature_key
 from hrc_learn.demos.read.metadata import Feature
-from hrc_learn.demos.read.naming import (
-    is_hand,
-    joint_of,
-    meaning_of_component,
-    role_of_key,
-    without_unit,
-)
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.recording_files import UNNAMED, Field, Recording
 
 Place = tuple[str, int]
 """Field and component."""
 
-_COMMAND = re.compile(
-    r"(?:^|(?<=[_./ ]))(?:actions?|qaction|cmd|command|commanded|commands|target|desired|des|"
-    r"setpoint|leader|master)(?=[_./ \d]|$)[_ ]?"
+_WORDS = naming.WORDS["recordings"]
+_COMMAND, _STATE, _IGNORED, _JOINT_NAME, _MEASURED, _NO_CAMERA, _OTHER_FRAME = (
+    re.compile(_WORDS[name])
+    for name in ("command", "state", "ignored", "joint", "measured", "no_camera", "other_frame")
 )
-_STATE = re.compile(r"(?:low_dim_)?(?:states?|obs|observations?|proprio|agent_pos|robot_state)")
-_IGNORED = re.compile(
-    r"(?:next[_.]?)?(?:rewards?|dones?|terminals?|timeouts?|truncations?|discounts?)|success|mask|"
-    r"is_(?:first|last|terminal)|infos?|compress_len|frame(?:_?(?:index|number|id|nr))?|step|seq|"
-    r"index|task_index|episode.*|demo(?:_?id)?|traj.*|trial|run|.*_ends|next_.*"
-)
-"""Fields that count, or belong to a learner, or repeat the next frame."""
-_SYNONYMS = {
-    "qpos": "q actual_q joint_angles joint_angle joint_states robot_q arm_qpos",
-    "qvel": "dq qd qdot q_dot actual_qd",
-    "effort": "tau tau_j torques",
-    "eef_pos": "pos position positions xyz",
-    "eef_quat": "quat quaternion",
-    "tcp_pose": "pose poses o_t_ee",
-    "gripper": "gripper_state gripper_states gripper_opening",
-}
-_KEYS = {name: key for key, names in _SYNONYMS.items() for name in names.split()}
+_KEYS = {name: key for key, names in _WORDS["synonyms"].items() for name in names.split()}
 """Names of whole fields in recordings -> the names that datasets use."""
-_JOINT_NAME = re.compile(
-    r"(?:.*[._\- ])?(?:j|q|jnt|joint|axis|motor|servo|dof|theta|angle|a)[ _\-.]*\[?\d+\]?|"
-    r".*(?:shoulder|elbow|wrist|waist|forearm|upper_?arm|joint).*"
-)
-_TURNS = {
-    6: "name it euler_xyz or rotation_vector",
-    7: "name it quaternion_wxyz or quaternion_xyzw",
-}
-"""Width of a pose without names -> the question about its orientation."""
-_MEASURED = re.compile(r"^(?:(?:measured|meas|follower|puppet|obs|observation|state)[_. /])+")
 _INDEXED = re.compile(r"(.*?)[_.\[ ]?(\d+)\]?")
-_NO_CAMERA = re.compile(r"image(?:_\w+)?|color|rgb|compressed|ffmpeg|video")
-"""Parts of a topic that do not name its camera."""
-_OTHER_FRAME = re.compile(r"cam|trinsic|obj|goal|start")
 # ALOHA's `qpos`, `qvel`, `effort` and `action`: github.com/tonyzhaozh/act, record_episodes.py.
 _ALOHA_ARM = "waist shoulder elbow forearm_roll wrist_angle wrist_rotate gripper"
 _ALOHA = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_ARM.split())
@@ -196,22 +162,26 @@ class FieldSearch:
         places = [(name, index) for index in range(one.width)]
         if name in self.left_out:
             return
-        if key == "tcp_pose" and one.width in _TURNS:
+        if key == "tcp_pose" and str(one.width) in _WORDS["turns"]:
             # Which encoding, and in which order? Nothing tells.
-            self.left_out[f"{name}[3:{one.width}]"] = _TURNS[one.width]
+            self.left_out[f"{name}[3:{one.width}]"] = _WORDS["turns"][str(one.width)]
             key, places = "eef_pos", places[:3]
         if key == "eef_quat" and not re.match(r"robot\d_", bare):  # robosuite: x, y, z, w
-            self.left_out[name] = _TURNS[7]
+            self.left_out[name] = _WORDS["turns"]["7"]
             return
-        if role_of_key(key) == "gripper" and one.width < 3 and (command or one.width == 2):
+        if (
+            naming.role_of_key(key) == "gripper"
+            and one.width < 3
+            and (command or one.width == 2)
+        ):
             self.two_fingers = self.two_fingers if command else name
             self.fingers += [(True, "gripper", places[0])] if command else []
             return
-        of_joints = role_of_key(key) in JOINT_FIELDS
+        of_joints = naming.role_of_key(key) in JOINT_FIELDS
         if names and (command or of_joints or _STATE.fullmatch(bare)):
-            hands = [i for i, label in enumerate(names) if is_hand(label)]
-            if role_of_key(key) in ("joint_position", None):
-                self.fingers += [(command, joint_of(names[i]), places[i]) for i in hands]
+            hands = [i for i, label in enumerate(names) if naming.is_hand(label)]
+            if naming.role_of_key(key) in ("joint_position", None):
+                self.fingers += [(command, naming.joint_of(names[i]), places[i]) for i in hands]
             arm = [i for i in range(len(names)) if i not in hands]
             places, names = [places[i] for i in arm], tuple(names[i] for i in arm)
         elif not names and command and not bare:
@@ -223,7 +193,7 @@ class FieldSearch:
         prefix = "action" if command else "observation"
         group = [part for part in parents if not _COMMAND.search(part)]
         whole = ".".join([prefix, *group, key])
-        if names and not role_of_key(key):
+        if names and not naming.role_of_key(key):
             whole = "action" if command else "observation.state"
         self._add(whole, places, names)
 
@@ -251,7 +221,7 @@ class FieldSearch:
             if command:
                 rest = _COMMAND.sub("", plain.lower()).strip("_. ")
                 plain = rest if rest and not rest.isdigit() else plain
-            match = _INDEXED.fullmatch(without_unit(plain)[0])
+            match = _INDEXED.fullmatch(naming.without_unit(plain)[0])
             stem = (match[1] if match else plain).lower().strip("_. ").rpartition(".")[2]
             stem = "qpos" if match and stem in ("pos", "position", "positions") else stem
             key = _KEYS.get(re.sub(r"^(?:robot|arm)\d*_", "", stem), stem)
@@ -260,9 +230,9 @@ class FieldSearch:
                 turn, slot = divmod(int(match[2]), 3)
                 plain = f"ee.{'w' if turn else ''}{'xyz'[slot]}"
                 groups.setdefault("observation.ee", []).append((name, plain))
-            elif command and is_hand(plain):
-                self.fingers.append((True, joint_of(plain), (name, 0)))
-            elif role_of_key(key) in JOINT_FIELDS:
+            elif command and naming.is_hand(plain):
+                self.fingers.append((True, naming.joint_of(plain), (name, 0)))
+            elif naming.role_of_key(key) in JOINT_FIELDS:
                 groups.setdefault(f"{prefix}.{key}", []).append((name, plain))
             elif self._hinted or _names_joint(plain):
                 whole = "action" if command else "observation.state"
@@ -272,7 +242,7 @@ class FieldSearch:
         for key, members in groups.items():
             names = tuple(plain for _, plain in members)
             # Names that only count, as q_0 and target_q_0, say no more than their order.
-            counted = role_of_key(key) and all(map(_INDEXED.fullmatch, names))
+            counted = naming.role_of_key(key) and all(map(_INDEXED.fullmatch, names))
             self._add(key, [(n, 0) for n, _ in members], None if counted else names)
 
     def explained(self, note: str) -> str:
@@ -287,5 +257,5 @@ class FieldSearch:
 
 
 def _names_joint(name: str) -> bool:
-    plain = without_unit(name)[0].lower()
-    return meaning_of_component(name) is not None or bool(_JOINT_NAME.fullmatch(plain))
+    plain = naming.without_unit(name)[0].lower()
+    return naming.meaning_of_component(name) is not None or bool(_JOINT_NAME.fullmatch(plain))

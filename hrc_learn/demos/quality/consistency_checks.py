@@ -360,10 +360,7 @@ def velocity_commands(
     """
     found, key = commanded_rates([p.tracking for p in profiles], fps), command.columns[0][0]
     # The same unit per second, with lag or gain.
-    if (
-        found is not None
-        and _SPEED[0] < (slope := float(np.nanmedian(found.slope))) < _SPEED[1]
-    ):
+    if found and _SPEED[0] < (slope := float(np.nanmedian(found[0]))) < _SPEED[1]:
         names = listed(command.labels, range(len(command.labels)))
         text = (
             f"is taken for positions, but follows the velocity of the state with slope "

@@ -21,16 +21,10 @@ from hrc_learn.demos.quality.episode_checks import motion_sketch
 from hrc_learn.demos.quality.repair import RepairOptions, RepairReport, repair_dataset
 from hrc_learn.demos.read.dataset_folder import Progress, open_folder
 from hrc_learn.demos.read.source import DemonstrationSource, open_dataset
-from hrc_learn.store import Count, read_json, write_json
+from hrc_learn.store import Count, read_json, read_toml, write_json
 
-MEASURES = {
-    "distance": "distance from the most similar episodes, relative to the usual one",
-    "duration": "s",
-    "gripper": "number of times the gripper opens or closes",
-    "idle": "fraction of the time at rest",
-    "jerk": "logarithm of the dimensionless jerk",
-    "late": "fraction of late frames",
-}
+_MEASURES = read_toml(Path(__file__).with_name("measures.toml"))
+MEASURES = {name: row["meaning"] for name, row in _MEASURES.items()}
 """Measure of an episode -> its meaning or unit."""
 
 # Doubt added by one finding: an error alone outranks all that is merely unusual.
@@ -278,21 +272,9 @@ def _principal_components(
     return (left * sizes)[:, :_DIMENSIONS] / np.sqrt(_PHASES)
 
 
-_TESTS = {
-    "distance": (1.0, 0.25, "moves unlike all others: {own:.1f} times as far from the nearest"),
-    "duration": (0.0, 0.05, "takes {own:.1f} s, {usual:.1f} s are usual"),
-    "gripper": (1.0, 0.25, "its gripper moves {own:.0f} times, {usual:.0f} are usual"),
-    "idle": (0.1, 0.025, "rests for {own:.0%} of the time, {usual:.0%} are usual"),
-    "jerk": (1.0, 0.25, "moves jerkily: e^{above:.1f} times the usual jerk"),
-    "late": (0.02, 0.005, "{own:.0%} of its frames came late, {usual:.0%} are usual"),
-}
-"""Measure -> smallest difference from the usual value that counts, lower bound of the spread
-(for datasets of nearly equal episodes), and the reason given."""
-
-
 def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
     """Add a doubt for each unusual measure; durations are compared by their logarithms."""
-    for name, (least, least_spread, reason) in _TESTS.items():
+    for name, test in _MEASURES.items():
         known = [q for q in qualities if np.isfinite(q.measures.get(name, np.nan))]
         if len(known) < 4:
             continue
@@ -301,11 +283,11 @@ def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
         if is_duration:
             values = np.log(np.maximum(values, 1e-9))
         usual = float(np.median(values))
-        spread = max(1.4826 * float(np.median(np.abs(values - usual))), least_spread)
+        spread = max(1.4826 * float(np.median(np.abs(values - usual))), test["least_spread"])
         off = (np.abs(values - usual) if is_duration else values - usual) / spread
-        for k in np.flatnonzero((off > _UNUSUAL) & (np.abs(values - usual) >= least)):
+        for k in np.flatnonzero((off > _UNUSUAL) & (np.abs(values - usual) >= test["least"])):
             shown, own = float(np.exp(usual)) if is_duration else usual, known[k].measures[name]
-            text = reason.format(own=own, usual=shown, above=own - shown)
+            text = test["reason"].format(own=own, usual=shown, above=own - shown)
             known[k].doubt(min(off[k] / _UNUSUAL, 5.0), text)
 
 

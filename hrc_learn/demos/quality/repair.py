@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -185,17 +185,14 @@ def unfinished_files(root: Path) -> list[str]:
     if data and not lists:
         names.append(f"{_LISTS} is missing")
     if not names and data:
-        known = [row["length"] for file in episode_lists(root) for row in _listed(root, file)]
+        rows = [read_rows(root, file, ("length",), ()) for file in episode_lists(root)]
+        known = [row["length"] for row in chain(*rows)]
         # The columns of a sound recording need not be read.
         if sum(pq.read_metadata(path).num_rows for path in data) > sum(known):
             takes = [end - begin for path in data for _, begin, end in _takes(root, path)]
             if (extra := len(takes) - len(known)) > 0 and not Counter(known) - Counter(takes):
                 names.append(f"data/ holds {counted(extra, 'episode')} whose save failed")
     return names
-
-
-def _listed(root: Path, file: str) -> list[dict]:
-    return read_rows(root, file, ("episode_index", "length"), ())
 
 
 def _takes(root: Path, path: Path) -> list[tuple[int, int, int]]:

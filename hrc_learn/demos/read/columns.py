@@ -29,6 +29,7 @@ _ACTION_KEYS = ("action", "actions")
 _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
 _POSES = ("position", *ORIENTATION_ROLES)
 _ORIENTATIONS = (*ORIENTATION_ROLES, "quaternion", "rotation")
+_ASSUMED = naming.WORDS["assumed"]
 # Content of a pose feature without component names, by its width: the encoding of the
 # orientation after x, y, z, and the assumption to report.
 _CARTESIAN = {
@@ -409,16 +410,8 @@ class _Conventions:
         if {*slots} == {*"wxyz"}:
             return "quaternion_wxyz"
         found = known.get(len(slots), "quaternion_xyzw")
-        orders = {
-            "quaternion_xyzw": "quaternion in the order x, y, z, w; if it is w, x, y, z, give "
-            "--mapping quaternion_wxyz with its columns",
-            "rotation_vector": "rotation vector; if it holds roll, pitch, yaw, give --mapping "
-            "euler_xyz with its columns",
-            "rotation_6d": "matrix of which it holds two columns; if it holds two rows, as "
-            "PyTorch3D writes them, give --mapping rotation_6d_rows with its columns",
-        }
-        if found in orders:
-            self._notes.append(f"{feature.key}: assumed to be a {orders[found]}")
+        if found in _ASSUMED:
+            self._notes.append(f"{feature.key}: assumed to be a {_ASSUMED[found]}")
         return found
 
 

@@ -23,25 +23,12 @@ from hrc_learn.demos.read.dataset_folder import DatasetFolder
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json
 from hrc_learn.demos.read.naming import is_hand, joint_of
 from hrc_learn.demos.read.profiles import EpisodeProfile, FeatureProfiles
+from hrc_learn.demos.read.quantities import CONTRACT_QUANTITIES as _QUANTITIES
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.read.unit_evidence import CONFIDENT
 from hrc_learn.demos.read.units import UnitDecision, units_of
 from hrc_learn.store import Count, new_file, read_json
 
-_QUANTITIES = {
-    "arm": "joint_position",
-    "finger": "joint_position",
-    "velocity": "joint_velocity",
-    "effort": "joint_effort",
-    "command": "command_position",
-    "finger command": "command_position",
-    "velocity command": "command_velocity",
-    "gripper command": None,
-    "flag": None,
-    "constant": None,
-    "other": None,
-}
-"""Role in a contract -> quantity of a demonstration; other roles have the same name in both."""
 CONTRACT_ROLES = (*_QUANTITIES, *(role for role in ROLES if role not in _QUANTITIES.values()))
 """Roles of a component in a contract."""
 _FOLLOWS = 0.6
@@ -89,7 +76,7 @@ class ComponentContract:
     @property
     def quantity(self) -> str | None:
         """Quantity of a demonstration that holds the component; None for an extra column."""
-        return _QUANTITIES.get(self.role, self.role)
+        return _QUANTITIES.get(self.role, self.role) or None
 
     def unit_as(self, role: str) -> str:
         """Unit of the component if it is read as this quantity; "" if unknown."""

@@ -21,6 +21,7 @@ from jaxtyping import Shaped, UInt8
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH, write_parquet
+from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 NUMERIC = ("float", "int", "uint", "bool")
 """Prefixes of the dtypes of numbers."""
@@ -99,11 +100,8 @@ def flatten_names(names: object) -> tuple[str, ...] | None:
 
 VERSION = "v3.0"
 INDEX_FEATURES = {
-    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    **{
-        key: {"dtype": "int64", "shape": [1], "names": None}
-        for key in ("frame_index", "episode_index", "index", "task_index")
-    },
+    key: {"dtype": "float32" if key == "timestamp" else "int64", "shape": [1], "names": None}
+    for key in INDEX_KEYS
 }
 """Features that LeRobot adds to every dataset."""
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -5,13 +5,15 @@ caller's explicit mapping.
 """
 
 import re
-import tomllib
 from dataclasses import dataclass
-from importlib.resources import files
+from pathlib import Path
 
-_WORDS_OF = tomllib.loads(files(__package__).joinpath("names.toml").read_text(encoding="utf-8"))
+from hrc_learn.store import read_toml
 
-JOINT_SUFFIXES: dict[str, list[str]] = _WORDS_OF["joint_suffixes"]
+WORDS = read_toml(Path(__file__).with_name("names.toml"))
+"""Content of `names.toml`."""
+
+JOINT_SUFFIXES: dict[str, list[str]] = WORDS["joint_suffixes"]
 """Suffixes of `JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
 
 _JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
@@ -21,11 +23,11 @@ _UNDERSCORED = re.compile(
     r"(.*(?:joint|motor|axis)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)", re.IGNORECASE
 )
 _GRIPPER = re.compile(r"gripper|(?:^|[._/ ])(?:jaw|claw)(?:$|[._/ ])")
-_HAND = re.compile("|".join(_WORDS_OF["hand"]))
+_HAND = re.compile("|".join(WORDS["hand"]))
 _CAMEL = re.compile(r"(?<=[a-z\d])(?=[A-Z])")
 """Word boundaries of a name such as `kRightHandIndex`."""
 
-_UNITS: dict[str, str] = _WORDS_OF["units"]
+_UNITS: dict[str, str] = WORDS["units"]
 """Unit -> its spellings in names (regular expression)."""
 _SPELLED = "|".join(f"(?P<u{i}>{spelled})" for i, spelled in enumerate(_UNITS.values()))
 # After a separator or in brackets, perhaps before a number: `q_deg`, `q (deg)`, `q_deg_3`.
@@ -37,12 +39,12 @@ _UNIT_AT_END = re.compile(
 _METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|opening)$")
 """Stems after which a lone `m` is the unit, and no name."""
 
-_NO_JOINT = re.compile("|".join(_WORDS_OF["no_joint"]))
+_NO_JOINT = re.compile("|".join(WORDS["no_joint"]))
 
 
 def _part(found: re.Match[str]) -> str:
     """Pattern that stands for {NAME} in other patterns."""
-    pattern = _WORDS_OF["parts"][found[1]]
+    pattern = WORDS["parts"][found[1]]
     return f"(?:{re.sub(_PART, _part, pattern)})"
 
 
@@ -50,14 +52,14 @@ _PART = r"\{([a-z]+)\}"
 _NAMES = [
     (role, re.compile(re.sub(_PART, _part, "{before}" + rest)), table == "numbered")
     for table in ("components", "numbered")
-    for role, rest in _WORDS_OF[table]
+    for role, rest in WORDS[table]
 ]
 """Role, pattern of the whole name, and True if it needs a word for the tool."""
 _SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _QUATERNION_SLOTS = {"w": 0, "x": 1, "y": 2, "z": 3}
 
 _OF_TOOL = r"(?:ee|eef|tcp|tool\d*|end_?effector|flange)_(?:pose_)?"
-KEY_ROLES = {role: key.replace("TOOL_", _OF_TOOL) for role, key in _WORDS_OF["keys"].items()}
+KEY_ROLES = {role: key.replace("TOOL_", _OF_TOOL) for role, key in WORDS["keys"].items()}
 """Role of a whole feature -> last part of its key (regular expression)."""
 _KEY_PREFIX = re.compile(r"(?:(?:robot\d*|arm\d*|states?|observations?|obs|left|right)_)+")
 

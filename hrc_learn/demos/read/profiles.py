@@ -398,24 +398,19 @@ def _means(
     return (sums[window:] - sums[:-window] - values[window:] + values[:-window]) / window
 
 
-@dataclass(frozen=True, kw_only=True)
-class CommandedRates:
-    """Evidence that commands named like positions are changes or velocities."""
-
-    slope: Float64[np.ndarray, " components"]
-    """Joint rate per unit of the command [1/s]; NaN for components that do not follow."""
-    fit: float
-    """Typical fraction of the variance of rates that the commands explain (R squared)."""
-
-
 def commanded_rates(
     trackings: Sequence[Mapping[str, Tracking]], fps: float
-) -> CommandedRates | None:
-    """Relation of position commands to joint rates; None if most joints do not follow so.
+) -> tuple[Float64[np.ndarray, " components"], float] | None:
+    """Evidence that commands named like positions are changes or velocities.
 
     Args:
         trackings: Tracking in each episode, as `track_quantities` gives it.
         fps: Frame rate [1/s].
+
+    Returns:
+        Joint rate per unit of the command [1/s], NaN for components that do not follow, and the
+        typical fraction of the variance of rates that the commands explain (R squared); None if
+        most joints do not follow so.
     """
     positions, rates = (
         [known[name] for known in trackings if name in known]
@@ -436,9 +431,7 @@ def commanded_rates(
     followed &= np.abs(slope - typical) < _SAME_SLOPE * abs(typical)
     if 2 * followed.sum() <= len(slope):
         return None
-    return CommandedRates(
-        slope=np.where(followed, slope, np.nan), fit=float(np.median(fit[followed]))
-    )
+    return np.where(followed, slope, np.nan), float(np.median(fit[followed]))
 
 
 def are_positions(trackings: Sequence[Mapping[str, Tracking]], fps: float) -> bool:

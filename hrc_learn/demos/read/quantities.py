@@ -1,9 +1,8 @@
 """Quantities of a dataset: their roles, and encodings of orientation."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.geometry import quaternion
+from hrc_learn.store import read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +25,7 @@ class Role:
     """Number of columns; None for one per joint."""
 
 
-_TABLES = tomllib.loads(files(__package__).joinpath("quantities.toml").read_text("utf-8"))
+_TABLES = read_toml(Path(__file__).with_name("quantities.toml"))
 
 ROLES = {name: Role(**row) for name, row in _TABLES["roles"].items()}
 """Every role. `euler_xyz` is roll, pitch, yaw about the fixed axes x, y, z and
@@ -37,18 +37,16 @@ SIZES: dict[str, list[tuple[float, str, float, str]]] = _TABLES["sizes"]
 """Largest value, unit, confidence, and second candidate, by the quantities whose unit their
 size tells."""
 
-ORIENTATION_ROLES = (
-    "quaternion_wxyz",
-    "quaternion_xyzw",
-    "rotation_vector",
-    "euler_xyz",
-    "euler_intrinsic_xyz",
-    "rotation_6d",
-    "rotation_6d_rows",
-    "rotation_matrix",
-    "pose_matrix",
-)
+ORIENTATION_ROLES: tuple[str, ...] = tuple(_TABLES["orientations"]["roles"])
 """Encodings of an orientation, preferred first."""
+DIMENSIONS: dict[str, dict[str, float]] = _TABLES["dimensions"]
+"""Dimension -> unit -> factor to the SI unit. A tick is 1/4096 of a turn, as the encoders of
+hobby servos count; the position of their zero is unknown. A byte counts from 0 to 255, as
+grippers and hands of Robotiq and Inspire do."""
+CONTRACT_QUANTITIES: dict[str, str] = _TABLES["contract"]
+"""Role in a contract -> quantity of a demonstration, "" for none; other roles have one name."""
+RECORDED: dict[str, list[str]] = _TABLES["recorded"]
+"""Keyword of a frame -> role, feature and component names."""
 
 INDEX_KEYS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Index columns that LeRobot maintains."""

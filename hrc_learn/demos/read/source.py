@@ -16,12 +16,8 @@ from hrc_learn.demos.demonstration import (
 )
 from hrc_learn.demos.image_features import extracted_features
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
-from hrc_learn.demos.read.columns import (
-    ColumnMapping,
-    ColumnSelection,
-    MappingSpec,
-    map_columns,
-)
+from hrc_learn.demos.read import profiles
+from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.contract import Contract, Sidecar, fingerprint, read_sidecar
 from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
@@ -39,12 +35,6 @@ from hrc_learn.demos.read.frames import (
 )
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand
-from hrc_learn.demos.read.profiles import (
-    Tracking,
-    are_positions,
-    commanded_rates,
-    track_quantities,
-)
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, demonstration_fields
 from hrc_learn.demos.read.unit_evidence import FEWEST_JOINTS
 from hrc_learn.demos.read.units import (
@@ -57,7 +47,6 @@ from hrc_learn.demos.read.units import (
 _SAMPLED = 32
 """Episodes that decide on units."""
 _COMMAND = "command_position"
-_TRACKED = ("joint_position", _COMMAND)
 _WHOLE_STEP = (0.1, 1.5)
 """Motion per step and unit of the command that counts as 1."""
 
@@ -160,12 +149,12 @@ class OpenedDataset:
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
         """Decide on units as `units_from_episodes` does, and whether commands are changes."""
         fps, trackings = self.folder.fps, []
+        asked = _COMMAND in self.columns.selections.keys() - {*self.declared_units, *given}
 
         def tracked() -> Iterator[tuple[EpisodeEntry, Quantities]]:
             for entry, quantities in episodes:
-                if len(trackings) < _SAMPLED:
-                    known = {r: quantities[r] for r in _TRACKED if r in quantities}
-                    trackings.append(track_quantities(known, fps))
+                if asked and len(trackings) < _SAMPLED:
+                    trackings.append(profiles.track_quantities(quantities, fps))
                 yield entry, quantities
 
         decisions, faults = units_from_episodes(
@@ -177,28 +166,27 @@ class OpenedDataset:
             sample,
             self.folder.robot_type or "",
         )
-        if _COMMAND in decisions.keys() - {*self.declared_units, *given}:
-            decisions |= _meaning_of_commands(
-                self.columns.selections, decisions, trackings, fps
-            )
+        if asked:
+            decisions |= _meaning_of_commands(self.columns, decisions, trackings, fps)
         return decisions, faults
 
 
 def _meaning_of_commands(
-    selections: Mapping[str, ColumnSelection],
+    columns: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
-    trackings: Sequence[Mapping[str, Tracking]],
+    trackings: Sequence[Mapping[str, profiles.Tracking]],
     fps: float,
 ) -> dict[str, UnitDecision]:
     """Decisions that change where commands are no positions of the joints."""
-    command, selection = decisions[_COMMAND], selections[_COMMAND]
-    if (found := commanded_rates(trackings, fps)) is None:
-        if not selection.numbered or are_positions(trackings, fps):
+    command, selection = decisions[_COMMAND], columns.selections[_COMMAND]
+    if (found := profiles.commanded_rates(trackings, fps)) is None:
+        if not selection.numbered or profiles.are_positions(trackings, fps):
             return {}
         text = "names no components, and the joints do not follow it"
         evidence = f"{selection.columns[0][0]} {text}"
         return {_COMMAND: replace(command, confidence=0.3, evidence=evidence, leader="")}
-    scale = float(np.nanmedian(found.slope)) / fps
+    slope, fit = found
+    scale = float(np.nanmedian(slope)) / fps
     # A controller that lags makes a part of each step.
     factor = "" if _WHOLE_STEP[0] < scale < _WHOLE_STEP[1] else f"{scale:.2g} "
     # A gripper without a name of its own comes last.
@@ -206,20 +194,19 @@ def _meaning_of_commands(
     hands.append(selection.numbered or is_hand(selection.labels[-1]))
     units = tuple(
         command.unit_of(i) if no and hand else f"{factor}{command.unit}/step"
-        for i, (no, hand) in enumerate(zip(np.isnan(found.slope), hands, strict=True))
+        for i, (no, hand) in enumerate(zip(np.isnan(slope), hands, strict=True))
     )
     evidence = (
-        f"the joints follow its sum ({scale:.2g} {command.unit} per unit, R2 {found.fit:.2f}), "
+        f"the joints follow its sum ({scale:.2g} {command.unit} per unit, R2 {fit:.2f}), "
         f"so that it holds changes, not positions"
     )
-    steps = replace(command, unit=units[0], units=units, guessed=True, evidence=evidence)
+    steps = replace(command, unit=units[0], guessed=True, evidence=evidence)
+    steps = replace(steps, units=units if len({*units}) > 1 else ())
     joints = decisions["joint_position"]
-    if not selections["joint_position"].numbered or len(units) >= FEWEST_JOINTS:
+    if not columns.selections["joint_position"].numbered or len(units) >= FEWEST_JOINTS:
         return {_COMMAND: steps}
-    text = (
-        f"{joints.evidence}; {len(units)} columns without names that move by changes per step"
-    )
-    text += " may be a pose, which is read with --mapping position KEY[0:3]"
+    text = f"{joints.evidence}; {len(units)} columns without names that move by changes may be"
+    text += " a pose, which is read with --mapping position KEY[0:3]"
     return {_COMMAND: steps, joints.role: replace(joints, confidence=0.5, evidence=text)}
 
 

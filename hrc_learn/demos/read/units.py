@@ -18,32 +18,15 @@ from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand, role_of_key
-from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
+from hrc_learn.demos.read.quantities import DIMENSIONS, ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.unit_evidence import CONFIDENT, Guess, Sizes
-
-_DIMENSIONS: dict[str, dict[str, float]] = {
-    "angle": {"rad": 1.0, "deg": math.pi / 180, "tick": 2 * math.pi / 4096},
-    "angular velocity": {"rad/s": 1.0, "deg/s": math.pi / 180, "tick/s": 2 * math.pi / 4096},
-    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "torque": {"N m": 1.0, "N mm": 1e-3},
-    "pixels": {"px": 1.0},
-    "ratio": {"1": 1.0, "%": 1e-2, "byte": 1 / 255},
-}
-"""Dimension -> unit -> factor to the SI unit. A tick is 1/4096 of a turn, as the encoders of
-hobby servos count; the position of their zero is unknown. A byte counts from 0 to 255, as
-grippers and hands of Robotiq and Inspire do."""
 
 _STEP = re.compile(r"(?:(\d+\.?\d*(?:e-?\d+)?) )?(.+)/step")
 """Unit of commands that are added to the joint positions: rad/step, or 0.05 rad/step for values
 that were scaled."""
 
-_FOLLOWERS = {
-    "joint_velocity": "joint_position",
-    "command_position": "joint_position",
-    "command_velocity": "joint_position",
-}
-"""Quantity -> quantity whose unit it takes over if nothing is declared."""
+_FOLLOWERS = ("joint_velocity", "command_position", "command_velocity")
+"""Quantities that take over the unit of the joint positions if nothing is declared."""
 _JOINTS = ("joint_position", "command_position")
 _GUESSABLE = (*_JOINTS, *unit_evidence.GUESSED_BY_SIZE)
 
@@ -115,7 +98,7 @@ class UnitDecision:
     @property
     def si_unit(self) -> str:
         """Unit after the conversion: that of the quantity, or "1" for a fraction of a range."""
-        own = "1" if self.unit in _DIMENSIONS["ratio"] else ROLES[self.role].unit
+        own = "1" if self.unit in DIMENSIONS["ratio"] else ROLES[self.role].unit
         return own + "/step" * bool(self.steps.any())
 
     def unit_of(self, component: int) -> str:
@@ -146,11 +129,11 @@ def unit_factor(role: str, unit: str) -> float:
 def units_of(role: str) -> dict[str, float]:
     """Units of a quantity with their factors; commands come in units per step as well."""
     own = ROLES[role].unit
-    options = next(units for units in _DIMENSIONS.values() if own in units)
+    options = next(units for units in DIMENSIONS.values() if own in units)
     if role in ("gripper", "joint_position", "command_position"):
         # Grippers and hands give a fraction of their opening, hobby arms of their range.
         # Fingers of some slide, in metres.
-        options = options | _DIMENSIONS["ratio"] | {"m": 1.0}
+        options = options | DIMENSIONS["ratio"] | {"m": 1.0}
     return options
 
 
@@ -185,7 +168,7 @@ def decide_units(
             decisions[role] = replace(
                 _stated(role, named), confidence=0.99, evidence="the names state it"
             )
-        elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
+        elif role in _FOLLOWERS and (leader := decisions.get("joint_position")):
             decisions[role] = _following(role, leader)
         elif role == "time":
             decisions[role] = _guess_time(frame_step)
@@ -297,7 +280,7 @@ def _guess_joint_units(
 
 def _guess_time(frame_step: float) -> UnitDecision:
     """Unit of the stamps: the one that brings their step closest to the frame rate."""
-    sizes = _DIMENSIONS["time"]
+    sizes = DIMENSIONS["time"]
     # The bound avoids the logarithm of a step of zero.
     off = {unit: abs(math.log10(max(frame_step, 1e-3) * size)) for unit, size in sizes.items()}
     unit = min(off, key=off.__getitem__)
@@ -399,7 +382,7 @@ def _contradictions(
         return
     # Components that hardly move have no size to compare, and fractions are no angles.
     units = [decision.unit_of(i) for i in range(len(size))]
-    moving = (size > 1e-2) & [unit not in _DIMENSIONS["ratio"] for unit in units]
+    moving = (size > 1e-2) & [unit not in DIMENSIONS["ratio"] for unit in units]
     known = [(entry, own[role].peak) for entry, own in measured if role in own]
     if not moving.any() or not known:
         return
