@@ -1,14 +1,17 @@
 """Machine code of single operations against PyTorch's own."""
 
 import math
+import operator
+import random
 
+import numpy as np
 import pytest
 import sampling
 import torch
 from torch import Tensor, nn
 
-from hrc_learn.deploy import UnknownOperationError
-from hrc_learn.deploy.native_code import NativeCode, NativeStep, assemble
+from hrc_learn.deploy import UnknownOperationError, native_code
+from hrc_learn.deploy.native_code import NativeCode, NativeStep, assemble, lanes_of
 from hrc_learn.deploy.scalar_program import ScalarProgram, scalar_program
 
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 0.5, math.inf, -math.inf, math.nan)
@@ -134,3 +137,125 @@ def test_what_no_result_needs_is_left_out():
     kept = program.emit("sin", x)
     program.results["command"] = [kept]
     assert program.needed() == [x, kept]
+
+
+def defaults(x: Tensor) -> list[Tensor]:
+    """Operations with what PyTorch takes where it is not told otherwise; x (24,)."""
+    a, b = x[:12].reshape(2, 2, 3), x[12:].reshape(2, 2, 3)
+    none = a[:0]
+    return [
+        y.to(x.dtype).flatten()
+        for y in (
+            a.sum(), a.mean(), a.amax(), (a > 0.2).any(), (a > -9).all(), a.sum((0, 2)),
+            torch.linalg.vector_norm(a), torch.linalg.cross(a, b), torch.linalg.vecdot(a, b),
+            none.sum(0), (none > 0).any(0), (none > 0).all(0), a.argmax(-1),
+            torch.linalg.vector_norm(none, dim=0), a.amax((1, 2), keepdim=True),
+            torch.nn.functional.pad(a, (1, 1), value=2.5), torch.addcmul(a, b, b),
+            torch.addcdiv(a, b, b), a.gather(2, b.argmax(-1, keepdim=True)), a.to(torch.bool),
+        )
+    ]  # fmt: skip
+
+
+def test_operations_without_options_equal_those_of_torch():
+    numbers = torch.rand(ROWS, generator=sampling.generator(), dtype=torch.float64) - 0.4
+    expected = torch.cat(defaults(numbers))
+    vectors = (torch.zeros(1, dtype=torch.float64), numbers, torch.zeros_like(expected))
+
+    class Defaults(nn.Module):
+        def forward(self, state: Tensor, observation: Tensor, command: Tensor) -> None:
+            command.copy_(torch.cat(defaults(observation)))
+
+    program = scalar_program(
+        torch.export.export(Defaults(), vectors, strict=False), torch.float64
+    )
+    code = NativeCode(program, ("state", "observation", "command"), 1)
+    NativeStep(assemble(code.text), 1, code.workspace)(vectors)
+    torch.testing.assert_close(vectors[2], expected, rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("length", [1, 5])
+def test_values_wait_in_as_few_slots_as_are_in_use_at_once(monkeypatch, seed, length):
+    """Of a random program, cut into functions of so many instructions."""
+    monkeypatch.setattr(native_code, "_LENGTH", length)
+    rng, program = random.Random(seed), ScalarProgram(torch.float64)
+    values = [program.input("observation", row, 0) for row in range(4)]
+    meaning = {x: operator.itemgetter(row) for row, x in enumerate(values)}
+    for _ in range(24):
+        name, of = rng.choice([("add", np.add), ("mul", np.multiply), ("max", np.maximum)])
+        a, b = rng.sample(values, 2)
+        x = program.emit(name, a, b)
+        f, g = meaning[a], meaning[b]
+        meaning[x] = lambda numbers, of=of, f=f, g=g: of(f(numbers), g(numbers))
+        values.append(x)
+    program.results["command"] = chosen = rng.sample(values[4:], 6)
+    program.results["state"] = [values[-1]]
+    code = NativeCode(program, ("state", "observation", "command"), 2)
+
+    order = native_code._depth_first(program)
+    place = {x: k // length for k, x in enumerate(order)}
+    assert sorted(order) == [x for x in program.needed() if x >= 4]
+    waits = dict.fromkeys([*chosen, values[-1]], max(place.values()) + 1)
+    for x in order:
+        for y in program.instructions[x][1:]:
+            assert y < 4 or order.index(y) < order.index(x)
+            if y >= 4 and place[x] > place[y]:
+                waits[y] = max(waits.get(y, 0), place[x])
+    used = [
+        sum(place[x] <= k <= last for x, last in waits.items())
+        for k in range(max(place.values()) + 1)
+    ]
+    assert code.workspace == 2 * max(used)
+
+    numbers = torch.randn(4, 2, generator=sampling.generator(), dtype=torch.float64)
+    state, command = numbers.new_zeros(1, 2), numbers.new_zeros(6, 2)
+    NativeStep(assemble(code.text), 2, code.workspace)([state, numbers, command])
+    for row, x in zip([*command, state[0]], [*chosen, values[-1]], strict=True):
+        np.testing.assert_allclose(row, meaning[x](numbers.numpy()))
+
+
+@pytest.mark.parametrize(
+    ("features", "width"),
+    [({}, 16), ({"avx2": True}, 32), ({"avx2": True, "avx512f": True}, 64)],
+)
+def test_a_vector_register_holds_as_many_numbers_as_fit(monkeypatch, features, width):
+    monkeypatch.setattr(native_code.binding, "get_host_cpu_features", lambda: features)
+    assert lanes_of(np.dtype(np.float64)) == width / 8
+    assert lanes_of(np.dtype(np.float32)) == width / 4
+
+
+def test_programs_fold_choose_and_negate():
+    program = ScalarProgram(torch.float64)
+    x, y = (program.input("observation", row, 0) for row in (0, 1))
+    yes, no = program.constant(True), program.constant(False)
+    assert program.emit("select", yes, x, y) == x
+    assert program.emit("select", no, x, y) == y
+    assert program.emit("select", program.emit("gt", x, y), x, x) == x
+    for name, complement in (("lt", "not lt"), ("eq", "ne"), ("ge", "not ge")):
+        negated = program.emit("not", program.emit(name, x, y))
+        assert program.instructions[negated] == (complement, x, y)
+        assert program.boolean[negated]
+    truth = program.emit("gt", x, y)
+    number = program.as_number(truth)
+    assert not program.boolean[number]
+    one, zero = (program.constant(v) for v in (1.0, 0.0))
+    assert program.instructions[number] == ("select", truth, one, zero)
+    assert program.instructions[program.as_truth(x)] == ("ne", x, zero)
+    assert program.as_truth(truth) == truth
+    mixed = program.emit("select", truth, truth, x)
+    assert program.instructions[mixed] == ("select", truth, number, x)
+    # Only one factor of a product is 1, and only the divisor of a quotient.
+    assert program.emit("mul", x, one) == program.emit("mul", one, x) == x
+    assert program.emit("div", one, x) not in (x, one)
+    for name, value in (
+        ("max", 3.0),
+        ("min", 2.0),
+        ("and", True),
+        ("or", True),
+        ("atan2", None),
+    ):
+        folded = program.value(program.emit(name, program.constant(2.0), program.constant(3.0)))
+        assert folded == (math.atan2(2, 3) if value is None else value)
+    assert program.value(program.emit("not", yes)) is False
+    assert program.constant(-0.0) != zero
+    assert program.constant(math.nan) == program.constant(math.nan)

@@ -423,6 +423,7 @@ def test_the_step_begins_with_the_parameters_and_the_image_jacobian_of_the_paper
     found = [config.linear_speed, config.angular_speed, config.safety.tcp_speed]
     assert [*found, config.null_damping] == list(settings.values())
     assert runner.observation["dt"] == 0.002
+    assert runner.observation["goals.vision_enabled"] == 0
     network = controller.estimator.network
     assert float(network.width) == pytest.approx(0.1)
     first = np.ravel(INITIAL_IMAGE_JACOBIAN)

@@ -309,6 +309,7 @@ def served_robot():
 @pytest.fixture
 def robot(served_robot):
     robot = served_robot.ServedRobot(Simulated())
+    assert not robot.answered
     robot.joint_position_control(np.zeros(7))  # a step needs a command before it
     return robot
 
