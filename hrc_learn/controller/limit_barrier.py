@@ -360,9 +360,10 @@ class SpeedBarrier(nn.Module):
         braking = x / T
         # Faster than y v while the acceleration ramps down; slower if it brakes harder than
         # that, and past zero if it cannot end the braking before.
-        ramp, hard = towards + braking, towards.clamp(max=0) ** 2
-        swing = torch.where(hard > 2 * self.jerk * x, hard, ramp.clamp(max=0) ** 2)
-        excess = torch.maximum(ramp.clamp(min=0) ** 2, swing) / (2 * self.jerk)
+        # Then |a| > |v|/T, as T > max(A_i/j_i)/(2 kappa).
+        hard = towards.clamp(max=0) ** 2
+        ramp = torch.where(hard > 2 * self.jerk * x, hard, (towards + braking) ** 2)
+        excess = ramp / (2 * self.jerk)
         rho = (self.decay * T).clamp(min=1)
         excess = excess + (1 - (1 + rho.log()) / rho) * x
         fastest = x + excess
