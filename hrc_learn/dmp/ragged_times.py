@@ -57,16 +57,17 @@ def motion(
     if torch.compiler.is_compiling():
         return _gathered(_table(response, order, coordinates), s, coordinates)
     refuse_nested_forward(s)
-    return _Motion.apply(s, coordinates, response, order)  # pyright: ignore[reportReturnType]
+    result: Any = _Linear.apply(s, coordinates, response, order, False)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
 class CoefficientTable:
     """Map from coordinates to the coefficients of a motion, or of one of its derivatives by s.
 
-    Piece p has K coefficients, of 1, u, u^2 ... with u from -1 to 1 along the piece. One more
-    piece covers all times after the forcing ends: there the state at its end, relative to the
-    goal, decays as the unforced spring does.
+    Piece p has K coefficients: of 1, u, u^2 ... with u from -1 to 1 along the piece, and of
+    functions of time that are not polynomial. One more piece covers all times after the forcing
+    ends: there the state at its end, relative to the goal, decays as the unforced spring does.
     """
 
     response: Response
@@ -76,8 +77,8 @@ class CoefficientTable:
     """Maps coordinates to the coefficients of all pieces, one piece after another."""
     size: int
     """K, the number of coefficients of a piece."""
-    others: Float[Tensor, "M extra"] | None
-    """Maps coordinates to the factors of functions that are not polynomial; see `extra`."""
+    others: int
+    """Number of functions that are not polynomial."""
 
     @property
     def pieces(self) -> int:
@@ -96,20 +97,20 @@ class CoefficientTable:
         if periodic:  # the remainder may round up to the divisor
             piece = piece.clamp(max=pieces - 1)
         u = 2 * (x - piece if periodic else x.frac()).to(dtype) - 1
-        powers = powers_of(u, self.size)
+        degree, others = self.size - self.others, []
+        if periodic:
+            others = spring_rows(self.response, s, self.order).to(dtype).unbind(-1)
+        elif self.others:
+            others = [approach_curve(s, self.response.approach, self.order).to(dtype)]
+        powers = powers_of(u, degree, others)
         if periodic or not (torch.compiler.is_compiling() or piece.max() == pieces):
             return piece, powers
         back = spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
         goal = torch.full_like(s, float(self.order == 0))[..., None]
         back = torch.cat([back, goal], dim=-1).to(dtype)
-        back = torch.nn.functional.pad(back, (0, self.size - back.shape[-1]))
+        back = torch.nn.functional.pad(back, (0, degree - back.shape[-1]))
+        back = torch.cat([back, powers[..., degree:]], dim=-1)
         return piece, torch.where((piece == pieces)[..., None], back, powers)
-
-    def extra(self, s: Float[Tensor, "B T"], dtype: torch.dtype) -> Float[Tensor, "B T extra"]:
-        """Functions of time that multiply the columns of `others`."""
-        if self.response.forced.periodic:
-            return spring_rows(self.response, s, self.order).to(dtype)
-        return approach_curve(s, self.response.approach, self.order).to(dtype)[..., None]
 
 
 def spring_rows(response: Response, s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:
@@ -155,40 +156,24 @@ def _tabulate(
         others[N + 2, 0] = -1.0
         coefficients = torch.cat([row, 0 * free, goal], dim=-1)
     else:
+        others = others[:, : int(response.approach > 0)]
         if response.approach:
             start = torch.zeros_like(start)
-            others = others[:, :1]
             others[N + 1], others[N + 2] = -1.0, 1.0
         coefficients = torch.cat([row, rate, start, goal - start], dim=-1)
-        after = _piece_after_the_end(response, coefficients)
+        # One more piece: the state at the end, relative to the goal, and the goal.
+        after = torch.zeros_like(coefficients[:1])
+        after[0, :2] = response.state(row.new_tensor(forced.end))
+        after[0, 0, -1] -= 1.0
+        if response.approach:
+            after[0, :2, N + 1 :] = 0.0
+        after[0, 2, -1] = 1.0
         coefficients = torch.cat([coefficients, after])
     if not torch.compiler.is_compiling():
         coefficients = _lowest_degree(coefficients, NEGLIGIBLE * torch.finfo(dtype).eps)
+    coefficients = torch.cat([coefficients, others.mT.expand(len(coefficients), -1, -1)], dim=1)
     matrix = without_subnormals(coefficients.flatten(0, 1).mT.to(device, dtype)).contiguous()
-    needed = forced.periodic or response.approach
-    return CoefficientTable(
-        response,
-        order,
-        matrix,
-        coefficients.shape[1],
-        others.to(device, dtype) if needed else None,
-    )
-
-
-def _piece_after_the_end(
-    response: Response, coefficients: Float[Tensor, "pieces P M"]
-) -> Float[Tensor, "1 P M"]:
-    """State at the end of the forcing, relative to the goal, and the goal."""
-    forced, N = response.forced, response.basis.count
-    end = coefficients.new_tensor(forced.end)
-    E = response.spring.propagator(forced.end).to(coefficients)
-    after = torch.zeros_like(coefficients[:1])
-    after[0, :2, :N] = forced(end)
-    after[0, :2, N] = E[:, 1]
-    if not response.approach:
-        after[0, :2, N + 1], after[0, :2, N + 2] = E[:, 0], -E[:, 0]
-    after[0, 2, N + 2] = 1.0
-    return after
+    return CoefficientTable(response, order, matrix, coefficients.shape[1], others.shape[1])
 
 
 def _spring_pieces(response: Response, order: int) -> Float[Tensor, "pieces P 2"]:
@@ -265,170 +250,128 @@ def _gathered(
     piece, powers = table.locate(s, coordinates.dtype)
     rows = _rows(table, coordinates)
     index = piece.long()[..., None, None].expand(-1, -1, *rows.shape[2:])
-    y = (rows.gather(1, index) * powers[..., None]).sum(-2)
-    if table.others is not None:
-        y = y + table.extra(s, y.dtype) @ (coordinates @ table.others).mT
-    return y
+    return (rows.gather(1, index) * powers[..., None]).sum(-2)
 
 
-def blocks(s: Float[Tensor, "B T"]) -> Iterator[tuple[slice, slice]]:
-    """Slices of the batch and of time with about `CHUNK` samples each."""
-    T = s.shape[1]
-    for part in chunks(s):
-        for first in range(0, T, CHUNK["cpu"]):
-            yield part, slice(first, first + CHUNK["cpu"])
+def blocks(s: Float[Tensor, "B T"], most: int) -> Iterator[tuple[slice, slice]]:
+    """Slices of the batch and of time with at most `most` samples each."""
+    for part in chunks(s, most):
+        for first in range(0, s.shape[1], most):
+            yield part, slice(first, first + most)
 
 
-def chunks(s: Float[Tensor, "B T"]) -> Iterator[slice]:
-    """Slices of the batch with about `CHUNK` samples each."""
-    most = CHUNK.get(s.device.type, CHUNK["cpu"])
+def chunks(s: Float[Tensor, "B T"], most: int | None = None) -> Iterator[slice]:
+    """Slices of the batch with about `most` samples each; None: `CHUNK`."""
+    most = most or CHUNK.get(s.device.type, CHUNK["cpu"])
     size = max(1, most // max(s.shape[1], 1))
     return (slice(i, i + size) for i in range(0, s.shape[0], size))
 
 
-class _Motion(torch.autograd.Function):
+def _motion(s: Tensor, coordinates: Tensor, response: Response, order: int) -> Tensor:
     """`motion` in one pass over the samples."""
+    table = _table(response, order, coordinates)
+    B, D, _ = coordinates.shape
+    y, bags = empty_in_large_pages(coordinates, B, s.shape[1], D), None
+    for part in chunks(s):
+        x = coordinates[part]
+        piece, powers = table.locate(s[part], x.dtype)
+        flat, pieces = _flat_pieces(piece)
+        rows = _rows(table, x, pieces)
+        if x.is_cpu and bags is None:
+            # Looked up, because computing the indices of each sample takes twice as long.
+            count = len(x) * table.pieces * table.size
+            bags = torch.arange(count, dtype=torch.int32).view(-1, table.size)
+        if bags is None:
+            values = power_by_power(rows, flat, powers)
+        else:
+            # A weighted sum of rows per sample: the only operation that does not write
+            # the gathered rows to memory first.
+            values = torch.nn.functional.embedding_bag(
+                bags.index_select(0, flat),
+                rows.contiguous().view(-1, D),
+                mode="sum",
+                per_sample_weights=powers.view(-1, table.size),
+            ).view(len(x), -1, D)
+        if len(x) == B:
+            return values
+        y[part] = values
+    return y
+
+
+def _adjoint(s: Tensor, grad: Tensor, response: Response, order: int) -> Tensor:
+    """Gradient of `_motion` by its coordinates, linear in the gradient by the motion."""
+    table = _table(response, order, grad)
+    B, _, D = grad.shape
+    by_x = grad.new_empty(B, D, len(table.matrix))
+    for part in chunks(s):
+        g = grad[part]
+        piece, powers = table.locate(s[part], g.dtype)
+        (flat, pieces), powers = _flat_pieces(piece), powers.view(-1, table.size)
+        # The samples of each piece form one bag.
+        rising = bool((flat[1:] >= flat[:-1]).all())
+        sample = torch.arange(len(flat), device=s.device) if rising else flat.argsort()
+        counts = torch.bincount(flat, minlength=len(g) * pieces)
+        sums = [
+            torch.nn.functional.embedding_bag(
+                sample,
+                g.reshape(-1, D),
+                counts.cumsum(0) - counts,
+                mode="sum",
+                per_sample_weights=power.contiguous() if rising else power[sample],
+            )
+            for power in powers.unbind(-1)
+        ]
+        rows = torch.stack(sums, dim=-1).view(len(g), -1, D, table.size).movedim(2, 1)
+        rows = rows.reshape(len(g) * D, -1)
+        matrix = table.matrix[:, : rows.shape[-1]]
+        by_x[part] = (rows @ matrix.mT).view(len(g), D, -1)
+    return by_x
+
+
+class _Linear(torch.autograd.Function):
+    """`_motion` or `_adjoint`, each linear in its values and the derivative of the other."""
 
     @staticmethod
-    def forward(s, coordinates, response, order):
-        table = _table(response, order, coordinates)
-        B, D, _ = coordinates.shape
-        y = empty_in_large_pages(coordinates, B, s.shape[1], D)
-        bags = None
-        for part in chunks(s):
-            x = coordinates[part]
-            piece, powers = table.locate(s[part], y.dtype)
-            flat, pieces = _flat_pieces(piece)
-            rows = _rows(table, x, pieces)
-            if y.is_cpu and bags is None:
-                # Looked up, because computing the indices of each sample takes twice as long.
-                count = len(x) * table.pieces * table.size
-                bags = torch.arange(count, dtype=torch.int32).view(-1, table.size)
-            if bags is None:
-                y[part] = power_by_power(rows, flat, powers)
-            else:
-                # A weighted sum of rows per sample: the only operation that does not write
-                # the gathered rows to memory first.
-                y[part] = torch.nn.functional.embedding_bag(
-                    bags.index_select(0, flat),
-                    rows.contiguous().view(-1, D),
-                    mode="sum",
-                    per_sample_weights=powers.view(-1, table.size),
-                ).view(len(x), -1, D)
-            if table.others is not None:
-                y[part] += table.extra(s[part], y.dtype) @ (x @ table.others).mT
-        return y
+    def forward(s, values, response, order, adjoint):
+        return (_adjoint if adjoint else _motion)(s, values, response, order)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        s, coordinates, ctx.response, ctx.order = inputs
-        ctx.save_for_backward(s, coordinates)
-        ctx.save_for_forward(s, coordinates)
+        s, values, *ctx.others = inputs
+        ctx.save_for_backward(s, values)
+        ctx.save_for_forward(s, values)
 
     @staticmethod
     def backward(ctx, grad):
-        s, x = ctx.saved_tensors
-        by_s = by_x = None
+        (s, values), (response, order, adjoint) = ctx.saved_tensors, ctx.others
+        by_s = by_values = None
         if ctx.needs_input_grad[0]:
-            by_s = _by_time(grad, _Motion.apply(s, x, ctx.response, ctx.order + 1), s)
+            by_motion, coordinates = (values, grad) if adjoint else (grad, values)
+            rate: Any = _Linear.apply(s, coordinates, response, order + 1, False)
+            by_s = (by_motion * rate).sum(-1).to(s.dtype)
         if ctx.needs_input_grad[1]:
-            by_x = _Adjoint.apply(s, grad, ctx.response, ctx.order)
-        return by_s, by_x, None, None
+            by_values = _Linear.apply(s, grad, response, order, not adjoint)
+        return by_s, by_values, None, None, None
 
     @staticmethod
-    def jvp(ctx, ds, dx, *_):
-        s, x = ctx.saved_tensors
+    def jvp(ctx, ds, dvalues, *_):
+        (s, values), (response, order, adjoint) = ctx.saved_tensors, ctx.others
         change = 0.0
-        if dx is not None:
-            change = _Motion.apply(s, dx, ctx.response, ctx.order)
+        if dvalues is not None:
+            change = _Linear.apply(s, dvalues, response, order, adjoint)
         if ds is not None:
-            rate = _Motion.apply(s, x, ctx.response, ctx.order + 1)
-            change = change + rate * ds.to(rate)[..., None]
+            ds = ds.to(values)[..., None]
+            moved = values * ds if adjoint else values
+            rate: Any = _Linear.apply(s, moved, response, order + 1, adjoint)
+            change = change + (rate if adjoint else rate * ds)
         return change
 
     @staticmethod
-    def vmap(info, in_dims, s, coordinates, response, order):
-        return _flattened(_Motion, info, in_dims, s, coordinates, response, order)
-
-
-class _Adjoint(torch.autograd.Function):
-    """Gradient of `_Motion` by its coordinates, linear in the gradient by the motion."""
-
-    @staticmethod
-    def forward(s, grad, response, order):
-        table = _table(response, order, grad)
-        B, _, D = grad.shape
-        by_x = grad.new_empty(B, D, len(table.matrix))
-        for part in chunks(s):
-            g = grad[part]
-            piece, powers = table.locate(s[part], g.dtype)
-            (flat, pieces), powers = _flat_pieces(piece), powers.view(-1, table.size)
-            # The samples of each piece form one bag.
-            rising = bool((flat[1:] >= flat[:-1]).all())
-            sample = torch.arange(len(flat), device=s.device) if rising else flat.argsort()
-            counts = torch.bincount(flat, minlength=len(g) * pieces)
-            sums = [
-                torch.nn.functional.embedding_bag(
-                    sample,
-                    g.reshape(-1, D),
-                    counts.cumsum(0) - counts,
-                    mode="sum",
-                    per_sample_weights=power.contiguous() if rising else power[sample],
-                )
-                for power in powers.unbind(-1)
-            ]
-            rows = torch.stack(sums, dim=-1).view(len(g), -1, D, table.size).movedim(2, 1)
-            rows = rows.reshape(len(g) * D, -1)
-            matrix = table.matrix[:, : rows.shape[-1]]
-            by_x[part] = (rows @ matrix.mT).view(len(g), D, -1)
-            if table.others is not None:
-                by_x[part] += (g.mT @ table.extra(s[part], g.dtype)) @ table.others.mT
-        return by_x
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        s, grad, ctx.response, ctx.order = inputs
-        ctx.save_for_backward(s, grad)
-        ctx.save_for_forward(s, grad)
-
-    @staticmethod
-    def backward(ctx, weight):
-        s, grad = ctx.saved_tensors
-        by_s = by_grad = None
-        if ctx.needs_input_grad[0]:
-            by_s = _by_time(grad, _Motion.apply(s, weight, ctx.response, ctx.order + 1), s)
-        if ctx.needs_input_grad[1]:
-            by_grad = _Motion.apply(s, weight, ctx.response, ctx.order)
-        return by_s, by_grad, None, None
-
-    @staticmethod
-    def jvp(ctx, ds, dgrad, *_):
-        s, grad = ctx.saved_tensors
-        change = 0.0
-        if dgrad is not None:
-            change = _Adjoint.apply(s, dgrad, ctx.response, ctx.order)
-        if ds is not None:
-            moved = grad * ds.to(grad)[..., None]
-            change = change + _Adjoint.apply(s, moved, ctx.response, ctx.order + 1)
-        return change
-
-    @staticmethod
-    def vmap(info, in_dims, s, grad, response, order):
-        return _flattened(_Adjoint, info, in_dims, s, grad, response, order)
-
-
-def _by_time(grad: Any, rate: Any, s: Tensor) -> Tensor:
-    """Gradient by the times, from the gradient by the motion and the motion's derivative."""
-    return (grad * rate).sum(-1).to(s.dtype)
-
-
-def _flattened(
-    function: Any, info: Any, in_dims: Any, s: Tensor, x: Tensor, *others: Any
-) -> tuple[Tensor, int]:
-    """Apply a function to a `torch.vmap` axis by merging it with the batch axis."""
-    s, x = (
-        value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)
-        for value, dim in zip((s, x), in_dims, strict=False)
-    )
-    result = function.apply(s.flatten(0, 1), x.flatten(0, 1), *others)
-    return result.unflatten(0, s.shape[:2]), 0
+    def vmap(info, in_dims, s, values, *others):
+        # The mapped axis is merged with the batch axis.
+        s, values = (
+            x.expand(info.batch_size, *x.shape) if dim is None else x.movedim(dim, 0)
+            for x, dim in zip((s, values), in_dims, strict=False)
+        )
+        result: Any = _Linear.apply(s.flatten(0, 1), values.flatten(0, 1), *others)
+        return result.unflatten(0, s.shape[:2]), 0

@@ -9,7 +9,7 @@ table of polynomials.
 import json
 import math
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -50,8 +50,10 @@ def chebyshev_points() -> Float[Tensor, "P"]:
     return (1 - torch.cos(torch.pi * k / DEGREE)) / 2
 
 
-def powers_of(u: Float[Tensor, "*batch"], size: int) -> Float[Tensor, "*batch K"]:
-    """Powers u^0 to u^(size - 1).
+def powers_of(
+    u: Float[Tensor, "*batch"], size: int, others: Sequence[Float[Tensor, "*batch"]] = ()
+) -> Float[Tensor, "*batch K"]:
+    """Powers u^0 to u^(size - 1), and other values after them.
 
     Products, because derivatives of `**` by tensors of exponents hold logarithms, of negative
     numbers too.
@@ -60,11 +62,13 @@ def powers_of(u: Float[Tensor, "*batch"], size: int) -> Float[Tensor, "*batch K"
         columns = [torch.ones_like(u)]
         for _ in range(1, size):
             columns.append(columns[-1] * u)
-        return torch.stack(columns, dim=-1)
+        return torch.stack([*columns, *others], dim=-1)
     # Written in place column by column: a product along rows of six takes twice as long.
-    powers = u.new_ones(*u.shape, size)
+    powers = u.new_ones(*u.shape, size + len(others))
     for k in range(1, size):
         torch.mul(powers[..., k - 1], u, out=powers[..., k])
+    for k, values in enumerate(others, start=size):
+        powers[..., k] = values
     return powers
 
 

@@ -19,6 +19,8 @@ from hrc_learn.dmp.samples import Samples
 
 REGULARIZATION = 1e-7
 """Default ridge of a fit: far above rounding, far below what a sensor resolves."""
+BLOCK = 2**13
+"""Samples whose columns are computed at a time: 3 MB, which fit the cache."""
 METHODS = ("trajectory", "ridge", "lwr")
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function of the even grid on which columns are orthonormal."""
@@ -114,15 +116,18 @@ def normal_products(
     mixing, _ = _orthonormal_columns(response, n, samples.s.device)
     D = samples.position.shape[1]
     products = known.new_zeros(len(known), n + D, n + D)
-    for part, span in blocks(samples.s):
+    for part, span in blocks(samples.s, BLOCK):
         s = samples.s[part, span]
         # One motion for each column, at the times of all demonstrations.
         columns = motion(response, s.reshape(1, -1), mixing.mT[None], 0).view(*s.shape, M)
         left = samples.position[part, :, span].double().mT - columns[..., n:] @ known[part]
-        columns = torch.cat([columns[..., :n], left], dim=-1)
         if not samples.complete:
             columns *= samples.mask[part, span][..., None]
-        products[part] += columns.mT @ columns
+            left *= samples.mask[part, span][..., None]
+        columns, sums = columns[..., :n], products[part]
+        sums[:, :n, :n] += columns.mT @ columns
+        sums[:, :n, n:] += columns.mT @ left
+        sums[:, n:, n:] += left.mT @ left
     return products
 
 
