@@ -1,0 +1,211 @@
+"""Columns of new episodes: those of a demonstration, if the motion is the demonstrated one."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from hrc_learn.demos import DatasetWriter, open_demos
+from hrc_learn.demos.dataset_views import arm_of_dataset
+from hrc_learn.kinematics import arm, panda
+from hrc_learn.learning.multiply_dataset import MultipliedColumns, pose_of
+
+pytestmark = pytest.mark.simulation
+
+FPS, FRAMES = 20, 24
+TIME = np.arange(FRAMES) / FPS
+# The lid is turned by more than half a turn, as a recorder's rotation vector may be.
+LID = np.array([0.4, -0.2, 0.1, 0.0, 0.0, 3.3])
+BLOCK = np.array([0.5, 0.1, 0.05, *Rotation.from_euler("z", 0.4).as_quat(scalar_first=True)])
+CUP = np.array([0.3, 0.3, 0.2])
+TOOL = tuple(f"ee.{axis}" for axis in ("x", "y", "z", "wx", "wy", "wz"))
+
+
+def joints(episode):
+    return panda.ready.numpy() + 0.1 * np.sin(TIME[:, None] + np.arange(7) + episode)
+
+
+class Case(NamedTuple):
+    """Demonstrations on disk, and the columns of episodes made of them."""
+
+    source: object
+    columns: MultipliedColumns
+    other: MultipliedColumns
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("columns") / "demos"
+    pose = ("x", "y", "z")
+    features = {
+        "observation.block": tuple(f"block.{a}" for a in (*pose, "qw", "qx", "qy", "qz")),
+        "observation.lid": tuple(f"lid.{a}" for a in (*pose, "wx", "wy", "wz")),
+        "observation.cup": ("first", "second", "third"),
+        "observation.mood": ("mood", "lamp"),
+        "action.tool": (*TOOL, "gripper"),
+    }
+    with DatasetWriter(folder, FPS, "panda", panda.joint_names, features) as writer:
+        for episode in range(2):
+            q = joints(episode)
+            tool = panda.forward(torch.from_numpy(q))
+            turns = Rotation.from_quat(tool.orientation.numpy(), scalar_first=True)
+            rate = np.gradient(q, TIME, axis=0)
+            vector = turns.as_rotvec()
+            flip = np.where((vector @ vector[0]) < 0, 1 - 2 * np.pi / turns.magnitude(), 1)
+            place = np.concatenate([tool.position.numpy(), vector * flip[:, None]], axis=1)
+            following = np.concatenate([place[1:], place[-1:]])
+            writer.start_episode("go")
+            for k in range(FRAMES):
+                opening = 0.08 - 0.002 * k
+                more = {
+                    "observation.block": BLOCK + [0.01 * episode, 0, 0, 0, 0, 0, 0],
+                    "observation.lid": LID,
+                    "observation.cup": CUP + episode,
+                    "observation.mood": [k * k / 100, float(k % 8 > 3)],
+                    "action.tool": [*following[k], opening + 1],
+                }
+                writer.add_frame(
+                    joint_position=q[k],
+                    joint_velocity=rate[k],
+                    command_position=q[k] + 0.01,
+                    position=tool.position[k].numpy(),
+                    orientation=tool.orientation[k].numpy(),
+                    gripper=opening,
+                    **more,
+                )
+            writer.save_episode()
+    source = open_demos(folder)
+    taught, given = arm_of_dataset(source), {"cup": "observation.cup[0:3]"}
+    made = (MultipliedColumns(source, taught, robot, given) for robot in (panda, arm("ur5e")))
+    return Case(source, *made)
+
+
+def on_disk(case, episode):
+    """Columns of a demonstration, read by PyArrow."""
+    path = case.source.folder.root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    rows = np.asarray(table["episode_index"]) == episode
+    return {key: np.stack(table[key].to_pylist())[rows] for key in case.columns.features}
+
+
+def still(pose):
+    return np.broadcast_to(pose, (FRAMES, 7)).copy()
+
+
+def seven(place, turn):
+    return np.concatenate([place, turn.as_quat(scalar_first=True)])
+
+
+def made_again(case, episode=0, **more):
+    """Values of the demonstrated motion."""
+    q = joints(episode)
+    lid = seven(LID[:3], Rotation.from_rotvec(LID[3:]))
+    cup = seven(CUP + episode, Rotation.identity())
+    block = BLOCK + [0.01 * episode, 0, 0, 0, 0, 0, 0]
+    given = {
+        "main": episode,
+        "phase": np.arange(FRAMES, dtype=float),
+        "joints": q,
+        "sent": q + 0.01,
+        "gripper": 0.08 - 0.002 * np.arange(FRAMES),
+        "objects": {"block": still(block), "lid": still(lid), "cup": still(cup)},
+    } | more
+    return case.columns.values(**given)
+
+
+@pytest.mark.parametrize("episode", [0, 1])
+def test_the_demonstrated_motion_gives_the_columns_of_the_demonstration(case, episode):
+    expected, made = on_disk(case, episode), made_again(case, episode)
+    assert made.keys() == expected.keys()
+    for key, values in expected.items():
+        np.testing.assert_allclose(made[key], values, atol=3e-6, err_msg=key)
+    assert "time" not in case.columns.features
+
+
+def test_objects_stand_where_their_columns_say(case):
+    found = case.columns.objects
+    assert found.keys() == {"block", "lid", "cup"}
+    np.testing.assert_allclose(found["block"].position[:, 0], (0.5, 0.51), atol=1e-6)
+    np.testing.assert_allclose(found["cup"].position, (CUP, CUP + 1), atol=1e-6)
+    np.testing.assert_allclose(found["cup"].orientation, [[1, 0, 0, 0]] * 2)
+    np.testing.assert_allclose(found["block"].orientation[1], BLOCK[3:], atol=1e-6)
+    own = Rotation.from_quat(found["lid"].orientation[0].numpy(), scalar_first=True)
+    assert (own * Rotation.from_rotvec(LID[3:]).inv()).magnitude() < 1e-6
+
+
+def test_objects_and_gripper_move_on_their_own(case):
+    away = [0.2, 0.1, 0.3]
+    turned = Rotation.from_rotvec([0, 0, 3.5])
+    lid = still(seven(LID[:3] + away, turned))
+    made = made_again(case, gripper=np.full(FRAMES, 0.03), objects={"lid": lid})
+    np.testing.assert_allclose(made["observation.lid"][:, :3], still_three(LID[:3] + away))
+    # The rotation vector continues the demonstrated one beyond half a turn.
+    np.testing.assert_allclose(made["observation.lid"][:, 3:], still_three([0, 0, 3.5]))
+    names = case.columns.features["observation.state"]["names"]
+    opening = made["observation.state"][:, names.index("gripper.pos")]
+    np.testing.assert_allclose(opening, 0.03)
+    block = on_disk(case, 0)["observation.block"]
+    np.testing.assert_allclose(made["observation.block"], block, atol=1e-6)
+
+
+def still_three(values):
+    return np.broadcast_to(values, (FRAMES, 3))
+
+
+def test_other_columns_are_carried_along_between_frames_and_switches_stay_switches(case):
+    phase = np.linspace(0, FRAMES - 1.3, FRAMES)
+    made = made_again(case, phase=phase, gripper=None)
+    shown = on_disk(case, 0)
+    mood = np.interp(phase, np.arange(FRAMES), shown["observation.mood"][:, 0])
+    np.testing.assert_allclose(made["observation.mood"][:, 0], mood, atol=1e-9)
+    lamp = shown["observation.mood"][np.rint(phase).astype(int), 1]
+    np.testing.assert_array_equal(made["observation.mood"][:, 1], lamp)
+    # A commanded opening comes before the measured one.
+    commanded = 1 + 0.08 - 0.002 * phase
+    np.testing.assert_allclose(case.columns.gripper(0, phase), commanded, atol=1e-6)
+
+
+def test_another_arm_puts_its_joints_in_the_place_of_the_demonstrated_ones(case):
+    six = arm("ur5e")
+    rng = np.random.default_rng(0)
+    q = six.ready.numpy() + 0.1 * rng.standard_normal((FRAMES, 6))
+    phase = np.arange(FRAMES, dtype=float)
+    made = case.other.values(0, phase, q, q + 0.02, None, {})
+    features, before = case.other.features, case.columns.features
+    old, new = (f["observation.state"]["names"] for f in (before, features))
+    assert features["observation.state"]["shape"] == [len(new)] == [len(old) - 2]
+    assert new[:6] == [f"{name}.pos" for name in six.joint_names]
+    assert new[6] == old[7]
+    assert new[7:13] == [f"{name}.vel" for name in six.joint_names]
+    assert new[13:] == old[15:]
+    assert features["action"]["names"] == [f"{name}.pos" for name in six.joint_names]
+    state = made["observation.state"]
+    np.testing.assert_allclose(state[:, :6], q)
+    np.testing.assert_allclose(state[:, 7:13], np.gradient(q, TIME, axis=0))
+    np.testing.assert_allclose(made["action"], q + 0.02)
+    tool = six.forward(torch.from_numpy(q)).position.numpy()
+    np.testing.assert_allclose(state[:, 13:16], tool)
+    np.testing.assert_allclose(made["action.tool"][:-1, :3], tool[1:])
+    np.testing.assert_allclose(made["action.tool"][-1, :3], tool[-1])
+    np.testing.assert_allclose(state[:, 6], on_disk(case, 0)["observation.state"][:, 7])
+
+
+@pytest.mark.parametrize("count", [3, 6, 7])
+def test_a_pose_is_a_position_with_a_rotation_vector_or_a_quaternion(count):
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    q = 2 * turn.as_quat(scalar_first=True)
+    turned = {3: [], 6: turn.as_rotvec(), 7: q}[count]
+    pose = pose_of(torch.tensor(np.array([[1.0, 2.0, 3.0, *turned]])))
+    np.testing.assert_allclose(pose.position, [[1, 2, 3]])
+    expected = [1, 0, 0, 0] if count == 3 else q / 2
+    np.testing.assert_allclose(pose.orientation[0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("columns", ["observation.cup[0:2]", "observation.block[0:4]"])
+def test_objects_of_other_numbers_of_columns_are_refused(case, columns):
+    taught = arm_of_dataset(case.source)
+    with pytest.raises(ValueError, match=r"objects\.cup\.columns=.* must be of 3, 6 or 7"):
+        MultipliedColumns(case.source, taught, panda, {"cup": columns})
