@@ -28,6 +28,10 @@ def joints(episode):
     return panda.ready.numpy() + 0.1 * np.sin(TIME[:, None] + np.arange(7) + episode)
 
 
+def moved(pose, x):
+    return np.array([pose[0] + x, *pose[1:]])
+
+
 class Case(NamedTuple):
     """Demonstrations on disk, and the columns of episodes made of them."""
 
@@ -61,7 +65,7 @@ def case(tmp_path_factory):
             for k in range(FRAMES):
                 opening = 0.08 - 0.002 * k
                 more = {
-                    "observation.block": BLOCK + [0.01 * episode, 0, 0, 0, 0, 0, 0],
+                    "observation.block": moved(BLOCK, 0.01 * episode),
                     "observation.lid": LID,
                     "observation.cup": CUP + episode,
                     "observation.mood": [k * k / 100, float(k % 8 > 3)],
@@ -104,7 +108,7 @@ def made_again(case, episode=0, **more):
     q = joints(episode)
     lid = seven(LID[:3], Rotation.from_rotvec(LID[3:]))
     cup = seven(CUP + episode, Rotation.identity())
-    block = BLOCK + [0.01 * episode, 0, 0, 0, 0, 0, 0]
+    block = moved(BLOCK, 0.01 * episode)
     given = {
         "main": episode,
         "phase": np.arange(FRAMES, dtype=float),
