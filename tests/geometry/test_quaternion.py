@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from sampling import directions, generator, quaternions, rotation_vectors
@@ -201,3 +202,22 @@ def test_the_mean_is_nearest_to_all_matrices_whatever_the_signs():
     assert mean.norm().item() == pytest.approx(1, abs=1e-12)
     for step in 1e-3 * torch.cat([torch.eye(3), -torch.eye(3)]).double():
         assert distance(quaternion.multiply(quaternion.exp(step), mean)) > distance(mean)
+
+
+def test_what_compilers_get_are_the_same_products_and_rotations():
+    """Written out for compilers, every branch by the largest component, against SciPy."""
+    rng = np.random.default_rng(0)
+    # Turns near each of the four components that can be the largest.
+    q = np.eye(4)[rng.integers(4, size=40)] + rng.normal(0, 0.4, (40, 4))
+    one, other = (Rotation.from_quat(x, scalar_first=True) for x in (q, np.roll(q, 7, axis=0)))
+    p, r = (torch.from_numpy(x.as_quat(scalar_first=True)) for x in (one, other))
+    product = quaternion._written_out_product(p, r)
+    expected = (one * other).as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((product.numpy() * expected).sum(-1)), 1, atol=1e-12)
+    # Linear in both, and so independent of their length.
+    torch.testing.assert_close(quaternion._written_out_product(2 * p, 3 * r), 6 * product)
+    back = quaternion._written_out_from_matrix(torch.from_numpy(one.as_matrix())).numpy()
+    np.testing.assert_allclose(np.abs((back * p.numpy()).sum(-1)), 1, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(back, axis=-1), 1, atol=1e-12)
+    # The largest component is positive.
+    assert (np.take_along_axis(back, np.abs(back).argmax(-1)[:, None], 1) > 0).all()

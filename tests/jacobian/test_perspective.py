@@ -1,5 +1,6 @@
 """A camera found from motion, against OpenCV's."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -8,6 +9,7 @@ import pytest
 import torch
 from pinhole import wander
 from sampling import generator
+from scipy.spatial.transform import Rotation
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
@@ -23,6 +25,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.jacobian.perspective import (
     FOCAL,
     SHIFT,
+    CameraFit,
     adjust_bundle,
     camera_jacobian,
     eye_of,
@@ -335,3 +338,24 @@ def test_estimators_learn_what_the_camera_leaves():
                 state = estimator.update(state, now)
         off = estimator.jacobian(state, demo.pose[-1]) - expected
         assert float(off.norm() / expected.norm()) < bound
+
+
+def test_a_fit_says_where_the_camera_is():
+    turn, place = Rotation.from_euler("xyz", [np.pi - 0.2, 0.1, 0.4]), np.array([0.3, 0.2, 1.4])
+    marker, deviation = (0.012, -0.034, 0.056), np.arange(1, 14) * 1e-3
+    c = [np.log(1234.0), 720, 540, 0, *turn.as_rotvec(), *-turn.apply(place), *marker]
+    covariance = np.diag(deviation**2)
+    covariance[4, 4] = -1e-20  # rounding
+    fit = CameraFit(camera=torch.tensor(c), covariance=torch.from_numpy(covariance), noise=1.0)
+    tilt = np.degrees(np.arccos(-turn.as_matrix()[2, 2]))
+    numbers = [float(x) for x in re.findall(r"-?\d+\.?\d*", str(fit))]
+    expected = [*place, 10.0, np.degrees(7e-3), tilt, 1234, 1.234, 12, -34, 56, 13.0]
+    np.testing.assert_allclose(numbers, expected, atol=0.5)
+    np.testing.assert_allclose(numbers[:3], place, atol=5e-4)
+    np.testing.assert_allclose(numbers[4], np.degrees(7e-3), atol=5e-3)
+    down = CameraFit(
+        camera=torch.tensor([7.0, 0, 0, 0, np.pi, 0, 0, 0, 0, 1, 0, 0, 0]).double(),
+        covariance=torch.eye(13).double(),
+        noise=1.0,
+    )
+    assert "its view 0 degrees from straight down" in str(down)

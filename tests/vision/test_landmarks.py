@@ -244,3 +244,96 @@ def test_a_finding_is_drawn_about_its_place():
     assert image[430, 715].any()
     assert image[430, 640].any()
     assert not image[470, 600].any()
+
+
+def test_a_finding_without_direction_has_no_arrow_and_an_ellipse_of_two_deviations():
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    turn = Rotation.from_euler("z", 0.5).as_matrix()[:2, :2]
+    covariance = turn @ np.diag([900.0, 100.0]) @ turn.T
+    points = np.array([[100.0, 100.0], [160.0, 100.0], [130.0, 150.0]])
+    place = np.array([700.0, 500.0])
+    draw_finding(image, Finding(pixel=place, covariance=covariance, points=points))
+    red = (image == (255, 40, 40)).all(axis=-1)
+    for angle in np.linspace(0, 2 * np.pi, 24):
+        on = place + turn @ (60 * np.cos(angle), 20 * np.sin(angle))
+        u, v = np.rint(on).astype(int)
+        assert red[v - 2 : v + 3, u - 2 : u + 3].any()
+    assert not (image == (40, 120, 255)).all(axis=-1).any()
+    yellow = (image == (255, 220, 0)).all(axis=-1)
+    for u, v in points.astype(int):
+        assert yellow[v, u]
+        assert yellow[v, u + 3]
+        assert not yellow[v, u + 5]
+    # The outline of the points is closed.
+    green = (image == (40, 220, 60)).all(axis=-1)
+    for middle in ((130, 100), (115, 125), (145, 125)):
+        assert green[middle[1] - 2 : middle[1] + 3, middle[0] - 2 : middle[0] + 3].any()
+    # The cross at the place is 36 px wide in an image of 1440 px.
+    assert red[500, 700]
+    across = np.flatnonzero(red[500, 670:730]) + 670
+    assert 34 <= np.ptp(across[np.abs(across - 700) < 25]) <= 42
+
+
+def test_an_arrow_of_forty_pixels_per_480_shows_the_direction():
+    image = np.zeros((360, 480, 3), np.uint8)
+    points = np.array([[10.0, 10.0], [20.0, 10.0], [10.0, 20.0]])
+    place, angle = np.array([200.0, 180.0]), -0.7
+    found = Finding(pixel=place, covariance=np.eye(2) * 1e-6, angle=angle, points=points)
+    draw_finding(image, found)
+    blue = np.argwhere((image == (40, 120, 255)).all(axis=-1))[:, ::-1]
+    end = place + 40 * np.array([np.cos(angle), np.sin(angle)])
+    along = (blue - place) @ (end - place) / 40
+    assert along.max() == pytest.approx(40, abs=1.5)
+    assert along.min() > -1.5
+    # Its head is a tenth of its length.
+    across = (blue - place) @ ((end - place)[::-1] * (-1, 1)) / 40
+    assert np.abs(across).max() < 5
+    red = np.argwhere((image == (255, 40, 40)).all(axis=-1))[:, ::-1]
+    # The smallest ellipse has half axes of 2 px, the cross arms of 6 px.
+    assert np.abs(red - place).max() == 6
+
+
+@pytest.mark.parametrize("at", [(0, 0), (WIDTH - 180, HEIGHT - 180)])
+def test_what_changed_at_the_edge_of_an_image_has_features_too(at):
+    grey = scene(at=at)[..., 0]
+    found = changed_features(grey, np.full_like(grey, 128))
+    assert len(found.pixels) > 20
+    inside = (found.pixels > np.subtract(at, 6)) & (found.pixels < np.add(at, 186))
+    assert inside.all()
+
+
+def test_a_line_counts_up_to_six_hundredths_of_the_width_aside():
+    grey, usual = scene()[..., 0], np.full((HEIGHT, WIDTH), 128, np.uint8)
+    everywhere = changed_features(grey, usual).pixels
+    line = np.array([[650.0, 0.0], [650.0, 1000.0]])
+    near = changed_features(grey, usual, line).pixels
+    reach = 0.06 * WIDTH
+    assert 5 < len(near) < len(everywhere)
+    assert near[:, 0].max() < 650 + reach + 2
+    left_out = everywhere[everywhere[:, 0] > 650 + reach + 2]
+    assert len(left_out) > 5
+    inside = everywhere[everywhere[:, 0] < 650 + reach - 9]
+    apart = np.linalg.norm(inside[:, None] - near, axis=-1).min(axis=1)
+    assert (apart < 0.5).mean() > 0.8
+
+
+def test_a_change_of_14_grey_levels_is_none_and_one_of_15_is():
+    rng = np.random.default_rng(0)
+    usual = np.full((HEIGHT, WIDTH), 100, np.uint8)
+    blocks = np.kron(rng.integers(0, 2, (12, 12)), np.ones((15, 15))).astype(np.uint8)
+    for level, there in ((14, False), (15, True)):
+        image = usual.copy()
+        image[500:680, 700:880] += np.uint8(level) * blocks
+        assert (len(changed_features(image, usual).pixels) > 0) == there
+    noise = usual.copy()
+    noise[rng.integers(0, HEIGHT, 300), rng.integers(0, WIDTH, 300)] = 255
+    assert len(changed_features(noise, usual).pixels) == 0
+
+
+def test_features_of_a_flat_image_are_none_in_the_shape_of_some():
+    none = Features.of(np.full((200, 300, 3), 77, np.uint8))
+    assert none.pixels.shape == (0, 2)
+    assert none.descriptors.shape == (0, 128)
+    grey = scene()[..., 0]
+    same = changed_features(grey, grey)
+    assert (same.pixels.shape, same.descriptors.shape) == ((0, 2), (0, 128))
