@@ -41,7 +41,7 @@ _IN_HAND = quaternion.from_matrix(
 
 def lasting(phases: Sequence[Event], last: float = math.inf) -> list[tuple[Event, float]]:
     """Each phase with its end: the start of the next one, or the last end [s]."""
-    return list(zip(phases, [*(phase.time for phase in phases[1:]), last], strict=True))
+    return list(zip(phases, [*(phase.time for phase in phases[1:]), last], strict=False))
 
 
 def spans(log: LoggedSteps, phase: str) -> list[tuple[float, float]]:
