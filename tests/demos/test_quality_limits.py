@@ -168,6 +168,8 @@ def test_the_distance_is_that_of_the_three_nearest_in_usual_ones():
     found = [given[k].measures["distance"] for k in shapes]
     np.testing.assert_allclose(found, np.divide(expected, 3), rtol=1e-6)
     places = np.array([given[k].place[0] for k in shapes])
+    steps = 0.01 * np.diff([0, 1, 2, 3, 9])
+    np.testing.assert_allclose(np.abs(np.diff(places)), steps, rtol=1e-6)
     few = {k: EpisodeQuality(episode=k, length=9, task="") for k in range(3)}
     ranking._compare(few, {k: shapes[k] for k in range(3)})
     assert few[0].place is None
@@ -199,28 +201,26 @@ def test_a_ranking_as_text():
     whole = Ranking(path=Path("x"), episodes=(odd, *qualities("late", [0.0] * 3)), notes=("n",))
     lines = [*whole.lines(2)]
     assert lines[0].split()[:4] == ["episode", "doubt", "frames", "distance"]
-    assert lines[1].split() == [
-        "3",
-        "11.5",
-        "70",
-        "-",
-        "1.23",
-        "-",
-        "-",
-        "-",
-        "-",
-        "lost;",
-        "late",
-    ]
+    words = ["3", "11.5", "70", "-", "1.23", "-", "-", "-", "-", "lost;", "late"]
+    assert lines[1].split() == words
     assert lines[3:] == ["and 2 less doubtful episodes", "n"]
     assert len([*whole.lines()]) == 6
 
 
 @pytest.mark.parametrize(
     ("start", "stop", "valid"),
-    [(0, 2, True), (0, 1, False), (5, 5, False), (98, 100, True), (99, 101, False), (-1, 5, False),
-     (50, 101, False), (50, 100, True)],
-)  # fmt: skip
+    [
+        (0, 2, True),
+        (0, 1, False),
+        (5, 5, False),
+        (98, 100, True),
+        (99, 101, False),
+        (-1, 5, False),
+        (50, 101, False),
+        (50, 102, False),
+        (50, 100, True),
+    ],
+)
 def test_a_cut_keeps_two_frames_of_the_episode_at_least(start, stop, valid):
     make = {"verdict": "cut", "length": 100, "start": start, "stop": stop}
     if valid:
