@@ -1,6 +1,8 @@
 """What LeRobot, and whoever trusts a policy with an arm, may expect of `motion_chunk`."""
 
 import json
+import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -459,3 +461,101 @@ def test_statistics_that_cannot_be_used_are_named():
     config = MotionChunkConfig(**features_of(SHOWN[0]), fps=FPS, device="cpu")
     with pytest.raises(ValueError, match="lack max of action"):
         MotionChunkPolicy(config, dataset_stats=stats)
+
+
+@pytest.mark.parametrize("n_plans", [1, 3])
+def test_the_loss_is_that_of_a_loop_over_samples_plans_and_actions(n_plans):
+    """Of the plans that the network makes; the numbers are those that the module documents."""
+    shown, plans = gripping(), []
+    policy = wild(chunk_policy(shown, n_plans=n_plans, **UNNAMED)).eval()
+    policy.network.register_forward_hook(lambda _, inputs, made: plans.append(made))
+    samples = windows(policy, shown)
+    batch = samples.batch(torch.tensor([0, 17, len(shown[0]["action"]) - 3, len(samples) - 1]))
+    each, values = policy.forward(batch, reduction="none")
+    made = plans[0]
+    spread, low, high = policy.encoding.std, *policy.levels
+    losses, squares, count = [], 0.0, 0
+    for i in range(4):
+        whitened = (batch["action"][i] - policy.encoding.mean) / spread
+        present = (~batch["action_is_pad"][i]).tolist()
+        errors, squared = [], []
+        for coefficients in made.coefficients[i]:
+            off = (policy.decoder.positions(coefficients) - whitened[:, :2]).tolist()
+            here = [sum(map(abs, row)) / 2 for row in off]
+            rate = [
+                sum(abs(b - a) * FPS for a, b in zip(before, after, strict=True)) / 2
+                for before, after in pairwise(off)
+            ]
+            error = sum(e for e, there in zip(here, present, strict=True) if there) / 11
+            rates = [r for r, there in zip(rate, present[1:], strict=True) if there]
+            errors.append(error + 0.005 * sum(rates) / 10)
+            squared.append([sum(x * x for x in row) / 2 for row in off])
+        best = min(range(n_plans), key=errors.__getitem__)
+        loss = 0.95 * errors[best] + 0.05 * sum(errors) / n_plans
+        scores = made.scores[i].tolist()
+        loss += 0.1 * (math.log(sum(math.exp(s) for s in scores)) - scores[best])
+        for k, there in enumerate(present):
+            up = float(whitened[k, 2] > (low[2] + high[2]) / 2)
+            chance = 1 / (1 + math.exp(-made.levels[i, k, 0].item()))
+            loss -= there * math.log(chance if up else 1 - chance) / 11
+            squares += there * squared[best][k]
+            count += there
+        losses.append(loss)
+    assert each.tolist() == pytest.approx(losses, rel=1e-4)
+    assert values["rmse"] == pytest.approx(math.sqrt(squares / count), rel=1e-4)
+    mean, _ = policy.forward(batch)
+    assert float(mean) == pytest.approx(sum(losses) / 4, rel=1e-4)
+
+
+def test_the_error_of_plans_is_a_running_mean_over_trainings_only():
+    policy = chunk_policy(SHOWN, dropout=0.0, history=0)
+    batch = windows(policy, SHOWN).batch(torch.arange(6))
+    before = float(policy.error)
+    rmse = policy.eval().forward(batch)[1]["rmse"]
+    assert policy.error == before
+    policy.train().forward(batch)
+    assert float(policy.error) == pytest.approx(0.99 * before + 0.01 * rmse, rel=1e-5)
+
+
+def test_without_a_delay_a_chunk_begins_at_once():
+    seen = {STATE: torch.zeros(1, 3), GOAL: torch.ones(1, 2)}
+    chunks = []
+    for delay in ({}, {"inference_delay": 0}, {"inference_delay": 2}):
+        policy = wild(chunk_policy(SHOWN))
+        policy.predict_action_chunk(seen)
+        seen_later = {**seen, STATE: torch.ones(1, 3)}
+        chunks.append(policy.predict_action_chunk(seen_later, **delay))
+    assert torch.equal(chunks[0], chunks[1])
+    assert not torch.equal(chunks[0], chunks[2])
+
+
+@pytest.mark.parametrize(("steps", "warm_up"), [(60, 60), (100, 100), (5000, 100)])
+def test_the_learning_rate_rises_and_then_falls_to_nothing(steps, warm_up):
+    config = MotionChunkConfig(
+        scheduler_decay_steps=steps, chunk_size=7, n_action_steps=3, device="cpu"
+    )
+    preset = config.get_scheduler_preset()
+    assert (preset.num_warmup_steps, preset.num_decay_steps) == (warm_up, steps)
+    assert (preset.peak_lr, preset.decay_lr) == (config.optimizer_lr, 0.0)
+    assert config.action_delta_indices == list(range(8))
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        *(({name: 1}, "") for name in ("n_basis", "hidden_dim", "n_plans")),
+        *(({name: 0}, f"{name} must be at least 1, got 0") for name in ("n_basis", "n_plans")),
+        ({"chunk_size": 4, "n_action_steps": 2}, ""),
+        ({"chunk_size": 3, "n_action_steps": 2}, "chunk_size must be at least 4, got 3"),
+        ({"history": 0, "state_noise": 0.0, "blend_time": 1e-9}, ""),
+        ({"history": -1}, "history must be at least 0, got -1"),
+        ({"state_noise": float("nan")}, "state_noise must be at least 0, got nan"),
+        ({"blend_time": 0.0}, "blend_time must be positive seconds, got 0.0"),
+    ],
+)
+def test_settings_have_their_least_values(settings, complaint):
+    if complaint:
+        with pytest.raises(ValueError, match=complaint):
+            MotionChunkConfig(device="cpu", **settings)
+    else:
+        MotionChunkConfig(device="cpu", **settings)
