@@ -228,18 +228,31 @@ def test_the_first_image_may_take_five_seconds_more(backend, monkeypatch):
     assert waited[0][1] == 5.75
 
 
-def test_a_file_begins_with_the_first_reading_and_keeps_its_rate(backend):
+def test_a_file_begins_with_the_first_reading_and_keeps_its_rate(backend, monkeypatch):
+    waits, waited = [], threading.Event()
+
+    class Condition(threading.Condition):
+        def wait_for(self, reached, longest=None):
+            if longest is not None and threading.current_thread().name.startswith("video"):
+                waits.append(longest)
+                waited.set()
+            return super().wait_for(reached, longest)
+
+    standing = SimpleNamespace(Condition=Condition, Thread=threading.Thread)
+    monkeypatch.setattr(opencv_cameras, "threading", standing)
     backend.images = [(BGR, 0.0), (BGR + 100, 40.0), (BGR + 200, 80.0)]
     camera = CaptureCamera(__file__, timeout=0.5)
     backend.now = 70.0  # nothing is late before the first reading
     np.testing.assert_array_equal(camera.read(), BGR[..., ::-1])
     assert camera.age == 0.0
+    assert waited.wait(PATIENCE)
     backend.now = 70.1
     seen = set()
-    while 200 not in seen:  # due already, so that they come at once
+    while 200 not in seen:
         seen.add(int(camera.read()[0, 0, 2]))
     assert camera.age == pytest.approx(0.02)
     assert seen <= {0, 100, 200}
+    assert waits == pytest.approx([0.04, 0.0])  # the third is overdue
     backend.end()
     camera.close()
 

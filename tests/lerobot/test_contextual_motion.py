@@ -8,7 +8,12 @@ from lerobot_samples import SampleWindows, reaching, write_dataset
 
 from hrc_learn.dmp import GaussianBasis, SpringDamper, Trajectory, response_of
 from hrc_learn.lerobot.policy import policy_base
-from hrc_learn.lerobot.policy.contextual_motion import ContextualMotion, fit_closed_form
+from hrc_learn.lerobot.policy.contextual_motion import (
+    DURATIONS,
+    HARMONICS,
+    ContextualMotion,
+    fit_closed_form,
+)
 
 EPISODES = reaching(3)
 DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.goal": None}
@@ -134,3 +139,65 @@ def test_of_many_demonstrations_some_are_read_spread_evenly(tmp_path, monkeypatc
     for found, k in zip(read, (0, 2, 4), strict=True):
         torch.testing.assert_close(found["action"], episodes[k]["action"])
     assert len(policy_base.read_episodes(folder, ["action"], [1, 3])) == 2
+
+
+def test_primitives_are_those_of_a_loop_over_contexts():
+    """Linear in the clipped context, corrected by a network that sees the phase."""
+    rng = torch.Generator().manual_seed(3)
+    motion, told = motion_of(), []
+    motion.network.register_forward_hook(lambda _, given, made: told.append((given[0], made)))
+    with torch.no_grad():
+        for parameter in motion.parameters():
+            parameter.copy_(0.3 * torch.randn(parameter.shape, generator=rng))
+        motion.centre.copy_(torch.tensor([0.5, -0.5]))
+        motion.low.copy_(torch.tensor([-1.0, -2.0]))
+        motion.high.copy_(torch.tensor([1.0, 2.0]))
+    contexts = torch.tensor([[0.2, 0.7], [-3.0, 1.0], [4.0, 9.0], [0.0, -9.0]]).double()
+    features = torch.randn(4, 4, generator=rng).double()
+    elapsed = torch.tensor([0.0, 0.4, 0.9, 50.0]).double()
+    with torch.no_grad():
+        found = motion(contexts, features, elapsed)
+    (inputs, corrections), base = told[0], motion.base.detach()
+    for i in range(4):
+        clipped = [sorted((-(k + 1.0), float(contexts[i, k]), k + 1.0))[1] for k in range(2)]
+        slopes = motion.slopes.detach()
+        x = base + (clipped[0] - 0.5) * slopes[0] + (clipped[1] + 0.5) * slopes[1]
+
+        def duration(x):
+            off = float(x[-1] - base[-1])
+            return math.exp(base[-1] + max(-DURATIONS, min(off, DURATIONS)))
+
+        phase = min(elapsed[i].item() / duration(x), 1.0)
+        waves = [
+            wave(math.pi * k * phase)
+            for wave in (math.sin, math.cos)
+            for k in range(1, HARMONICS + 1)
+        ]
+        assert inputs[i].tolist() == pytest.approx([*features[i].tolist(), *waves])
+        x = x + corrections[i]
+        count = motion.response.basis.count + 3
+        assert found.duration[i].item() == pytest.approx(duration(x))
+        for a in range(2):
+            *weights, rate, start, goal = x[a * count : (a + 1) * count].tolist()
+            stiffness = motion.response.spring.stiffness
+            assert found.weights[i, a].tolist() == pytest.approx(
+                [stiffness * w for w in weights]
+            )
+            assert found.start_velocity[i, a].item() == pytest.approx(rate / duration(x))
+            assert (found.start[i, a].item(), found.goal[i, a].item()) == (start, goal)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_durations_stay_near_the_fitted_one(sign):
+    motion = motion_of()
+    x = motion.base.detach().clone()
+    x[-1] += 10 * sign
+    assert motion.primitives(x).duration.item() == pytest.approx(math.exp(DURATIONS * sign))
+
+
+def test_coordinates_from_rest_begin_at_their_goal():
+    x = torch.randn(2 * 15 + 1, generator=torch.Generator().manual_seed(0)).double()
+    primitives = motion_of().primitives(x)
+    ends = primitives.from_rest()[:, -3:].tolist()
+    assert ends == [[0.0, goal, goal] for goal in primitives.goal.tolist()]
+    assert primitives.from_rest()[:, :-3].equal(primitives.weights)
