@@ -664,13 +664,18 @@ class Multiply(OnDataset):
 
     episodes: int
     """Number of new demonstrations. 0: list the segments and write nothing else."""
-    out: Path
-    """Folder of the new dataset, which must not exist."""
+    out: Path | None = None
+    """Folder of the new dataset, which must not exist. Default: DATASET_multiplied."""
     robot: str = ""
     """Arm of the new motions, by name or file. Default: that of the dataset."""
     config: tuple[str, ...] = ()
     """Scenes, variation and judge as NAME=VALUE or TOML files, such as
     objects.object.yaw=[-0.5,0.5] or judge.scene=none. `--config help` lists them."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the new dataset."""
+        return self.out or sibling(self.dataset, "multiplied")
 
 
 @dataclass(frozen=True, kw_only=True)

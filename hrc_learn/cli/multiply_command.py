@@ -121,7 +121,7 @@ def multiply(args: Multiply) -> int:
         print(f"{count:6d} motions left out: {reason}")
     attempts = args.episodes + failures.total()
     rate = args.episodes / attempts
-    print(f"{args.episodes} of {attempts} motions succeeded ({rate:.0%}): {args.out}")
+    print(f"{args.episodes} of {attempts} motions succeeded ({rate:.0%}): {args.folder}")
     values = {"episodes": args.episodes, "attempts": attempts, "success_rate": rate}
     write_values(args.json, values)
     return 0
@@ -192,10 +192,10 @@ class Multiplication:
         Raises:
             RuntimeError: Hardly any motion succeeds.
         """
-        wanted, settings = self.args.episodes, self.settings
+        wanted, folder, settings = self.args.episodes, self.args.folder, self.settings
         made_by = {"dataset": str(self.args.dataset), "robot": self.robot.name}
         made_by |= asdict(replace(settings, judge=replace(settings.judge, processes=1)))
-        writer = MultipliedWriter(self.args.out, self.kind, self.columns, self.source, made_by)
+        writer = MultipliedWriter(folder, self.kind, self.columns, self.source, made_by)
         widths = [float(demo.gripper.max()) for demo in self.demos if demo.gripper is not None]
         physics = nullcontext()
         if self.judge.scene:

@@ -105,6 +105,13 @@ def test_another_arm_gets_its_own_joints(dataset, tmp_path):
         assert np.abs(tool.numpy() - np.array(origin["scene"]["block"])[:3]).max() < 3e-3
 
 
+def test_segments_are_listed_without_a_folder(dataset):
+    done = hrc("multiply", dataset, "--episodes", 0)
+    assert done.status == 0
+    assert "block" in done.output
+    assert not dataset.with_name(f"{dataset.name}_multiplied").exists()
+
+
 def test_segments_are_listed_and_may_be_corrected(dataset, tmp_path):
     file, out = tmp_path / "segments.json", tmp_path / "out"
     option = ("--config", f"multiply.segments={file}")
