@@ -21,8 +21,13 @@ from hrc_learn.kinematics import (
 from hrc_learn.kinematics.inverse import follow_poses
 from hrc_learn.kinematics.registry import MissingModelError
 from hrc_learn.sim import World
-from hrc_learn.sim.layout_quality import marker_seen
-from hrc_learn.sim.workplace import Workplace, layout_for
+from hrc_learn.sim.layout_quality import (
+    clearance_quality,
+    marked_turns,
+    marker_seen,
+    path_quality,
+)
+from hrc_learn.sim.workplace import CellLayout, Workplace, layout_for
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -82,6 +87,38 @@ def test_above_the_table_it_turns_by_half_a_turn_with_its_marker_in_view(robot):
     plate = workplace.scene.arm.marker
     assert plate is not None
     assert marker_seen(robot, workplace.scene.camera, plate, workplace.hover_joints())
+
+
+@pytest.mark.simulation
+def test_a_layout_is_as_good_as_the_worst_of_its_paths(robot):
+    layout = layout_for(robot)
+    place, clearances = layout.workplace, layout.workplace.arm_clearances
+    home, hover = (torch.tensor(q).double() for q in (place.home_posture, place.hover_posture))
+    ways = [
+        path_quality(
+            robot, clearances, place.path_to_shelf(name), place.level_at, home[None]
+        ).item()
+        for name in place.shelf_names()
+    ]
+    plate, camera = place.scene.arm.marker, place.scene.camera
+    assert plate is not None
+    above = marked_turns(
+        robot, clearances, camera, plate, place.hover(), place.table_reach, hover
+    )
+    between = home + torch.linspace(0, 1, 25).double()[:, None] * (hover - home)
+    clear = clearance_quality(clearances, between, robot.hand_size).min().item()
+    assert layout.quality == pytest.approx(min(*ways, above.quality, clear, 1.0))
+    assert layout.seen == above.seen
+    assert place.hover_turns == above.turns
+    assert place.scene.arm.marker == above.plate
+
+
+@pytest.mark.parametrize(
+    ("quality", "seen", "rank"), [(0.4, 1.0, 0.4), (0.4, 0.97, 0.4), (0.9, 0.95, 0.5)]
+)
+def test_views_without_the_marker_cost_ten_times_their_fraction(quality, seen, rank):
+    layout = CellLayout(workplace=Workplace(), quality=quality, seen=seen)
+    assert layout.rank == pytest.approx(rank)
 
 
 def test_the_usual_hand_may_turn_a_little_further_with_its_marker_in_view():
