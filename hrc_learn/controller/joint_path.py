@@ -67,7 +67,7 @@ class JointPaths:
 
     @classmethod
     def of(
-        cls, chain: SerialChain, paths: Sequence[Float[np.ndarray, "samples n"]], dt: float
+        cls, chain: SerialChain, paths: Sequence[Float[np.ndarray, "_samples n"]], dt: float
     ) -> JointPaths:
         """Tabulate paths.
 

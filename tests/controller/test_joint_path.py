@@ -8,8 +8,11 @@ import torch
 
 from hrc_learn.controller.arm_loop_state import PathState
 from hrc_learn.controller.joint_path import (
+    FAR_ASIDE,
+    POORLY_ALIGNED,
     DirectReturn,
     JointPaths,
+    changed_rate,
     deviation_ratio,
     may_not_return,
     nears_singularity,
@@ -161,3 +164,114 @@ def test_deviations_and_speeds_count_along_each_axis_and_about_it(axis):
     still = torch.zeros_like(unit)
     assert deviation_ratio(0.002 * unit, still) == pytest.approx(2.0)
     assert deviation_ratio(-0.002 * unit, 0.1 * unit) == pytest.approx(2.0 / 7.0)
+
+
+def test_paths_are_tabulated_with_their_slopes_and_narrow_places():
+    """One that rests, one through a singularity of the shoulder, one in between."""
+    dt, rest = 0.05, torch.tensor([-0.3, 0.4, 1.5, -1.9, -0.1, 2.0, -0.3], dtype=torch.float64)
+    through = rest.repeat(60, 1)
+    through[:, 1] = torch.linspace(0.6, -0.6, 60, dtype=torch.float64)
+    lines = [rest[None].numpy(), through.numpy(), through[:25].numpy()]
+    table = JointPaths.of(panda, lines, dt)
+    assert table.last.tolist() == [0, 59, 24]
+    for row, line in enumerate(lines):
+        n, pad = len(line), 60 - len(line)
+        narrow = np.linalg.svd(panda.jacobian(torch.from_numpy(line)).numpy())[1][:, -1] < 0.07
+        # Within 0.2 s, four samples.
+        ahead = [narrow[k : k + 5].any() for k in range(n)]
+        slope = np.gradient(line, dt, axis=0) if n > 1 else np.zeros_like(line)
+        for found, expected in (
+            (table.position, line),
+            (table.velocity, slope),
+            (table.narrow, narrow),
+            (table.narrow_ahead, np.array(ahead)),
+        ):
+            padded = np.concatenate([expected, expected[-1:].repeat(pad, 0)])
+            np.testing.assert_array_equal(found[row].numpy(), padded)
+    assert 0 < table.narrow[1].sum() < table.narrow_ahead[1].sum() < 60
+    samples = torch.tensor([0.0, 0.25, 7.5, 23.9, 24.0, 24.5, 40.0], dtype=torch.float64)
+    for row in (1, 2):
+        found = table.interpolated(table.position, torch.full((7,), row), samples)
+        expected = np.interp(samples.numpy(), np.arange(len(lines[row])), lines[row][:, 1])
+        np.testing.assert_allclose(found[:, 1].numpy(), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rate", "wanted", "direction", "expected"),
+    [
+        (0.5, 1.0, 1, 0.6),
+        (0.5, 0.0, 1, 0.4),
+        (0.5, 0.55, 1, 0.55),
+        (0.95, 7.0, 1, 1.0),
+        (0.05, -7.0, 1, 0.0),
+        (0.05, 1.0, -1, -0.05),
+        (-0.95, 7.0, -1, -1.0),
+        (0.3, 0.35, -1, 0.2),
+    ],
+)
+def test_a_rate_changes_by_its_full_range_in_a_fifth_of_a_second(
+    rate, wanted, direction, expected
+):
+    found = changed_rate(torch.tensor(rate).double(), wanted, 0.02, direction)
+    assert float(found) == pytest.approx(expected)
+
+
+def test_joints_right_at_the_limits_of_their_way_back_may_return():
+    error = torch.zeros(7, dtype=torch.float64)
+    # The limits themselves are numbers of float32.
+    error[2] = FAR_ASIDE * (1 - 1e-6)
+    aligned = torch.tensor(POORLY_ALIGNED * (1 + 1e-6), dtype=torch.float64)
+    assert not may_not_return(error, aligned)
+    assert may_not_return(error * (1 + 2e-6), aligned)
+    assert may_not_return(error, aligned * (1 - 2e-6))
+    # A push across the way back fades, one along it does not.
+    middle = aligned + 0.075
+    push = torch.eye(7, dtype=torch.float64)
+    assert float(push_fraction(push[0], error, middle)) == pytest.approx(0.5, abs=1e-5)
+    assert float(push_fraction(push[2], error, middle)) == 1.0
+
+
+@pytest.mark.parametrize("samples", [12, 101])
+def test_a_direct_return_leads_to_the_nearest_sample_with_a_clear_way(samples):
+    """The one that waits comes first, then each twentieth part of the path by its distance."""
+    joints = START + torch.tensor([0.2] + 6 * [0.0], dtype=torch.float64)
+    line = torch.lerp(START, AWAY, torch.linspace(0, 1, samples).double()[:, None])
+    post = (joints + torch.lerp(START, AWAY, torch.tensor(0.4).double())) / 2
+
+    def clearance(q):
+        return (q - post).norm(dim=-1) - 0.05
+
+    def clear(goal):
+        s = np.linspace(0, 1, 51)[:, None]
+        way = clearance(torch.from_numpy(joints.numpy() + s * (goal - joints).numpy()))
+        return bool((way >= min(way[0], way[-1], 0.03)).all())
+
+    waits = 0.3 * samples
+    whole = int(waits)
+    here = torch.lerp(line[whole], line[whole + 1], waits - whole)
+    assert not clear(here)
+    candidates = list(range(0, samples, max(samples // 20, 1)))
+    candidates.sort(key=lambda k: float((line[k] - joints).norm()))
+    expected = next(k for k in candidates if clear(line[k]))
+    direct = planned(line, waits, joints, clearance)
+    assert float(direct.progress) == expected
+    torch.testing.assert_close(direct.goal, line[expected])
+    assert bool(direct.active)
+    assert not bool(direct.blocked)
+    # Where nothing is known to be near, the sample that waits.
+    assert float(planned(line, waits, joints, None).progress) == pytest.approx(waits)
+
+
+def test_a_direct_return_moves_with_minimum_jerk():
+    direct = planned(START[None], 0.0, AWAY, None)
+    duration = 1.875 * 0.3 / 0.4
+    for fraction in (0.0, 0.2, 0.5, 0.9, 1.0):
+        s = 10 * fraction**3 - 15 * fraction**4 + 6 * fraction**5
+        now = replace(direct, time=torch.tensor(fraction * duration, dtype=torch.float64))
+        torch.testing.assert_close(now.joint_position(), AWAY + s * (START - AWAY))
+    there = planned(START[None], 0.0, START, None)
+    torch.testing.assert_close(there.joint_position(), START)
+    none = DirectReturn.none(START)
+    assert not none.active
+    assert not none.blocked
+    torch.testing.assert_close(none.joint_position(), START)

@@ -148,3 +148,41 @@ def test_a_start_that_is_not_finite_is_refused():
 def test_dt_must_be_positive(dt):
     with pytest.raises(ValueError, match="dt must be positive"):
         MotionFilter(dt, **limits())
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_push_against_a_limit_ends_where_braking_from_rest_needs_the_way(side):
+    """A^3/(8 j^2) + A^2 dt/(2 j) before the limit."""
+    given_limits = limits(-0.2, 0.3, 1.0, 3.0, 12.0)
+    motion = MotionFilter(DT, **given_limits)
+    A, j = float(motion.acceleration[0]), 12.0
+    path = follow(given_limits, np.full((200, 1), side * 9.0))
+    wall = 0.3 if side > 0 else 0.2
+    expected = wall - (A**3 / (8 * j**2) + A**2 * DT / (2 * j))
+    assert side * path[-1, 0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_small_errors_decay_at_the_rate_of_the_weakest_limit():
+    """Jerk over acceleration, but no faster than a third of the sampling rate."""
+    ratios = []
+    for jerk, step in ((6.0, 1e-3), (300.0, 3e-3)):
+        error = step - follow(limits(jerk=jerk), np.full((60, 1), step))[:, 0]
+        ratios.append((error[1:] / error[:-1])[8:40])
+    np.testing.assert_allclose(ratios[0], 1 / (1 + 6.0 / 3.0 * DT), rtol=1e-3)
+    assert 0.7 < ratios[1].min() <= ratios[1].max() < 0.8
+
+
+def test_a_motion_under_way_goes_on_from_its_velocity_and_acceleration():
+    """A parabola within the limits, begun at its second sample."""
+    t = np.arange(40) * DT
+    asked = (0.1 + 0.3 * t - 0.2 * t**2)[:, None]
+    v = np.diff(asked, axis=0) / DT
+    a = np.diff(v, axis=0) / DT
+    state = MotionState.moving(asked[2], v[1], a[0])
+    np.testing.assert_array_equal(state.reference_velocity, v[1])
+    motion = MotionFilter(DT, **limits())
+    for row in asked[3:]:
+        before, state = state, motion.step(state, row)
+        assert np.abs(state.acceleration - before.acceleration) <= 30 * DT * (1 + 1e-9)
+        np.testing.assert_allclose(state.position, row, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(state.velocity, v[-1], rtol=0, atol=2e-3)

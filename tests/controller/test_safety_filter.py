@@ -348,3 +348,26 @@ def test_a_wrong_number_of_joints_is_named():
         safety.initial_state(torch.zeros(7, dtype=torch.float64))
     with pytest.raises(ValueError, match="joint_velocity_command needs 6 values"):
         safety.step(state, torch.zeros(6, dtype=torch.float64), [0.0] * 7, 0.01)
+
+
+@pytest.mark.parametrize("moves", [1.0, -1.0])
+def test_a_start_that_is_measured_at_rest_is_not_one_in_motion(moves):
+    safety = SafetyFilter(LIMITS)
+    state = safety.initial_state(READY, moves * 0.2 * LIMITS.velocity)
+    still = torch.zeros_like(READY)
+    v, after, report = safety.step(state, READY, still, 0.01, joint_velocity=still)
+    assert report.acted("start")
+    assert not v.any()
+    assert after.count("start") == 1
+
+
+def test_a_jacobian_that_is_not_finite_leaves_the_report_finite():
+    safety = SafetyFilter(LIMITS, SafetyConfig(tcp_speed=0.2))
+    u = 0.1 * torch.ones(7, dtype=torch.float64)
+    J = panda.jacobian(READY)
+    J[1, 2] = torch.nan
+    v, after, report = safety.step(safety.initial_state(READY, u), READY, u, 0.01, jacobian=J)
+    assert report.acted("invalid")
+    assert float(report.speed_excess) == float(report.speed_excess_time) == 0.0
+    assert ((v >= 0) & (v < u)).all()
+    assert all(x.isfinite().all() for x in (after.velocity, after.acceleration, after.position))
