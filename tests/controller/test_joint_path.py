@@ -234,25 +234,27 @@ def test_joints_right_at_the_limits_of_their_way_back_may_return():
 @pytest.mark.parametrize("samples", [12, 101])
 def test_a_direct_return_leads_to_the_nearest_sample_with_a_clear_way(samples):
     """The one that waits comes first, then each twentieth part of the path by its distance."""
-    joints = START + torch.tensor([0.2] + 6 * [0.0], dtype=torch.float64)
+    middle = torch.lerp(START, AWAY, torch.tensor(0.62).double())
+    joints = middle + torch.tensor([0.2] + 6 * [0.0], dtype=torch.float64)
     line = torch.lerp(START, AWAY, torch.linspace(0, 1, samples).double()[:, None])
-    post = (joints + torch.lerp(START, AWAY, torch.tensor(0.4).double())) / 2
+    post = (joints + middle) / 2
 
     def clearance(q):
-        return (q - post).norm(dim=-1) - 0.05
+        return (q - post).norm(dim=-1) - 0.02
 
     def clear(goal):
         s = np.linspace(0, 1, 51)[:, None]
         way = clearance(torch.from_numpy(joints.numpy() + s * (goal - joints).numpy()))
         return bool((way >= min(way[0], way[-1], 0.03)).all())
 
-    waits = 0.3 * samples
+    waits = 0.57 * samples
     whole = int(waits)
     here = torch.lerp(line[whole], line[whole + 1], waits - whole)
     assert not clear(here)
     candidates = list(range(0, samples, max(samples // 20, 1)))
     candidates.sort(key=lambda k: float((line[k] - joints).norm()))
     expected = next(k for k in candidates if clear(line[k]))
+    assert 0 < expected != candidates[0]
     direct = planned(line, waits, joints, clearance)
     assert float(direct.progress) == expected
     torch.testing.assert_close(direct.goal, line[expected])
