@@ -3,6 +3,7 @@
 import json
 import math
 import ssl
+import subprocess
 import sys
 from pathlib import Path
 from urllib.error import HTTPError
@@ -289,6 +290,40 @@ def test_a_certificate_that_ends_is_made_anew(tmp_path, monkeypatch):
     before = certificate.read_bytes()
     tls_context(config)
     assert certificate.read_bytes() != before
+
+
+@pytest.mark.parametrize(("name", "kind"), [("192.0.2.7", "IP Address"), ("arm.local", "DNS")])
+def test_a_certificate_names_its_page_and_is_served_where_it_is_given(
+    tmp_path, monkeypatch, name, kind
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    tls_context(AddressConfig(host="0.0.0.0", name=name))
+    folder = tmp_path / "hrc_learn" / "tls"
+    pem, key = folder / f"{name}.pem", folder / f"{name}.key"
+    shown = subprocess.run(
+        ["openssl", "x509", "-noout", "-dates", "-ext", "subjectAltName", "-in", str(pem)],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert f"{kind}:{name}" in shown
+    begins, ends = (
+        ssl.cert_time_to_seconds(line.split("=")[1]) for line in shown.splitlines()[:2]
+    )
+    assert 790 <= (ends - begins) / 86400 <= 825
+    # Given by name, it is served even to this machine alone, and nothing is made.
+    own = {file: file.rename(tmp_path / file.name) for file in (pem, key)}
+    context = tls_context(AddressConfig(certificate=own[pem], key=own[key]))
+    assert isinstance(context, ssl.SSLContext)
+    assert not list(folder.iterdir())
+    with pytest.raises(ValueError, match=r"certificate .* with key"):
+        tls_context(AddressConfig(certificate=own[key], key=own[pem]))
+
+
+def test_every_address_is_reached_by_the_one_that_goes_out():
+    name = network_name(AddressConfig(host="0.0.0.0"))
+    assert name == network_name(AddressConfig(host="::"))
+    assert name not in ("0.0.0.0", "::", "")
 
 
 NO_TEXT = b"\xff".decode("ascii", "surrogateescape")
