@@ -10,6 +10,7 @@ from urllib.error import HTTPError
 from urllib.request import ProxyHandler, Request, build_opener
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -25,6 +26,7 @@ from hrc_learn.teleoperation.gate.admission import Admission, Bucket, RefusedErr
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
     MessageError,
+    acts,
     session_message,
     view_message,
 )
@@ -213,12 +215,21 @@ def test_orientations_are_unit_quaternions_to_single_precision(length):
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_no_number_is_let_through_that_is_none(number):
-    import msgspec
-
     fields = {"name": "/region", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, number, 0.0)}
     raw = msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage", **fields})
     with pytest.raises(MessageError, match="position"):
         view_message(raw)
+
+
+def test_looking_around_acts_on_nothing():
+    stored = {"request_uuid": "7", "value": None, "error": None}
+    used = {"uuid": "7"}
+    for tag, content, acting in (
+        ("LocalStorageGetItemResponseMessage", stored, False),
+        ("CommandTriggerMessage", used, True),
+    ):
+        raw = msgspec.msgpack.encode({"type": tag} | content)
+        assert acts(view_message(raw)) == acting
 
 
 def test_an_address_is_ours_alone_unless_asked_for():
