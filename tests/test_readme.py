@@ -2,12 +2,14 @@
 
 import ast
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 from hrc_learn import cli
-from hrc_learn.cli._commands import find
+from hrc_learn.cli._commands import COMMANDS, find, name_leading
+from hrc_learn.cli._run import parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -83,6 +85,29 @@ def test_commands_are_known_with_their_options(page):
     assert not unknown
 
 
+WHOLE = re.compile(r"^(?:\$ )?hrc ([a-z].*)$", re.MULTILINE)
+"""A command in a block of a shell."""
+
+
+@by_page
+def test_whole_commands_are_accepted_by_their_parsers(page):
+    blocks = [body for kind, body in BLOCK.findall(page.read_text()) if kind in SHELLS]
+    refused = []
+    for line in WHOLE.findall("\n".join(blocks).replace("\\\n", " ")):
+        words = shlex.split(line, comments=True)
+        stops = [i for i, word in enumerate(words) if word in {"|", "&&", ">", "&"}]
+        name, rest = find(words[: min(stops, default=None)])
+        if not name or "..." in rest:  # the other test knows its name and options
+            continue
+        command = COMMANDS[name]
+        try:
+            parse(command.arguments, name_leading(command.leading, rest), f"hrc {name}")
+        except SystemExit:  # with the reason on standard error
+            refused.append(line)
+    assert not refused
+
+
+SHELLS = {"console", "sh", "bash"}
 HELP = {"help", "version", "json"}
 
 
