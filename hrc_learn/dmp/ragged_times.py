@@ -55,7 +55,12 @@ def motion(
         NotImplementedError: Two forward derivatives (`refuse_nested_forward`).
     """
     if torch.compiler.is_compiling():
-        return _gathered(_table(response, order, coordinates), s, coordinates)
+        # Plain operations, which a compiler fuses.
+        table = _table(response, order, coordinates)
+        piece, powers = table.locate(s, coordinates.dtype)
+        rows = _rows(table, coordinates)
+        index = piece.long()[..., None, None].expand(-1, -1, *rows.shape[2:])
+        return (rows.gather(1, index) * powers[..., None]).sum(-2)
     refuse_nested_forward(s)
     result: Any = _Linear.apply(s, coordinates, response, order, False)
     return result
@@ -145,7 +150,10 @@ def _tabulate(
         exponents = torch.arange(row.shape[1], dtype=row.dtype, device=row.device)
         row = row * (2 / forced.interval * exponents)[:, None]
         row = torch.nn.functional.pad(row[:, 1:], (0, 0, 0, 1))
-    free, goal = _spring_pieces(response, order), torch.zeros_like(row[..., :1])
+    knots = torch.arange(len(row), dtype=row.dtype)[:, None]
+    free = spring_rows(response, forced.interval * (knots + chebyshev_points()), order)
+    free = forced.interpolate(free[..., None, :], forced.interval).coefficients[..., 0, :]
+    goal = torch.zeros_like(row[..., :1])
     goal[:, 0] = float(order == 0)
     rate, start = free[..., 1:], free[..., :1]
     others = row.new_zeros(N + 3, 2)
@@ -176,33 +184,18 @@ def _tabulate(
     return CoefficientTable(response, order, matrix, coefficients.shape[1], others.shape[1])
 
 
-def _spring_pieces(response: Response, order: int) -> Float[Tensor, "pieces P 2"]:
-    """Coefficients of `spring_rows` on the pieces of the forcing."""
-    forced = response.forced
-    u = chebyshev_points().to(forced.coefficients)
-    knots = torch.arange(len(forced.coefficients), dtype=u.dtype, device=u.device)
-    values = spring_rows(response, forced.interval * (knots[:, None] + u), order)
-    return forced.interpolate(values[..., None, :], forced.interval).coefficients[..., 0, :]
-
-
 def _lowest_degree(
     coefficients: Float[Tensor, "pieces P M"], tolerance: float
 ) -> Float[Tensor, "pieces K M"]:
     """Polynomials of the lowest degree within a tolerance, relative to the largest value."""
-    P = coefficients.shape[1]
-    exponents = torch.arange(P, device=coefficients.device)
-    checked = torch.linspace(-1, 1, 4 * P).to(coefficients)[:, None] ** exponents
-    size = (checked @ coefficients).abs().amax((0, 1))
-    for degree in range(2, P - 1):
-        k = torch.arange(degree + 1).to(coefficients)
-        u = -torch.cos(torch.pi * k / degree)[:, None]
-        # The polynomial through the Chebyshev points of that degree, both ends included.
-        lower = torch.linalg.solve(u ** exponents[: degree + 1], u**exponents)
-        lower = torch.nn.functional.pad(lower, (0, 0, 0, P - degree - 1))
-        error = (checked @ (lower @ coefficients - coefficients)).abs().amax((0, 1))
-        if (error <= tolerance * size).all():
-            return (lower @ coefficients)[:, : degree + 1]
-    return coefficients
+    k = torch.arange(coefficients.shape[1]).to(coefficients)
+    angle = torch.pi * (k[:, None] + 0.5) / len(k)
+    # Powers and Chebyshev polynomials, whose sums bound what leaving out the last ones changes.
+    powers, chebyshev = torch.cos(angle) ** k, torch.cos(angle * k)
+    terms = torch.linalg.solve(chebyshev, powers) @ coefficients
+    rest = terms.abs().flip(1).cumsum(1).flip(1).amax(0)
+    needed = max(int((rest > tolerance * rest[0]).any(-1).sum()), 3)
+    return torch.linalg.solve(powers, chebyshev)[:needed, :needed] @ terms[:, :needed]
 
 
 def _rows(
@@ -241,16 +234,6 @@ def power_by_power(
     for k in range(1, K):
         y.addcmul_(terms[k].index_select(0, flat), powers[..., k].view(-1, 1))
     return y.view(B, T, D)
-
-
-def _gathered(
-    table: CoefficientTable, s: Tensor, coordinates: Tensor
-) -> Float[Tensor, "B T D"]:
-    """`motion` in plain operations, which a compiler fuses."""
-    piece, powers = table.locate(s, coordinates.dtype)
-    rows = _rows(table, coordinates)
-    index = piece.long()[..., None, None].expand(-1, -1, *rows.shape[2:])
-    return (rows.gather(1, index) * powers[..., None]).sum(-2)
 
 
 def blocks(s: Float[Tensor, "B T"], most: int) -> Iterator[tuple[slice, slice]]:

@@ -69,14 +69,6 @@ def through_via_points(
         ValueError: Via points at one time or outside of the window, or too many or too close
             together for the basis.
     """
-    x = motion.coordinates().detach()
-    weights = x[..., :-3] + _weight_change(motion, via, within)
-    return motion.with_coordinates(torch.cat([weights, x[..., -3:]], dim=-1))
-
-
-def _weight_change(
-    motion: LinearPrimitive, via: ViaPoints, within: tuple[float, float] | None
-) -> Float[Tensor, "*batch D N"]:
     if motion.basis.periodic:
         raise ValueError("a rhythm has no via points: every time occurs in each period")
     window = _window(motion, within)
@@ -108,7 +100,9 @@ def _weight_change(
     _check_overshoot(motion, follower.change(z), curve[..., 0, :].mT, window)
     change = z.new_zeros(*z.shape[:-1], motion.basis.count)
     change = change.index_copy(-1, follower.chosen, z @ follower.to_weights.mT)
-    return motion.forcing_scale.unscale(change.mT, motion.demonstrated()).mT
+    change = motion.forcing_scale.unscale(change.mT, motion.demonstrated()).mT
+    x = motion.coordinates().detach()
+    return motion.with_coordinates(torch.cat([x[..., :-3] + change, x[..., -3:]], dim=-1))
 
 
 def _check_overshoot(
@@ -126,11 +120,8 @@ def _check_overshoot(
         return
     ratio = (largest / (asked + rounding)).max().item()
     spacing = motion.duration.max().item() / (motion.basis.count - 1)
-    inside = (
-        ""
-        if window == (0.0, 1.0)
-        else (f" ({CLOSEST_TO_WINDOW * spacing:.3g} s from the ends of `within`)")
-    )
+    inside = f" ({CLOSEST_TO_WINDOW * spacing:.3g} s from the ends of `within`)"
+    inside = "" if window == (0.0, 1.0) else inside
     raise ValueError(
         f"the motion would change {ratio:.2g} times as far as its via points ask: they are too "
         f"close for {motion.basis.count} basis functions. Keep {CLOSEST * spacing:.3g} s "
