@@ -302,8 +302,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         columns, frame = self._columns(state)
         given = self._given(goal_body=goal_body)
         columns, frame, target = self._retarget(columns, frame, goal, filtered, **given)
-        target = checked_vector("goal", target, columns.target).expand_as(columns.target)
-        return self.state_of(replace(columns, target=target), frame)
+        if target is not columns.target:
+            target = checked_vector("goal", target, columns.target).expand_as(columns.target)
+            columns = replace(columns, target=target)
+        return self.state_of(columns, frame)
 
     def condition[S: "MotionPrimitive"](
         self: S,

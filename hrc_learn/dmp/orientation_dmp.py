@@ -4,6 +4,7 @@ e'' = alpha (beta (0 - e) - e') + f, exact at all angles (Koutras and Doulgeri 2
 reference is the goal by default; see `orientation_error.py` for the error.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     broadcast_shapes,
+    fits_numpy,
     to_tensor,
 )
 from hrc_learn.dmp.closed_loop_step import DMPState
@@ -28,8 +30,10 @@ from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
 from hrc_learn.dmp.motion_primitive import WrappedPrimitive, via_values
 from hrc_learn.dmp.orientation_error import (
+    exp_numbers,
     fitted_error,
     reference_of,
+    retarget_numbers,
     to_orientation,
     unit_quaternion,
 )
@@ -266,16 +270,41 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         target, (P, B) = columns.target, self._others
         if goal is not None:
             position, rotation = self._parts("goal", goal)
-            rotation = unit_quaternion(rotation, frame)
-            new = reference_of(self.motion.goal[..., self.error_columns], rotation)
-            new = new.expand_as(frame)
-            columns = self._to_reference(columns, frame, new, filtered)
+            moved = None if filtered else self._retarget_numbers(columns, frame, rotation)
+            if moved is None:
+                rotation = unit_quaternion(rotation, frame)
+                new = reference_of(self.motion.goal[..., self.error_columns], rotation)
+                new = new.expand_as(frame)
+                moved = self._to_reference(columns, frame, new, filtered), new
+            columns, frame = moved
             if position is not None:
                 target = _with_columns(target, P, position)
-            frame = new
         if goal_body is not None:
             target = _with_columns(target, B, goal_body)
         return columns, frame, target
+
+    def _retarget_numbers(
+        self, columns: DMPState, frame: Tensor, rotation: Quaternions
+    ) -> tuple[DMPState, Tensor] | None:
+        """Columns and reference of one motion for a goal that jumps, in Python's numbers.
+
+        Returns:
+            None where PyTorch has to compute, or for a wrong value, which it reports.
+        """
+        E, motion, parts = self.error_columns, self.motion, (columns.position, columns.rate)
+        if frame.ndim != 1 or type(motion) is not JointDMP or not fits_numpy(frame, *parts):
+            return None
+        q = to_tensor(rotation, frame.dtype, frame.device)
+        if q.shape != (4,) or not 0.5 < (norm := math.hypot(*q.tolist())) < math.inf:
+            return None
+        offset, q = motion.goal[..., E].tolist(), [x / norm for x in q.tolist()]
+        q = quaternion.product_of_components(exp_numbers(offset), q)
+        numbers = (x.tolist()[E] for x in parts)
+        turned = [x.numpy().copy() for x in parts]
+        for x, new in zip(turned, retarget_numbers(*numbers, frame.tolist(), q), strict=True):
+            x[E] = new
+        position, rate = map(torch.from_numpy, turned)
+        return replace(columns, position=position, rate=rate), frame.new_tensor(q)
 
     def _to_reference(
         self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool

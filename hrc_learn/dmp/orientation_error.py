@@ -6,6 +6,8 @@ primitives for robot control in the Cartesian space"; their logarithm is half of
 goal, e = 0. A rotation of the tool frame that moves start and goal alike leaves e unchanged.
 """
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,6 +17,7 @@ from hrc_learn.dmp.samples import check_samples, demo_label
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
+type Numbers = list[float]
 _NO_AXIS = 1e-9
 """Length [rad] below which a rotation vector has no direction."""
 MEAN_ITERATIONS = 10
@@ -107,6 +110,50 @@ def retarget(
     """Error to a new goal and its rate, for the same motion of the orientation."""
     new = nearest_turn(to_error(to_orientation(error, old), goal), error)
     return new, error_rate(new, angular_velocity(error, rate))
+
+
+def retarget_numbers(
+    error: Numbers, rate: Numbers, old: Numbers, goal: Numbers
+) -> tuple[Numbers, Numbers]:
+    """`retarget` of one motion in Python's numbers, in a fiftieth of the time."""
+    angle, axis = _polar(error)
+    between = quaternion.product_of_components(goal, [old[0], *(-x for x in old[1:])])
+    turned = quaternion.product_of_components(between, exp_numbers(error))
+    if turned < [0.0] * 4:  # the first component that is not zero becomes positive
+        turned = [-part for part in turned]
+    sine, own = _polar(turned[1:])
+    short = 2 * math.atan2(sine, turned[0])
+    own = own if short > _NO_AXIS else axis
+    along = sum(n * e for n, e in zip(own, error, strict=True)) - short
+    half = short / 2 + math.pi * round(along / (2 * math.pi))
+    # v is minus the angular velocity; see `drift_free_rate` and `axis_drift`.
+    slant = (math.cos(angle) - 1) / angle if angle else 0.0
+    v = _stretched(rate, axis, math.sin(angle) / angle if angle else 1.0, slant)
+    sinc = math.sin(half) / half if half else 1.0
+    lost = abs(sinc) < quaternion.SINGULAR
+    across, turn = (0.0, 0.0) if lost else (math.cos(half) / sinc, half)
+    return [2 * half * n for n in own], _stretched(v, own, across, turn)
+
+
+def exp_numbers(v: Numbers) -> Numbers:
+    """Unit quaternion of a rotation vector [rad]."""
+    angle, axis = _polar(v)
+    return [math.cos(angle / 2), *(math.sin(angle / 2) * n for n in axis)]
+
+
+def _polar(v: Numbers) -> tuple[float, Numbers]:
+    """Length and direction of a vector; zeros have none."""
+    length = math.hypot(*v)
+    return length, [x / length for x in v] if length else v
+
+
+def _stretched(v: Numbers, axis: Numbers, across: float, turn: float) -> Numbers:
+    """Vector with its part across a unit axis scaled, plus `turn` times axis x v."""
+    (x, y, z), (a, b, c) = v, axis
+    along = (1 - across) * (a * x + b * y + c * z)
+    cross = (b * z - c * y, c * x - a * z, a * y - b * x)
+    parts = zip(v, axis, cross, strict=True)
+    return [across * x + along * n + turn * k for x, n, k in parts]
 
 
 def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4"]:

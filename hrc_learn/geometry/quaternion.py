@@ -8,6 +8,8 @@ branches on data or writes in place, so all can be compiled, exported and vmappe
 Inputs must be unit quaternions: `normalize` external data.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -223,7 +225,7 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
 # Below this squared angle, the series are exact to rounding and the closed forms are not.
 _SMALL = 0.1
 # Ratio |v| / |e'| of the components perpendicular to e, below which n is singular.
-_SINGULAR = 1e-3
+SINGULAR = 1e-3
 
 
 def axis_drift(
@@ -237,7 +239,7 @@ def axis_drift(
     far = square.clamp_min(_SMALL)
     cosine, sinc = cos_and_sinc(far / 4)
     # |sinc(|e|/2)| is the ratio |v| / |e'| of the components perpendicular to e.
-    singular = sinc.abs() < _SINGULAR
+    singular = sinc.abs() < SINGULAR
     cosecant = torch.where(singular, 0.0, 1 / torch.where(singular, 1.0, sinc))
     series = polynomial(
         square.clamp_max(_SMALL), (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
@@ -304,14 +306,18 @@ def _k(square: Tensor) -> Tensor:
 
 def _written_out_product(p: Tensor, q: Tensor) -> Tensor:
     """`multiply` component by component."""
-    (a, b, c, d), (w, x, y, z) = p.unbind(-1), q.unbind(-1)
-    parts = [
+    return torch.stack(product_of_components(p.unbind(-1), q.unbind(-1)), dim=-1)
+
+
+def product_of_components[T: (Tensor, float)](p: Sequence[T], q: Sequence[T]) -> list[T]:
+    """Four components of the Hamilton product, as tensors or as numbers."""
+    (a, b, c, d), (w, x, y, z) = p, q
+    return [
         a * w - b * x - c * y - d * z,
         a * x + b * w + c * z - d * y,
         a * y - b * z + c * w + d * x,
         a * z + b * y - c * x + d * w,
     ]
-    return torch.stack(parts, dim=-1)
 
 
 def _written_out_from_matrix(R: Tensor) -> Tensor:

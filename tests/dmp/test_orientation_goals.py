@@ -1,13 +1,17 @@
 """New goals for an orientation, all around: 36 axes by 5 angles in one batch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from demo_motions import minimum_jerk
+from scipy.spatial.transform import Rotation
+from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import OrientationDMP
+from hrc_learn.dmp import OrientationDMP, PoseDMP
 from hrc_learn.dmp.orientation_error import angular_acceleration
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Pose, quaternion
 
 S = torch.linspace(0, 1, 1000, dtype=torch.float64)
 TURN = 120
@@ -95,3 +99,94 @@ def test_the_sign_of_a_new_goal_means_nothing(goal_filter):
         ]
     torch.testing.assert_close(states[0].angular_velocity, states[1].angular_velocity)
     assert quaternion.angle(states[0].orientation, states[1].orientation).max() < 1e-7
+
+
+def pose_around(dmp):
+    """A pose that turns as the given primitive does."""
+    return PoseDMP.fit(2 * S, S[:, None] * torch.ones(3), dmp.rollout().orientation)
+
+
+@pytest.fixture(scope="module")
+def kinds():
+    orientation = fitted(approach=1.0)
+    offset = orientation.motion.coordinates().detach()
+    offset[:, -1] += torch.tensor([0.2, -0.1, 0.4])
+    offset = orientation.motion.with_coordinates(offset)
+    return {
+        "orientation": orientation,
+        "pose": pose_around(orientation),
+        "goal with an error": OrientationDMP(offset, orientation.goal),
+    }
+
+
+def turned(error, reference):
+    """SciPy's rotation with this error."""
+    reference = Rotation.from_quat(np.asarray(reference), scalar_first=True)
+    return Rotation.from_rotvec(-np.asarray(error)) * reference
+
+
+def spin(error, rate, reference, h=1e-5):
+    """Angular velocity by central differences."""
+    before, after = (turned(error + k * h * rate, reference) for k in (-1, 1))
+    return (after * before.inv()).as_rotvec() / (2 * h)
+
+
+@pytest.mark.parametrize("kind", ["orientation", "pose", "goal with an error"])
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-5, 0.4, 3.1, 4.5, 8.0, 20.0])
+@pytest.mark.parametrize("stays", [False, True])
+def test_a_goal_that_jumps_changes_only_what_is_seen_from_it(kinds, kind, angle, stays):
+    dmp, rng = kinds[kind], np.random.default_rng(round(10 * angle))
+    E = dmp.error_columns
+    axis, rate = rng.normal(size=(2, 3))
+    error = angle * axis / np.linalg.norm(axis)
+    with torch.no_grad(), shapes_unchecked():
+        state = dmp.initial_state()
+        columns = state.motion.position.clone(), state.motion.rate.clone()
+        columns[0][E], columns[1][E] = torch.tensor(error), torch.tensor(rate)
+        motion = replace(state.motion, position=columns[0], rate=columns[1])
+        state = replace(state, motion=motion)
+        q = Rotation.random(rng=rng).as_quat(scalar_first=True)
+        if stays:
+            q = -1.3 * (dmp.goal.orientation if kind == "pose" else dmp.goal)
+        place = torch.tensor([1.0, -2.0, 3.0]).double()
+        goal = Pose(place, torch.as_tensor(q)) if kind == "pose" else q
+        new = dmp.retarget(state, goal, filtered=False)
+        plain = dmp.retarget(state, goal)
+    moved = new.motion.position[E].numpy(), new.motion.rate[E].numpy(), new.reference
+    change = turned(*moved[::2]) * turned(error, state.reference).inv()
+    assert change.magnitude() < 1e-12
+    # A goal that stays, whichever the sign and length of its quaternion, changes nothing.
+    if stays:
+        np.testing.assert_allclose(moved[0], error, rtol=0, atol=1e-7)
+    expected = spin(error, rate, state.reference)
+    np.testing.assert_allclose(spin(*moved), expected, rtol=0, atol=1e-7)
+    # No other number of whole turns is closer to where it was.
+    turn = 2 * np.pi * moved[0] / np.linalg.norm(moved[0]) if moved[0].any() else 0.0
+    far = [np.linalg.norm(moved[0] + k * turn - error) for k in (-1, 0, 1)]
+    assert far[1] <= min(far) + 1e-9
+    torch.testing.assert_close(new.motion.position, plain.motion.position, rtol=0, atol=1e-7)
+    torch.testing.assert_close(new.reference, plain.reference)
+    if kind == "pose":
+        torch.testing.assert_close(new.motion.target[:3], place)
+        torch.testing.assert_close(state.motion.target[:3], dmp.goal.position)
+
+
+def test_whole_turns_away_only_the_rate_along_the_error_stays(kinds):
+    dmp = kinds["orientation"]
+    axis = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+    with torch.no_grad():
+        state = dmp.initial_state()
+        rate = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+        motion = replace(state.motion, position=2 * torch.pi * axis, rate=rate)
+        new = dmp.retarget(replace(state, motion=motion), dmp.goal, filtered=False).motion
+    torch.testing.assert_close(new.position, 2 * torch.pi * axis)
+    torch.testing.assert_close(new.rate, (rate @ axis) * axis, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong", [[0.1, 0.2, 0.1, 0.0], [1.0, 0.0, 0.0], [np.nan, 0, 0, 1], 1.0]
+)
+def test_a_goal_that_is_no_orientation_is_refused(kinds, wrong):
+    dmp = kinds["orientation"]
+    with torch.no_grad(), shapes_unchecked(), pytest.raises(ValueError, match="unit quat"):
+        dmp.step(dmp.initial_state(), 0.01, goal=wrong)
