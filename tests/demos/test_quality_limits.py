@@ -1,5 +1,6 @@
 """Measures, edits and files of episodes at both sides of every limit."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hrc_learn.demos.quality import ranking, structure_checks, video_checks
 from hrc_learn.demos.quality.ranking import Decision, EpisodeQuality, Ranking
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.read.profiles import FeatureProfiles, profile_columns
 from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.demos.videos import VideoSegment
 
@@ -632,3 +634,44 @@ def test_copies_of_a_video_are_known_by_their_ends(tmp_path):
     one.write_bytes(b"ab")
     assert same(b"ab")
     assert not same(b"aa")
+
+
+@pytest.mark.parametrize(
+    ("name", "shift", "told"),
+    [
+        ("min", 0.19, False),
+        ("min", 0.21, True),
+        ("max", -0.19, False),
+        ("max", -0.21, True),
+        ("mean", 5.19, False),
+        ("mean", 5.21, True),
+        ("mean", -5.19, False),
+        ("mean", -5.21, True),
+        ("std", -2.0, False),
+        ("std", -2.01, True),
+        ("max", 190.9, False),
+        ("max", 191.1, True),
+        ("min", float("nan"), True),
+    ],
+)
+def test_statistics_fit_within_a_fiftieth_of_the_range(folder, tmp_path, name, shift, told):
+    """Values from 0 to 10: a fiftieth is 0.2; twenty ranges and one are 201."""
+    stated = {"min": 0.0, "max": 10.0, "mean": 5.0, "std": 2.0}
+    stated[name] += shift
+    (tmp_path / "meta").mkdir()
+    rows = {key: [value, 5.0 * (key != "min")] for key, value in stated.items()}
+    text = json.dumps({STATE: rows})
+    (tmp_path / "meta/stats.json").write_text(text)
+    values = np.stack([np.linspace(0, 10, 30), np.linspace(0, 5, 30)], axis=1)
+    profiles = [profile_columns({STATE: values})[STATE]] * 2
+    feature = FeatureProfiles(
+        key=STATE,
+        fps=50.0,
+        entries=[entry(0), entry(1)],
+        profiles=profiles,
+        names=["a", "b"],
+        smooth=np.ones(2, bool),
+    )
+    found = [*structure_checks.statistics_fit(replace(folder, root=tmp_path), [feature])]
+    assert len(found) == told
+    assert all("do not fit the data in 1 components" in issue.message for issue in found)

@@ -650,6 +650,7 @@ def gripper_like(count=1, rest=0.6, size=1.0):
     [
         (gripper_like(), 1),
         (gripper_like(2), 2),
+        (gripper_like(2)[:, 2:], 0),
         (gripper_like(rest=0.45), 0),
         (gripper_like(size=1.04), 1),
         (gripper_like(size=1.06), 0),
@@ -796,3 +797,11 @@ def test_files_are_told_by_their_content(tmp_path):
     path.write_bytes(stream.getvalue())
     (one,) = open_recordings(path)
     assert (one.fps, one.task, [*one.fields]) == (20, "pour", ["q"])
+
+
+def test_half_of_the_joints_are_too_few_to_follow_a_command():
+    other = np.cos(np.arange(200) / 7)[:, None] + 3
+    two = np.hstack([Q[:, :1], other])
+    assert "command_position" not in understood(qpos=Q[:, :2], action=two).selections
+    three = np.hstack([Q[:, :2], other])
+    assert "command_position" in understood(qpos=Q, action=three).selections
