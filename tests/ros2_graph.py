@@ -18,6 +18,7 @@ class Graph:
         listeners: Subscriptions that its publishers count.
         greeting: Joint states that come as soon as it listens.
         qualities: Quality of service of each topic that it takes or sends.
+        kinds: Names of the messages that it sends, by topic.
         sleeps: Durations for which it was waited [s].
     """
 
@@ -25,7 +26,7 @@ class Graph:
         self.takers, self.sent, self.closed = {}, [], False
         self.now, self.listeners, self.greeting = 50.0, 1, [(10.0, READY)]
         self.node, self.trips, self.parameters, self.log = self, [], {}, []
-        self.forms, self.qualities, self.sleeps = {}, {}, []
+        self.forms, self.qualities, self.kinds, self.sleeps = {}, {}, {}, []
 
     def create_subscription(self, kind, topic, take, quality):
         self.takers[topic], self.qualities[topic] = take, quality
@@ -34,7 +35,7 @@ class Graph:
                 self.state(*greeting)
 
     def create_publisher(self, kind, topic, quality):
-        self.qualities[topic] = quality
+        self.qualities[topic], self.kinds[topic] = quality, kind.__name__
         return SimpleNamespace(
             topic_name=topic,
             publish=lambda message: self.sent.append((topic, message)),

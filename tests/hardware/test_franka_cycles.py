@@ -452,3 +452,14 @@ def test_a_stopped_arm_without_a_connection_is_asked_a_hundred_times_a_second(bo
     run(box, 60)
     assert slept == [0.01] * len(slept)
     assert len(slept) >= 3
+
+
+def test_an_arm_of_which_one_joint_moves_does_not_rest(box):
+    seen = {}
+    box.command(range(10, 80, 20), 0.1 * np.eye(7)[3])
+    box.at[75] = lambda: seen.update(report=box.report)
+    run(box, 80)
+    assert not seen["report"].resting
+    assert seen["report"].phase == Phase.MOVING
+    assert box.calls.count(("motion",)) == 1
+    assert not any(end for _, velocity, end in box.answers if np.abs(velocity).max() > 1e-6)

@@ -276,3 +276,17 @@ def test_controllers_are_waited_for_and_then_missed_by_their_topic(graph):
     assert begun + 4 < graph.now <= begun + 4.03
     assert set(graph.sleeps) == {0.02}
     assert graph.closed
+
+
+@pytest.mark.parametrize(
+    ("interface", "kind"),
+    [
+        ("velocity", "Float64MultiArray"),
+        ("position", "Float64MultiArray"),
+        ("trajectory", "JointTrajectory"),
+    ],
+)
+def test_commands_are_messages_of_the_controllers_kind(graph, guards, interface, kind):
+    Ros2Arm(panda.chain, Ros2Config(interface=interface))
+    assert graph.kinds == {COMMANDS: kind}
+    assert bool(guards) == (interface == "velocity")

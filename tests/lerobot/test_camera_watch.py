@@ -12,9 +12,11 @@ from lerobot.processor import ProcessorStepRegistry
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian.perspective import from_base, marker_pixels, moved, pixels_and_depth
-from hrc_learn.lerobot.arm_values import HAND, MARKER
+from hrc_learn.lerobot import camera_watch
+from hrc_learn.lerobot.arm_values import HAND, MARKER, PIXELS
 from hrc_learn.lerobot.camera_watch import CAMERA_WATCH, CameraWatchStep, add_camera_watch
 from hrc_learn.lerobot.smoothing import PREPROCESSOR
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 FPS = 25
 CAMERA = torch.tensor(
@@ -189,3 +191,72 @@ def test_what_is_missing_is_named(dataset, tmp_path):
         writer.save_episode()
     with pytest.raises(ValueError, match=r"ee\.x"):
         add_camera_watch(tmp_path, tmp_path / "bare")
+
+
+@pytest.mark.parametrize("correct", [False, True])
+def test_objects_are_corrected_from_a_dataset_in_which_they_were_taken(
+    tmp_path, correct, step, monkeypatch
+):
+    """Each lies where the tool was lowest, and was seen from the first frame on."""
+    fitted = []
+
+    def fit(watched, fps, size):  # the same camera again
+        fitted.append((watched, fps, size))
+        return step._watch.reference
+
+    monkeypatch.setattr(camera_watch.CameraReference, "fit", fit)
+    rng, root = np.random.default_rng(6), tmp_path / "set"
+    names = [name.removesuffix(".pos") for name in (*PIXELS, *HAND, *MARKER)]
+    with DatasetWriter(root, FPS, "any", names) as writer:
+        for _ in range(5):
+            writer.start_episode("take")
+            pose, pixels = episode(rng)
+            taken = pose.position[pose.position[:, 2].argmin()]
+            seen = pixels_and_depth(CAMERA, from_base(CAMERA, taken[None]))[0][0]
+            for k, pixel in enumerate(pixels):
+                there = seen if k == 0 else 0 * seen  # hidden by the tool later
+                visible = float(k != 3)
+                state = [*there.tolist(), *pose[k].vector().tolist(), *pixel, visible]
+                writer.add_frame(joint_position=state)
+            writer.save_episode()
+    (tmp_path / PREPROCESSOR).write_text(json.dumps({"steps": []}))
+    add_camera_watch(tmp_path, root, correct=correct)
+    ((watched, fps, size),) = fitted
+    assert (len(watched), fps, size) == (5, FPS, IMAGE_SIZE)
+    last = watched[-1]
+    np.testing.assert_allclose(last.feature, pixels, rtol=1e-6)
+    np.testing.assert_allclose(last.pose.vector(), pose.vector(), atol=1e-6)
+    assert last.visible.tolist() == [k != 3 for k in range(len(pixels))]
+    (entry,) = json.loads((tmp_path / PREPROCESSOR).read_text())["steps"]
+    config = entry["config"]
+    assert config["correct"] == correct
+    assert config["pose_columns"] == [*range(2, 8)]
+    assert config["marker_columns"] == [8, 9, 10]
+    assert config["object_columns"] == ([0, 1] if correct else None)
+    if not correct:
+        assert config["object_height"] == 0.0
+        return
+    columns = {"pose_columns": [*range(6)], "marker_columns": [6, 7, 8]}
+    corrected = CameraWatchStep(**config | columns | {"object_columns": [9, 10]})
+    knocked = moved(CAMERA, torch.tensor([0.03, 0.02, 0.02, 0.02, -0.01, 0.02]).double())
+    pose, pixels = episode(rng, knocked)
+    lowest = pose.position[:, 2].min()  # nearly the plane of the objects
+    there = torch.tensor([0.5, 0.03, float(lowest)]).double()[None]
+    before, now = (pixels_and_depth(c, from_base(c, there))[0][0] for c in (CAMERA, knocked))
+    for k, pixel in enumerate(pixels):
+        state = torch.tensor([*pose[k].vector(), *pixel, 1.0, *now]).float()[None]
+        made = corrected({TransitionKey.OBSERVATION: {"observation.state": state}})
+    found = made[TransitionKey.OBSERVATION]["observation.state"][0, 9:]
+    assert (found - before).norm() < 0.2 * (now - before).norm()
+
+
+@pytest.mark.parametrize(("visible", "seen"), [(0.5, True), (0.49, False)])
+def test_a_marker_counts_from_a_visibility_of_a_half(step, visible, seen):
+    pose, pixels = episode(np.random.default_rng(7))
+    looks = []
+    step._watch.update = lambda time, pose, pixel: looks.append(time)
+    for k in range(3):
+        state = torch.tensor([[0.0, *pose[k].vector(), *pixels[k], visible]])
+        step({TransitionKey.OBSERVATION: {"observation.state": state}})
+    assert looks == ([1 / FPS, 2 / FPS, 3 / FPS] if seen else [])
+    assert step.transform_features({"a": {}}) == {"a": {}}

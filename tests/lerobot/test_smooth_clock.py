@@ -169,6 +169,7 @@ def test_the_path_begins_with_the_measured_velocity(
     smooth, clock, moved, passed, age, velocity
 ):
     smooth.begin()
+    clock.now += 0.5  # only the last two readings count
     smooth.get_observation()
     started = []
     smooth.upsampler.reset = lambda *motion: started.append(motion)
