@@ -408,7 +408,6 @@ def _rest(
     position: Float[np.ndarray, " images"], pixel: Float[np.ndarray, "images 2"]
 ) -> float:
     """Squared distances of pixels from a polynomial of the joint's position [px^2]."""
-    centred = position - position.mean()
-    powers = np.vander(centred / max(float(np.abs(centred).max()), 1e-9), _POWERS + 1)
+    powers = np.vander(position - position.mean(), _POWERS + 1)
     fitted, *_ = np.linalg.lstsq(powers, pixel, rcond=None)
     return float(((pixel - powers @ fitted) ** 2).sum())

@@ -177,6 +177,7 @@ def test_a_calibration_tells_positions_as_lerobot_does(tmp_path):
         bus._id_to_name_dict = {m.id: name for name, m in motors.items()}
         bus._id_to_model_dict = {m.id: m.model for m in motors.values()}
         ranges = calibrated_ranges(file, degrees=degrees)
+        assert (ranges == calibrated_ranges(file)) != degrees
         for side, end in enumerate(("range_min", "range_max")):
             expected = bus._normalize({m["id"]: m[end] for m in CALIBRATION.values()})
             found = [ranges["a.pos"][side], ranges["gripper.pos"][side]]

@@ -504,7 +504,7 @@ def test_the_loss_is_that_of_a_loop_over_samples_plans_and_actions(n_plans):
     assert each.tolist() == pytest.approx(losses, rel=1e-4)
     assert values["rmse"] == pytest.approx(math.sqrt(squares / count), rel=1e-4)
     mean, _ = policy.forward(batch)
-    assert float(mean) == pytest.approx(sum(losses) / 4, rel=1e-4)
+    assert mean.item() == pytest.approx(sum(losses) / 4, rel=1e-4)
 
 
 def test_the_error_of_plans_is_a_running_mean_over_trainings_only():

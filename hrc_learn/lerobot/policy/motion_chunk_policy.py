@@ -393,7 +393,7 @@ class MotionChunkPolicy(MotionPolicy):
         """Planned state, with measured positions where they are observed."""
         if OBS_STATE not in self.encoder.widths:
             return planned
-        values = batch[OBS_STATE][:, None, self.measured.clamp_min(0)]
+        values = batch[OBS_STATE][:, None, self.measured]  # -1: the last, which is not used
         seen = self.encoding.to_coordinates(values.to(self.encoding.mean))[:, 0]
         seen, there = seen[:, self._smooth].to(planned), self.measured[self._smooth] >= 0
         position = torch.where(there, seen, planned[:, 0])
