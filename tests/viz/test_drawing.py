@@ -217,6 +217,8 @@ def test_entries_of_a_legend_are_22_pixels_apart():
     inside = letters[(letters[:, 0] > 33) & (letters[:, 0] < 50) & (letters[:, 1] > 30)]
     assert 34 <= inside[:, 1].min() <= 36
     assert 4 <= right - inside[:, 1].max() <= 8
+    middle = (inside[:, 0].min() + inside[:, 0].max()) / 2
+    assert middle == pytest.approx((32 + bottom) / 2, abs=1.5)
 
 
 def test_an_inset_has_a_frame_of_two_pixels():
