@@ -26,7 +26,7 @@ _tests: dict[str, tuple[float, list[tuple[str, int]]]] = {}
 
 
 def _line(code: CodeType, number: int) -> object:
-    if code.co_filename.startswith(_PACKAGE):
+    if (code.co_filename or "").startswith(_PACKAGE):
         _lines.add((code.co_filename[len(_PACKAGE) :], number))
     return _MONITORED.DISABLE
 
