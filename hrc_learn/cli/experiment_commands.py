@@ -56,15 +56,7 @@ _APPLIES = {
     "handover": ("collaboration",),
 }
 """Experiments that an option belongs to."""
-_SIMULATED_ONLY = (
-    "markerless",
-    "trials",
-    "serve",
-    "page",
-    "camera_moved",
-    "worker",
-    "handover",
-)
+_SIMULATED_ONLY = "markerless trials serve page camera_moved worker handover"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +79,7 @@ def run(args: Run) -> int:
         if args.experiment not in experiments:
             refuse_given(args, [name], f"is an option of hrc run {' and '.join(experiments)}")
     refuse_existing(folder, args.overwrite)
-    is_real = args.drives_real_arm(_SIMULATED_ONLY)
+    is_real = args.drives_real_arm(_SIMULATED_ONLY.split())
     if args.arm == "lerobot":
         raise ValueError(
             "hrc run leads Franka arms only, not --arm lerobot: hrc page guides the arm and "

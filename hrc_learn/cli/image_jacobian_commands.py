@@ -33,26 +33,15 @@ from hrc_learn.learning.fit_dashboards import record_learning
 from hrc_learn.learning.markerless_fitting import MarkerlessFit, find_landmarks
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.store import new_folder, write_json
+from hrc_learn.store import new_folder, read_toml, write_json
 from hrc_learn.vision import MarkerDetector, centre
 from hrc_learn.viz.report import Measurement, Row, measured, show_command, show_measurements
 
-# Most of a relative error is image noise; a marker is detected to 0.1 px.
-_ROWS: tuple[Row, ...] = (
-    ("pairs", "pairs of images", 1, "", None, 0.0),
-    ("neurons", "neurons", 1, "", None, 0.0),
-    ("motion_px", "image motion in a pair", 1, "px", None, 0.0),
-    ("held_out_relative", "held-out error, relative to that motion", 100, "%", 2.0, 0.0),
-    ("held_out_relative_worst_cell", "held-out error, worst place", 100, "%", None, 0.0),
-    ("focal_px", "focal length", 1, "px", None, 0.0),
-    ("camera_place_std_mm", "place of the camera, standard deviation", 1, "mm", None, 0.0),
-    ("target_error_px", "target in the image, error", 1, "px", None, 0.1),
-    ("angle_spread_deg", "angle of object and gripper, spread", 1, "deg", None, 0.0),
-    ("approach_spread_deg", "orientation above the object, spread", 1, "deg", None, 0.0),
-    # Found in the video, without markers.
-    ("tool_seen", "images in which the tool was found", 100, "%", None, 0.0),
-    ("tool_pixel_std_px", "pixel of the tool, standard deviation", 1, "px", None, 0.1),
-    ("objects_found", "demonstrations in which the object was found", 1, "", None, 0.0),
+_ROWS: tuple[Row, ...] = tuple(
+    (name, text, factor, unit, bound[0] if bound else None, resolution)
+    for name, (text, factor, unit, resolution, *bound) in read_toml(
+        Path(__file__).with_name("image_jacobian_rows.toml")
+    ).items()
 )
 
 

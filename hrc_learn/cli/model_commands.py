@@ -19,19 +19,12 @@ from hrc_learn.kinematics import panda
 from hrc_learn.learning.model_choice import best_models, predict
 from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, sampled
 from hrc_learn.learning.reproduction_error import ReproductionError
-from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
+from hrc_learn.store import MADE_BY, new_folder, read_made_by, read_toml, write_json
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import Figure, plots_figure
 from hrc_learn.viz.panels import Plot, single
 
-UNITS = {
-    "nrmse": "",
-    "largest": "rad or m",
-    "goal_error": "rad or m",
-    "jerk": "of the demonstration's",
-    "turn_rmse": "deg",
-    "turn_at_goal": "deg",
-}
+UNITS: dict[str, str] = read_toml(Path(__file__).with_name("reproduction_units.toml"))
 """Units of the measures of `ReproductionError`."""
 
 

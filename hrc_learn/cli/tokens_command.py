@@ -15,7 +15,7 @@ from hrc_learn.cli.arguments import Tokens, refuse_given, sibling
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.dmp.tokens import MotionTokenizer
-from hrc_learn.store import new_folder, read_made_by, write_json
+from hrc_learn.store import new_folder, read_made_by, read_toml, write_json
 from hrc_learn.viz.report import Measurement, show_measurements
 
 MODEL = "tokens"
@@ -156,11 +156,4 @@ def _measured(
     }
 
 
-_ROWS = {
-    "chunks": "chunks of held-out episodes",
-    "tokens_mean": "tokens per chunk",
-    "tokens_p95": "tokens per chunk, 95th percentile",
-    "bits_per_s": "bits per second",
-    "rmse": "RMSE in the dataset's units",
-    "rmse_of_range": "RMSE relative to the range of each column",
-}
+_ROWS = read_toml(Path(__file__).with_name("token_rows.toml"))

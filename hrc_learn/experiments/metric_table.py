@@ -15,16 +15,10 @@ from jaxtyping import Float
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.viz.report import Measurement
 
-RESOLUTIONS = {
-    # Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; contacts in MuJoCo are as soft.
-    "mm": 0.1,
-    # The same noise of seven joints: sqrt(7) * 1e-4 rad.
-    "deg": 0.02,
-    # Noise of a detected marker centre: 0.08 px per coordinate (docs/concepts/training.md).
-    "px": 0.1,
-    # The control step.
-    "s": 0.01,
-}
+# Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; contacts in MuJoCo are as soft. The
+# same noise of seven joints is sqrt(7) * 1e-4 rad. That of a detected marker centre is 0.08 px
+# per coordinate (docs/concepts/training.md). The last one is the control step.
+RESOLUTIONS = {"mm": 0.1, "deg": 0.02, "px": 0.1, "s": 0.01}
 """Resolution of measurements by unit; values in other units are shown as they are."""
 
 

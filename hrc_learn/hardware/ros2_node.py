@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,16 +29,9 @@ from hrc_learn.hardware.ros2_arm import Ros2Arm, Ros2Config
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import SerialChain
+from hrc_learn.store import read_toml
 
-PARAMETERS: dict[str, tuple[float, float, float, str]] = {
-    "linear_speed": (0.1, 0.01, 0.5, "cap on the speed of the task [m/s]"),
-    "angular_speed": (0.5, 0.05, 2.0, "cap on the rotation of the task [rad/s]"),
-    "tcp_speed": (0.25, 0.01, 1.0, "cap on the speed of the tool, elbow included [m/s]"),
-    "null_damping": (3.0, 0.5, 50.0, "push divided by the null-space velocity [N m s/rad]"),
-    "region_size": (0.02, 0.002, 1.0, "half edge of the goal's box [m]"),
-    "heartbeat": (0.0, 0.0, 10.0, "longest silence of ~/heartbeat [s]; 0: not required"),
-    "marker": (-1.0, -1.0, 49.0, "marker in ~/image; -1: features come on ~/feature"),
-}
+PARAMETERS: dict[str, list] = read_toml(Path(__file__).with_name("ros2_parameters.toml"))
 """Parameters of the node, read at `configure`: default, range and meaning."""
 _REPORTS = 0.1
 """Time between markers, and ten times between diagnostics [s]."""

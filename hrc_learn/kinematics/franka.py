@@ -18,10 +18,9 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 
 from __future__ import annotations
 
-import tomllib
 from functools import partial
-from importlib.resources import files
 from math import cos, pi, sin
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -34,60 +33,24 @@ from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import link_capsules
 from hrc_learn.kinematics.description import pseudo_inertia
 from hrc_learn.kinematics.limits import JointLimits
+from hrc_learn.store import read_toml
 
 
-def _limits(vintage: str, **rows: tuple[float, ...]) -> JointLimits:
+def _limits(vintage: str, **rows: list[float]) -> JointLimits:
     table = {name: torch.tensor(row, dtype=torch.float64) for name, row in rows.items()}
     return JointLimits(vintage=vintage, **table)
 
 
-PANDA_LIMITS = _limits(
-    "Franka Emika Panda (FER), FCI documentation up to libfranka 0.9",
-    lower=(-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973),
-    upper=(2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973),
-    velocity=(2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100),
-    acceleration=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
-    jerk=(7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0),
-    torque=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
-)
+_TABLES = read_toml(Path(__file__).with_name("franka_links.toml"))
+PANDA_LIMITS = _limits(**_TABLES["panda_limits"])
 """Franka's "Robot and interface specifications", control-parameters-joint-fer.csv."""
 
-FR3_LIMITS = _limits(
-    "the strictest of libfranka 0.10 to 0.21 (rate_limiting.h), the URDF with position-based "
-    "velocity limits of franky-sim 1.0.4, and control-parameters-joint-fr3.csv of Franka's "
-    "documentation in a76efff, read in May 2026",
-    lower=(-2.7501, -1.7918, -2.9007, -3.0481, -2.8101, 0.54092, -3.0196),
-    upper=(2.7501, 1.7918, 2.9007, -0.1458, 2.8101, 4.5205, 3.0196),
-    velocity=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
-    acceleration=(10.0,) * 7,
-    jerk=(5000.0,) * 7,
-    torque=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
-    deceleration=(6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0),
-    # With the distance w from here to the position limit of a table, d the deceleration and v
-    # the velocity, the curves meet where v is reached: sqrt((v + its offset)^2 - 2 d w) - v, of
-    # which these are the largest.
-    velocity_offset=(
-        *(0.37174598019283733, 0.21154196331256925, 0.2004999999999999, 0.31507506547958686),
-        *(0.3795562316551111, 0.36783379753482226, 0.36935518865171524),
-    ),
-)
+FR3_LIMITS = _limits(**_TABLES["fr3_limits"])
 """The innermost position limits of these tables, and the smallest velocity offsets whose curves
 stay below all others: kept by every Research 3. The tables differ in the position limits and in
 the offsets; a robot uses those of the URDF that it sends to its driver, hence of its system
 image."""
 
-
-# Craig's modified Denavit-Hartenberg parameters, as published in Franka's "Robot and interface
-# specifications": a [m], d [m], alpha [rad].
-_JOINTS = (
-    (0.0, 0.333, 0.0),
-    (0.0, 0.0, -pi / 2),
-    (0.0, 0.316, pi / 2),
-    (0.0825, 0.0, pi / 2),
-    (-0.0825, 0.384, -pi / 2),
-    (0.0, 0.0, pi / 2),
-    (0.088, 0.0, pi / 2),
-)
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
 _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
 
@@ -147,10 +110,9 @@ def _valid_first(
     return torch.take_along_dim(q, order[..., None], dim=-2)
 
 
-def _craig(a: float, d: float, alpha: float) -> Tensor:
-    """Rx(alpha) Tx(a) Tz(d): a joint frame at zero in the frame before it."""
-    # Multiples of a right angle, without the 6e-17 of rounding.
-    c, s = round(cos(alpha)), round(sin(alpha))
+def _craig(a: float, d: float, s: int) -> Tensor:
+    """Rx(alpha) Tx(a) Tz(d): a joint frame at zero in the frame before it, s = sin(alpha)."""
+    c = 1 - abs(s)  # multiples of a right angle
     rows = [[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1]]
     return torch.tensor(rows, dtype=torch.float64)
 
@@ -164,17 +126,14 @@ def _along_z(distance: float, angle: float = 0.0) -> Tensor:
 TOOL_LINK = 9
 """Number of the tool centre point's frame, on which the hand is mounted."""
 
-_LINKS = tomllib.loads(
-    files(__package__).joinpath("franka_links.toml").read_text(encoding="utf-8")
-)
-LINK_CAPSULES = link_capsules(_LINKS["capsules"])
+LINK_CAPSULES = link_capsules(_TABLES["capsules"])
 """Capsules of the links of either arm; the simulated arm is built from the same ones."""
 
 
 def _inertias() -> tuple[Float[np.ndarray, "4 4"] | None, ...]:
     """Pseudo-inertias of base, links, flange and gripper."""
     found = []
-    for mass, row in zip(_LINKS["masses"], _LINKS["inertia"], strict=True):
+    for mass, row in zip(_TABLES["masses"], _TABLES["inertia"], strict=True):
         x, y, z, xx, xy, xz, yy, yz, zz = row
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         found.append(pseudo_inertia(mass, (x, y, z), inertia))
@@ -187,7 +146,7 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
     """One of Franka's arms with the Franka hand."""
     chain = SerialChain(
         joint_names=[f"{name}_joint{i}" for i in range(1, 8)],
-        mounts=torch.stack([_craig(*row) for row in _JOINTS]),
+        mounts=torch.stack([_craig(*row) for row in _TABLES["joints"]]),
         flange=_along_z(_FLANGE_OFFSET),
         tcp=_along_z(TCP_OFFSET, _HAND_ANGLE),
         limits=limits,
@@ -195,13 +154,13 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
             [0, -pi / 4, 0, -3 * pi / 4, 0, pi / 2, pi / 4], dtype=torch.float64
         ),
     )
-    *links, hand = _LINKS["masses"]
+    *links, hand = _TABLES["masses"]
     return Arm(
         name=name,
         chain=chain,
         shape=ArmShape(masses=(None, *links, 0.0, hand), inertia=_inertias()),
         capsules=LINK_CAPSULES + hand_capsules(TOOL_LINK),
-        overlapping=[(a, b) for a, b in _LINKS["overlapping"]],
+        overlapping=[(a, b) for a, b in _TABLES["overlapping"]],
         closed_form=partial(franka_branches, ranges=ranges),
     )
 

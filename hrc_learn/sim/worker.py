@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim.imperfections import Imperfections
+from hrc_learn.store import read_toml
 
 # Lengths as fractions of the stature: Drillis and Contini (1966), "Body segment parameters", as
 # in Winter (2009), "Biomechanics and motor control of human movement", figure 4.1.
@@ -27,20 +29,8 @@ _TRUNK = _SHOULDER_HEIGHT - _HIP_HEIGHT
 # Breadths and circumferences of men of 1.756 m, rounded, as fractions of it: Gordon et al.
 # (2014), "2012 anthropometric survey of U.S. Army personnel", NATICK/TR-15/007.
 _MEASURED = 1.756
-_RADII = {
-    "head": (0.154 + 0.199) / 4 / _MEASURED,  # of breadth and length, the mean
-    "neck": 0.398 / (2 * np.pi) / _MEASURED,
-    "chest": 0.255 / 2 / _MEASURED,  # of its depth
-    "shoulders": 0.358 / (2 * np.pi) / _MEASURED,
-    "pelvis": 0.250 / 2 / _MEASURED,  # of the depth of the abdomen and the buttocks
-    "upper_arm": 0.358 / (2 * np.pi) / _MEASURED,
-    "forearm": 0.310 / (2 * np.pi) / _MEASURED,
-    "hand": 0.088 / 2 / _MEASURED,  # of its breadth
-    # Thigh and calf are thickest at one end: of half way to the knee and the ankle.
-    "thigh": (0.625 + 0.39) / (4 * np.pi) / _MEASURED,
-    "shank": (0.392 + 0.229) / (4 * np.pi) / _MEASURED,
-    "foot": 0.090 / 2 / _MEASURED,
-}
+_TABLES = read_toml(Path(__file__).with_name("worker_parts.toml"))
+_RADII = {kind: radius / _MEASURED for kind, radius in _TABLES["radii"].items()}
 _SHOULDER_HALF = (0.510 / 2) / _MEASURED - _RADII["upper_arm"]  # of the deltoids' breadth
 _CHEST_HALF = 0.300 / 2 / _MEASURED - _RADII["chest"]
 _PELVIS_HALF = 0.346 / 2 / _MEASURED - _RADII["pelvis"]  # of the hips' breadth
@@ -52,45 +42,12 @@ STATURES = {"women": (1.518, 1.724), "men": (1.649, 1.869)}
 WORKER_ITEM_HALF_SIZE = (0.035, 0.025, 0.025)
 """Half size of the object that a worker carries to the bench [m]."""
 
-_SKIN: Colour = (0.85, 0.66, 0.53, 1.0)
-_SHIRT: Colour = (0.20, 0.42, 0.62, 1.0)
-_TROUSERS: Colour = (0.23, 0.25, 0.30, 1.0)
-_SHOES: Colour = (0.12, 0.12, 0.13, 1.0)
-
-_PARTS = (
-    ("head", "head", _SKIN),
-    ("neck", "neck", _SKIN),
-    ("chest_left", "chest", _SHIRT),
-    ("chest_right", "chest", _SHIRT),
-    ("shoulders", "shoulders", _SHIRT),
-    ("pelvis", "pelvis", _TROUSERS),
-    *(
-        (f"{part}_{side}", part, colour)
-        for side in ("left", "right")
-        for part, colour in (
-            ("upper_arm", _SHIRT),
-            ("forearm", _SKIN),
-            ("hand", _SKIN),
-            ("thigh", _TROUSERS),
-            ("shank", _TROUSERS),
-            ("foot", _SHOES),
-        )
-    ),
-)
+_PARTS: list[tuple[str, str, str]] = _TABLES["parts"]
 PARTS = tuple(name for name, _, _ in _PARTS)
 """Names of the body's capsules, in the order of all arrays."""
-# Body regions (`hrc_learn.controller.BODY_REGIONS`) by kind; others are named alike.
-_REGION = {
-    "shoulders": "back and shoulders",
-    "pelvis": "abdomen",  # the capsule holds both, and the limits of the abdomen are lower
-    "upper_arm": "upper arm",
-    "forearm": "lower arm",
-    "shank": "lower leg",
-    "foot": "lower leg",
-}
-REGIONS = tuple(_REGION.get(kind, kind) for _, kind, _ in _PARTS)
+REGIONS = tuple(_TABLES["regions"].get(kind, kind) for _, kind, _ in _PARTS)
 """Body regions of the capsules."""
-COLOURS = tuple(colour for _, _, colour in _PARTS)
+COLOURS: tuple[Colour, ...] = tuple(tuple(_TABLES["colours"][c]) for _, _, c in _PARTS)
 """Radii of the capsules [m]."""
 # Numbers of the parts that come in pairs, left and right.
 _PAIRS = {

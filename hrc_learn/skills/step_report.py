@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from hrc_learn.controller.arm_loop_state import ArmReport, Limitation, WatchedPe
 from hrc_learn.controller.null_space_motion import fraction_kept
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reason
+from hrc_learn.store import read_toml
 
 # Fraction of a motion above which it counts as followed: late servos and the curvature of the
 # null space leave no more of it either.
@@ -29,29 +31,9 @@ _WAITING = 0.05
 type Detail = float | int | str
 """Number or words inserted into the text of a reason."""
 
-_TEXTS: Mapping[Hindrance, str] = {
-    "joint_limit": "joint {joint} is at its limit",
-    "singularity": "a singularity is ahead: the arm would be stretched out",
-    "obstacle": "an obstacle is {distance:.0f} cm away",
-    "speed": "the arm cannot be guided faster",
-    "task": "the end effector would have to move",
-    "narrow_path": "the path passes a singularity: the arm cannot leave it here",
-    "too_far": "the arm is so far aside that it might not find back",
-    "task_waits": "the task waits until you let go",
-    "person": "{person}",
-    "stopped": "the safety filter brakes the arm",
-}
-
-# Interventions of the safety filter that take something from a push, the most telling first.
-# Limits of acceleration and jerk are left out: they only delay it.
-_INTERVENTIONS: Mapping[str, Hindrance] = {
-    "invalid": "stopped",
-    "stopped": "stopped",
-    "separation": "person",
-    "position": "joint_limit",
-    "velocity": "speed",
-    "tcp_speed": "speed",
-}
+_TABLES = read_toml(Path(__file__).with_name("hindrances.toml"))
+_TEXTS: Mapping[Hindrance, str] = _TABLES["texts"]
+_INTERVENTIONS: Mapping[str, Hindrance] = _TABLES["interventions"]
 
 
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
