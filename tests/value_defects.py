@@ -327,7 +327,7 @@ VALUES = {
     "actions that copy the state": Kind(
         lambda c: put(c, ACTION, lambda v: rows(c, STATE)), severe=False, local=True
     ),
-    "velocities as positions": Kind(rates_as_positions),
+    "velocities as positions": Kind(rates_as_positions, severe=False),
     "a gripper of the other sense": Kind(
         switch(lambda v: v.max() + v.min() - v), severe=False, local=True
     ),

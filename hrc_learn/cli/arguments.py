@@ -126,6 +126,8 @@ class Repair(Columns, OnDataset):
     drop: tuple[Literal["bad-frames", "bad-episodes", "repeats"], ...] = ()
     """Additional repairs: frames with values that are not finite, episodes that cannot be
     repaired, frames that repeat the one before for up to 0.1 s."""
+    offsets: dict[str, float] = field(default_factory=dict)
+    """Angles to add to measured joints [deg], such as: joint_2 2.5 joint_4 -4."""
     fps: float | None = None
     """Resample to this frame rate [1/s]. Default: keep the frames."""
     videos: bool = True

@@ -181,6 +181,7 @@ def repair(args: Repair) -> None:
         drop_repeats="repeats" in args.drop,
         drop_bad_frames="bad-frames" in args.drop,
         drop_bad_episodes="bad-episodes" in args.drop,
+        offsets=args.offsets,
         fps=args.fps,
         videos=args.videos,
         dry_run=args.dry_run,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ from jaxtyping import Float, Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.read.naming import is_hand
+from hrc_learn.demos.read.kinematic_evidence import arm_columns
 from hrc_learn.demos.read.source import DemonstrationSource
 from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.kinematics import Arm, ArmChoice
@@ -92,29 +91,10 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
         )
     return DatasetArm(
         arm=arm,
-        columns=_columns(source.joint_names, arm),
+        columns=arm_columns(source.joint_names, arm),
         joints=source.units["joint_position"],
         gripper=source.units.get("gripper"),
     )
-
-
-def _columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
-    plain = [_plain(name) for name in names]
-    wanted = [_plain(name) for name in arm.joint_names]
-    if set(wanted) <= set(plain):
-        return tuple(plain.index(name) for name in wanted)
-    joints = [i for i, name in enumerate(names) if not is_hand(name)]
-    if len(joints) != arm.joints:
-        raise DatasetError(
-            f"the dataset's joints ({', '.join(names) or 'none'}) are not those of {arm.name} "
-            f"({', '.join(arm.joint_names)}): --robot NAME|FILE names another arm"
-        )
-    return tuple(joints)
-
-
-def _plain(name: str) -> str:
-    """A joint's name without case, separators and the word for its position."""
-    return re.sub("[^a-z0-9]", "", re.sub(r"[._ ](pos|position|q)$", "", name.lower()))
 
 
 _MOTIONS = {"measured": "joint_position", "commanded": "command_position"}

@@ -50,6 +50,8 @@ MOTION_CHECKS = (
     episode_checks.joint_speeds,
     episode_checks.copied_commands,
 )
+_PLACED = 5
+"""Episodes whose joints and poses are compared."""
 CONSISTENCY_CHECKS = (
     consistency.holds,
     consistency.noise,
@@ -144,12 +146,11 @@ def _check_content(
     report.run(structure_checks.statistics_fit, folder, features)
     report.run(consistency.lengths, [profile.entry for profile in profiles])
     commanded = [profile for profile in profiles if "command_position" in profile.tracking]
-    if commanded:
-        command, state = (columns.selections[f"{who}_position"] for who in ("command", "joint"))
-        report.run(consistency.velocity_commands, command, commanded, folder.fps)
     if commanded and not decisions["command_position"].steps.any():
+        command, state = (columns.selections[f"{who}_position"] for who in ("command", "joint"))
         report.run(consistency.command_tracking, command, commanded)
-        report.run(consistency.command_offsets, command, state, commanded, features)
+        unit = decisions["joint_position"]
+        report.run(consistency.command_offsets, command, state, commanded, features, unit)
     for feature in features:
         report.run(consistency.sizes, feature)
         for check in CONSISTENCY_CHECKS:
@@ -169,7 +170,7 @@ def _check_motions(
     doubtful: set[int | None],
 ) -> None:
     """Check the motion of every sound episode whose units are known, in a second pass."""
-    sketches = []
+    sketches, placed = [], []
     # No feature extracted from videos is needed.
     source = DemonstrationSource(replace(dataset, own_feature=True), entries, decisions)
     for entry, demo in zip(entries, source.each(), strict=True):
@@ -184,9 +185,14 @@ def _check_motions(
             for check in MOTION_CHECKS:
                 report.run(check, entry, demo)
             report.run(episode_checks.spikes_and_jumps, entry, demo, usual)
+        if demo.joint_position is not None and demo.position is not None:
+            placed = [*placed, demo][:_PLACED]
         if (motion := episode_checks.arm_motion(demo)) is not None:
             span = float(np.ptp(motion, axis=0).max())
             sketches.append((entry, motion_sketch(motion), span))
+    if placed and source.joint_unit == "rad":
+        kind, names = dataset.folder.robot_type, source.joint_names
+        report.run(consistency.joint_zeros, kind, names, placed)
     report.run(episode_checks.duplicates, sketches)
 
 

@@ -6,9 +6,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import Issue, warning
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
+from hrc_learn.demos.read.kinematic_evidence import known_arm, zero_offsets
 from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
     FOLLOWS,
@@ -17,11 +19,11 @@ from hrc_learn.demos.read.profiles import (
     EpisodeProfile,
     FeatureProfiles,
     Tracking,
-    commanded_rates,
     gain_over,
     listed,
     over_episodes,
 )
+from hrc_learn.demos.read.units import UnitDecision
 
 FEWEST = 3
 """Fewest episodes among which one can be compared with the others."""
@@ -35,8 +37,6 @@ _HALF_TURN = 0.9 * np.pi
 """Length of a rotation vector [rad] above which noise of the hand can flip its sign."""
 _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
-_SPEED = (2 / 3, 1.5)
-"""Joint rates per velocity command, in the same unit."""
 _OFFSET = 0.1
 """Distance between command and state at rest that is reported, relative to the joint's range:
 hobby servos stop within a few degrees under load."""
@@ -313,6 +313,7 @@ def command_offsets(
     state: ColumnSelection,
     profiles: Sequence[EpisodeProfile],
     features: Sequence[FeatureProfiles],
+    unit: UnitDecision,
 ) -> Iterator[Issue]:
     """Constant distances between command and state at rest, and episodes where they changed.
 
@@ -323,11 +324,14 @@ def command_offsets(
         state: Columns of the states that follow them.
         profiles: Profiles of the episodes that have commands.
         features: Profiles of all features.
+        unit: Unit of the states.
     """
+    factors = np.broadcast_to(unit.factor, len(state.columns)) * (unit.si_unit == "rad")
     place: dict[str, Any] = {"key": command.columns[0][0]}
     spans = {feature.key: feature.median("span") for feature in features}
     offsets = np.stack([profile.tracking["command_position"].offset for profile in profiles])
-    for own, name, (key, index) in zip(offsets.T, command.labels, state.columns, strict=True):
+    parts = zip(offsets.T, command.labels, state.columns, np.rad2deg(factors), strict=True)
+    for own, name, (key, index), degrees in parts:
         found = np.flatnonzero(np.isfinite(own))
         # Hands that hold an object, and flags, do not reach their command.
         if not len(found) or key not in spans or is_hand(name):
@@ -337,7 +341,8 @@ def command_offsets(
         if least > 0 and abs(usual) > least and np.median(off) < least / 2:
             text = (
                 f"{name} rests {usual:.4g} from its command (action minus state) in "
-                f"{len(found)} episodes: leader and follower were calibrated differently?"
+                f"{len(found)} episodes: leader and follower were calibrated differently"
+                + (f", by {usual * degrees:+.1f} deg?" if degrees else "?")
             )
             yield warning(message=text, **place)
         for number in found[off > least] if len(found) >= FEWEST else ():
@@ -348,26 +353,29 @@ def command_offsets(
             yield profiles[number].entry.warning(text, **place)
 
 
-def velocity_commands(
-    command: ColumnSelection, profiles: Sequence[EpisodeProfile], fps: float
+def joint_zeros(
+    robot_type: str | None, joint_names: Sequence[str], demos: Sequence[Demonstration]
 ) -> Iterator[Issue]:
-    """Commands that are named like positions but are velocities.
+    """Zeros of the joints, by the kinematics of a known arm and the position of its tool.
 
     Args:
-        command: Columns of the commands.
-        profiles: Profiles of the episodes that have commands.
-        fps: Frame rate [1/s].
+        robot_type: Robot type of the dataset.
+        joint_names: Joints of the demonstrations.
+        demos: Demonstrations with joints [rad] and positions.
     """
-    found, key = commanded_rates([p.tracking for p in profiles], fps), command.columns[0][0]
-    # The same unit per second, with lag or gain.
-    if found and _SPEED[0] < (slope := float(np.nanmedian(found[0]))) < _SPEED[1]:
-        names = listed(command.labels, range(len(command.labels)))
-        text = (
-            f"is taken for positions, but follows the velocity of the state with slope "
-            f"{slope:.2f}: {names}; declare it "
-            f"(mapping={{'command_velocity': {key!r}, 'command_position': None}})"
-        )
-        yield Issue(message=text, key=key)
+    if (known := known_arm(robot_type, joint_names)) is None:
+        return
+    arm, columns = known
+    joints = np.concatenate([demo.joint_position[:, columns] for demo in demos])
+    offsets = zero_offsets(arm, joints, np.concatenate([demo.position for demo in demos]))
+    found = [
+        f"{joint_names[k]} {np.rad2deg(offset):+.1f} deg"
+        for k, offset in zip(columns, offsets, strict=True)
+        if offset
+    ]
+    if found:
+        text = "the zeros of joints are off: the forward kinematics give the position with"
+        yield warning(message=f"{text} {', '.join(found)}", key="joint_position")
 
 
 def _component_tracking(

@@ -242,6 +242,24 @@ def _while_all_rest(edit: EpisodeEdit, first: int, last: int) -> tuple[int, int]
     return first, last
 
 
+def move_zeros(edit: EpisodeEdit, offsets: Mapping[str, float]) -> EpisodeEdit:
+    """Add angles [deg] to measured joint positions, by joint.
+
+    Raises:
+        DatasetError: There is no such joint, or it is not measured as an angle.
+    """
+    role = "joint_position"
+    labels = [*edit.selections[role].labels] if role in edit.selections else []
+    for joint, angle in offsets.items():
+        if joint not in labels or edit.units[role].si_unit != "rad":
+            text = f"no angle of {joint!r} is measured; there are {', '.join(labels) or 'none'}"
+            raise edit.fault(text, key=role)
+        moved = edit.quantities[role].copy()
+        moved[:, labels.index(joint)] += angle / 360 * edit.turn(role)[labels.index(joint)]
+        edit = edit.with_quantity(role, moved, f"moved {joint} by {angle:+g} deg")
+    return edit
+
+
 def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
     """Remove jumps by whole turns from joints, Euler angles and rotation vectors.
 

@@ -65,6 +65,8 @@ class RepairOptions:
     """Drop frames with values that are not finite."""
     drop_bad_episodes: bool = False
     """Leave out episodes that cannot be read or repaired."""
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    """Angles that are added to measured joint positions [deg], by joint."""
     fps: float | int | None = None
     """Rate of a regular grid to resample to [1/s]; None keeps the frames."""
     videos: bool = True
@@ -379,6 +381,7 @@ class _Repair:
             edit = edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
         edit = edits.renew_stamps(edit, self.folder.fps)
         edit = edits.drop_bad_frames(edit, options.drop_bad_frames)
+        edit = edits.move_zeros(edit, options.offsets)
         for name in ("drop_late", "trim", "drop_repeats", "unwrap", "fix_signs"):
             if getattr(options, name):
                 edit = getattr(edits, name)(edit)

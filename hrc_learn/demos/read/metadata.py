@@ -111,13 +111,8 @@ EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
 CHUNK_SIZE, FILE_SIZE_MB, VIDEO_FILE_SIZE_MB = 1000, 100, 200
 
 # pandas uses the task texts as the index of the table only with this metadata.
-_TASK_INDEX = {
-    "name": "task",
-    "field_name": "task",
-    "pandas_type": "unicode",
-    "numpy_type": "object",
-    "metadata": None,
-}
+_TASK_INDEX = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+_TASK_INDEX |= {"name": "task", "field_name": "task"}
 _PANDAS_INDEX = {"index_columns": ["task"], "column_indexes": [], "columns": [_TASK_INDEX]}
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 

@@ -37,9 +37,9 @@ LOST = 0.4
 """R squared below which a state does not follow its command."""
 _SAME_SLOPE = 0.3
 """Largest difference of slopes of components in the same unit, relative to the usual one."""
-_SAME_UNIT, _LATE = 1.1, 0.75
-"""Logarithm of a slope (a third to three times as far), and delay [s], up to which a state may
-follow positions."""
+_SAME_UNIT, _LATE = np.log(2.0), 0.75
+"""Logarithm of a slope (half to twice as far), and delay [s], up to which a state may follow
+positions."""
 PROMPT = 0.2
 """Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
 RATE_WINDOW = 0.2
@@ -425,10 +425,11 @@ def commanded_rates(
     position_fit = over_episodes([t.fit for t in positions])
     # If both readings fit a smooth motion, the one without a long delay is meant.
     prompt = rate_delay <= PROMPT < position_delay
-    followed = (fit > FOLLOWS) & ((position_fit < LOST) | (prompt & (position_fit < fit)))
+    followed = (position_fit < LOST) | (prompt & (position_fit < fit))
+    followed &= (fit > FOLLOWS) & (slope > 0)
     # Joints that move together follow any command by their own factors.
     typical = np.median(slope[followed]) if followed.any() else 0.0
-    followed &= np.abs(slope - typical) < _SAME_SLOPE * abs(typical)
+    followed &= np.abs(slope - typical) < _SAME_SLOPE * typical
     if 2 * followed.sum() <= len(slope):
         return None
     return np.where(followed, slope, np.nan), float(np.median(fit[followed]))

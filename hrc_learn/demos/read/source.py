@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, overload, runtime_checkable
+from typing import Any, Protocol, overload, runtime_checkable
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from hrc_learn.demos.read.frames import (
     raising,
     read_quantities,
 )
+from hrc_learn.demos.read.kinematic_evidence import agreement, known_arm
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, demonstration_fields
@@ -46,9 +47,11 @@ from hrc_learn.demos.read.units import (
 
 _SAMPLED = 32
 """Episodes that decide on units."""
+_POSES = 5
+"""Episodes whose poses are compared with the kinematics."""
 _COMMAND = "command_position"
-_WHOLE_STEP = (0.1, 1.5)
-"""Motion per step and unit of the command that counts as 1."""
+_WHOLE_STEP, _SPEED = (0.1, 1.5), (2 / 3, 1.5)
+"""Motion per step, and per second, and unit of the command that counts as 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +130,8 @@ class OpenedDataset:
         guessed = guessed_from_values(self.columns.selections, known)
         # The joints show what their commands are.
         more = {"time"} - known | ({"joint_position"} if _COMMAND in guessed else set())
+        # A known arm tells by its kinematics in which unit its joints are.
+        more |= {"position"} if "joint_position" in guessed else set()
         roles = {*guessed, *(more & self.columns.selections.keys())}
         sample = {entry.index for entry in _spread(self.folder.episodes, _SAMPLED)}
         wanted = {entry.index for entry in entries}
@@ -148,27 +153,64 @@ class OpenedDataset:
         sample: Collection[int] | None = None,
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
         """Decide on units as `units_from_episodes` does, and whether commands are changes."""
-        fps, trackings = self.folder.fps, []
+        fps, trackings, poses = self.folder.fps, [], []
         asked = _COMMAND in self.columns.selections.keys() - {*self.declared_units, *given}
 
         def tracked() -> Iterator[tuple[EpisodeEntry, Quantities]]:
             for entry, quantities in episodes:
                 if asked and len(trackings) < _SAMPLED:
                     trackings.append(profiles.track_quantities(quantities, fps))
+                if len(poses) < _POSES and {"joint_position", "position"} <= quantities.keys():
+                    poses.append((quantities["joint_position"], quantities["position"]))
                 yield entry, quantities
 
+        columns, declared = self.columns, self.declared_units
+        robot = self.folder.robot_type or ""
         decisions, faults = units_from_episodes(
-            self.columns.selections,
-            tracked(),
-            fps,
-            self.declared_units,
-            given,
-            sample,
-            self.folder.robot_type or "",
+            columns.selections, tracked(), fps, declared, given, sample, robot
         )
+        joints = decisions.get("joint_position")
+        if joints is not None and joints.guessed and poses:
+            factor = decisions["position"].factor
+            decisions["joint_position"] = self._by_kinematics(joints, poses, factor)
         if asked:
-            decisions |= _meaning_of_commands(self.columns, decisions, trackings, fps)
+            decisions |= _meaning_of_commands(columns, decisions, trackings, fps)
         return decisions, faults
+
+    def _by_kinematics(
+        self, joints: UnitDecision, poses: Sequence[tuple[np.ndarray, np.ndarray]], factor: Any
+    ) -> UnitDecision:
+        """Decision on the unit of the joints, by the kinematics of a known arm if they tell.
+
+        Args:
+            joints: Decision by their values.
+            poses: Joint positions and positions of the end effector, as recorded.
+            factor: Factor of the latter to metres.
+        """
+        values, position = map(np.concatenate, zip(*poses, strict=True))
+        known = known_arm(self.folder.robot_type, self.columns.joint_names)
+        if known is None:
+            return joints
+        arm, columns = known
+        found = agreement(arm, values[:, columns], position * factor)
+        if found is None:
+            return joints
+        text = f"the forward kinematics of {arm.name} give the position within"
+        text += f" {1e3 * found.residual:.2g} mm"
+        if found.change:
+            text += (
+                f" only with {found.change}; as recorded, {1e3 * found.other:.2g} mm are left"
+            )
+        units = [joints.unit_of(i) for i in range(values.shape[1])]
+        for column in columns:
+            units[column] = found.unit
+        return replace(
+            joints,
+            unit=found.unit,
+            units=tuple(units) if len({*units}) > 1 else (),
+            confidence=0.4 if found.change else 0.99,
+            evidence=text,
+        )
 
 
 def _meaning_of_commands(
@@ -200,6 +242,8 @@ def _meaning_of_commands(
         f"the joints follow its sum ({scale:.2g} {command.unit} per unit, R2 {fit:.2f}), "
         f"so that it holds changes, not positions"
     )
+    if _SPEED[0] < scale * fps < _SPEED[1]:
+        evidence += f" (velocities in {command.unit}/s: map them to command_velocity)"
     steps = replace(command, unit=units[0], guessed=True, evidence=evidence)
     steps = replace(steps, units=units if len({*units}) > 1 else ())
     joints = decisions["joint_position"]

@@ -9,16 +9,22 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy.lib.stride_tricks import sliding_window_view
 
+from hrc_learn.demos.read.naming import WORDS
 from hrc_learn.demos.read.quantities import SIZES
 
 CONFIDENT = 0.75
 """Confidence from which a guessed unit is used without a question."""
+ASSUMED = 0.95
+"""Highest confidence of a guess from the size of values: it is assumed, not known."""
 
 # Two turns: wrists turn further than one, and no demonstration stays within 13 degrees.
 _RADIANS, _DEGREES = 4 * math.pi, 400.0
 # Largest fraction of a range, allowing for noise.
 _FINGER_RATIO, _PERCENT = 1.05, 105.0
 _BYTE = 255.5
+# LeRobot divides a turn by 4095.
+_ENCODERS = (("deg", 360 / 4095), ("deg", 360 / 4096), ("rad", math.tau / 4096))
+_FEWEST_STEPS, _FEWEST_ENCODERS = 10, 3
 _SLIDE = 0.12
 """Longest stroke of a gripper's finger [m]."""
 # Old datasets of LeRobot name the columns of joints and of poses alike.
@@ -33,10 +39,7 @@ GUESSED_BY_SIZE = tuple(SIZES)
 _UNIT_LENGTH = 2e-3
 """Deviation of a quaternion's length, of float32 and of few printed digits."""
 # Arms of hobby servos, whose positions LeRobot stores in degrees or as -100..100.
-_HOBBY = re.compile(
-    r"so_?-?10[01]|so_follower|so_leader|koch|lekiwi|moss|omx|openarm_mini|bi_so", re.IGNORECASE
-)
-_HOBBY_JOINTS = {"shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"}
+_HOBBY, _HOBBY_JOINTS = re.compile(WORDS["hobby"], re.IGNORECASE), {*WORDS["hobby_joints"]}
 
 
 class Sizes(NamedTuple):
@@ -52,6 +55,8 @@ class Sizes(NamedTuple):
     """True where this component and the three after it have unit length, and move."""
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
+    step: Float64[np.ndarray, " components"] = np.zeros(1)
+    """Step of which all differences of values are multiples, as of an encoder; 0: none."""
 
 
 class Guess(NamedTuple):
@@ -81,7 +86,21 @@ def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
         whole=(known == np.rint(known)).all(0),
         unit_length=length,
         opening=(known.min(0) == 0) & (known.max(0) == 1),
+        step=np.array([_encoder_step(column) for column in known.T]),
     )
+
+
+def _encoder_step(values: Float64[np.ndarray, " frames"]) -> float:
+    """Step of an encoder through which the values went; 0 if they are no multiples of one."""
+    apart = np.diff(np.unique(values))
+    # Stored as float32, a step has an error of some 1e-4 of itself.
+    if len(apart) < _FEWEST_STEPS or apart.min() < 1e-5 * np.abs(values).max():
+        return 0.0
+    step = float(np.median(apart[apart < 1.5 * apart.min()]))
+    counts = np.rint(apart / step)
+    if (np.abs(apart / step - counts) > 0.1 + 1e-3 * counts).any():
+        return 0.0
+    return float(apart.sum() / counts.sum())
 
 
 def typical(sizes: Sequence[Sizes]) -> Sizes:
@@ -92,6 +111,7 @@ def typical(sizes: Sequence[Sizes]) -> Sizes:
         whole=np.all([s.whole for s in sizes], axis=0),
         unit_length=np.all([s.unit_length for s in sizes], axis=0),
         opening=np.all([s.opening for s in sizes], axis=0),
+        step=np.median([s.step for s in sizes], axis=0),
     )
 
 
@@ -122,6 +142,14 @@ def guess_joints(
         first, last = (labels[quaternion[0] + i] for i in (0, 3))
         text = f"{first} .. {last} always have unit length, as a quaternion has"
         return Guess("rad", 0.3, text)
+    # Joints at rest show no step.
+    steps = np.broadcast_to(sizes.step, len(arm))[moving & (sizes.step > 0)]
+    for unit, step in _ENCODERS if len(steps) >= _FEWEST_ENCODERS else ():
+        if (np.abs(steps / step - 1) < 2e-3).all():
+            text = (
+                f"all values step by {steps[0]:.4g}, as an encoder of 4096 steps does in {unit}"
+            )
+            return Guess(unit, 0.97, text)
     most = np.median(peaks[moving])
     limit = next((x for x in (_RADIANS, _DEGREES) if most <= x), math.inf)
     fitting = moving & (peaks <= limit)

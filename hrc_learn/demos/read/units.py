@@ -74,12 +74,14 @@ class UnitDecision:
         # A gripper in metres or as a fraction of its opening is the usual case.
         if not self.guessed or (self.role == "gripper" and not self.converts):
             return None
-        sure = f" ({100 * self.confidence:.0f} % sure)" if self.confidence < CONFIDENT else ""
+        sure = "" if self.confidence > unit_evidence.ASSUMED else " (assumed, not known)"
+        if self.confidence < CONFIDENT:
+            sure = f" ({100 * self.confidence:.0f} % sure)"
         others = sorted({*self.units} - {self.unit})
         fingers = f", others for {', '.join(others)}" if others else ""
         return (
-            f"{self.role}: no unit declared, {self.evidence}: taken for {self.unit}{sure}"
-            f"{fingers}; overrule with units={{{self.role!r}: ...}}"
+            f"{self.role}: no unit declared, {self.evidence}: taken for {self.unit}"
+            f"{fingers}{sure}; overrule with units={{{self.role!r}: ...}}"
         )
 
     @property

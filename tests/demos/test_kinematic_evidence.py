@@ -1,0 +1,253 @@
+"""Units, order, signs and zeros of joints by kinematics and by the steps of encoders.
+
+MuJoCo gives the positions of the tool from robosuite's descriptions of the arms.
+"""
+
+from importlib.metadata import distribution
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from lerobot_folders import read_info, write_folder, write_info
+
+from hrc_learn.demos import (
+    DatasetError,
+    RepairOptions,
+    check_dataset,
+    load_demos,
+    open_demos,
+    repair_dataset,
+)
+from hrc_learn.demos.read.kinematic_evidence import agreement, residual, zero_offsets
+from hrc_learn.demos.read.unit_evidence import measure
+from hrc_learn.kinematics import arm
+
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
+STATE = "observation.state"
+HOME = np.array([0.1, -1.4, 1.6, -1.7, -1.6, 0.3])
+UNITS = {"rad": 1.0, "deg": np.pi / 180, "rev": 2 * np.pi}
+SMALL = np.deg2rad(6.0)
+"""Range of each joint whose unit its size does not tell [rad]."""
+
+
+@pytest.fixture(scope="module")
+def model():
+    package = "robosuite/models/assets/robots/ur5e/robot.xml"
+    try:
+        file = Path(str(distribution("robosuite").locate_file(package)))
+    except ModuleNotFoundError:
+        pytest.skip("robosuite is not installed")
+    return mujoco.MjModel.from_xml_path(str(file))
+
+
+def motion(seed=0, span=1.0, frames=100):
+    """Joint positions within a range [rad]."""
+    rng, s = np.random.default_rng(seed), np.linspace(0, 1, frames)[:, None]
+    path = rng.uniform(-1, 1, 6) * (0.5 - 0.5 * np.cos(4.4 * s))
+    path += 0.4 * np.sin(5 * s * rng.uniform(0.7, 1.3, 6))
+    return HOME + span * path / np.ptp(path, axis=0)
+
+
+def tool(model, q, offset=(0.02, 0.0, 0.1), base=(0.5, -0.2, 0.9)):
+    """Positions of a tool that is mounted anywhere, in a frame with another origin [m]."""
+    data, hand, rows = mujoco.MjData(model), model.body("right_hand").id, []
+    for row in q:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        rows.append(data.xpos[hand] + data.xmat[hand].reshape(3, 3) @ offset + base)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("span", [1.5, SMALL])
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_unit_by_kinematics(model, span, unit):
+    q = motion(span=span)
+    found = agreement(arm("ur5e"), q / UNITS[unit], tool(model, q))
+    assert (found.unit, found.change) == (unit, "")
+    assert found.residual < 1e-6
+
+
+def test_a_millimetre_and_a_tick_of_noise_do_not_matter(model):
+    rng, q = np.random.default_rng(0), motion()
+    noisy = q + 1e-3 * rng.standard_normal(q.shape)
+    place = tool(model, q) + 1e-3 * rng.standard_normal((len(q), 3))
+    found = agreement(arm("ur5e"), np.rad2deg(noisy), place)
+    assert found.unit == "deg"
+    assert 1e-3 < found.residual < 4e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "elbow_joint with the other sign"),
+        (
+            lambda q: q * [1, -1, 1, -1, 1, 1],
+            "shoulder_lift_joint, wrist_1_joint with the other",
+        ),
+        (lambda q: q[:, [1, 0, 2, 3, 4, 5]], "shoulder_pan_joint and shoulder_lift_joint exch"),
+    ],
+)
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_signs_and_order_by_kinematics(model, change, words, unit):
+    q = motion(1)
+    found = agreement(arm("ur5e"), change(q) / UNITS[unit], tool(model, q))
+    assert found.unit == unit
+    assert found.change.startswith(words)
+    assert found.residual < 1e-6
+    assert found.other > 0.01
+
+
+def test_what_explains_nothing_tells_nothing(model):
+    """Another arm's poses, a tool at rest, and poses of another motion."""
+    q, ur5e = motion(), arm("ur5e")
+    assert agreement(arm("panda"), np.pad(q, ((0, 0), (0, 1))), tool(model, q)) is None
+    assert agreement(ur5e, q, np.zeros((len(q), 3))) is None
+    assert agreement(ur5e, q, tool(model, motion(7))) is None
+
+
+@pytest.mark.parametrize("offset", [(0, 2, 0, -3, 0, 0), (0, 0, 1.5, 0, 0, 0), (0,) * 6])
+def test_zeros_by_kinematics(model, offset):
+    offset, q, ur5e = np.deg2rad(offset), motion(2, 1.5), arm("ur5e")
+    found = zero_offsets(ur5e, q - offset, tool(model, q))
+    np.testing.assert_allclose(found, offset, atol=np.deg2rad(0.1))
+    assert residual(ur5e, q - offset + found, tool(model, q)) < 1e-3
+
+
+def test_zeros_explain_no_other_motion(model):
+    q = motion()
+    assert not zero_offsets(arm("ur5e"), q, tool(model, motion(7))).any()
+
+
+def write(root, model, joints, spans=(1.0, 1.2, 0.9), robot="ur5e"):
+    """A dataset of joints as recorded and of the tool's position."""
+    episodes = [motion(k, span) for k, span in enumerate(spans)]
+    rows = [{STATE: np.hstack([joints(q), tool(model, q)])} for q in episodes]
+    names = [*(f"joint_{i}.pos" for i in range(6)), "ee.x", "ee.y", "ee.z"]
+    write_folder(root, rows, {STATE: names}, fps=20)
+    write_info(root, read_info(root) | {"robot_type": robot})
+    return root, episodes
+
+
+@pytest.mark.parametrize("unit", ["deg", "rev"])
+def test_a_dataset_of_six_degrees_in_all_is_read_by_kinematics(model, tmp_path, unit):
+    # About a posture near zero: values within six degrees look like radians.
+    near = np.array([0.02, -0.05, 0.03, 0.04, -0.03, 0.05])
+    rows = []
+    for k in range(3):
+        q = motion(k, SMALL) - HOME + near
+        rows.append((q, np.hstack([q / UNITS[unit], tool(model, q)])))
+    names = [*(f"joint_{i}.pos" for i in range(6)), "ee.x", "ee.y", "ee.z"]
+    root = write_folder(tmp_path / "set", [{STATE: r} for _, r in rows], {STATE: names}, fps=20)
+    write_info(root, read_info(root) | {"robot_type": "ur5e"})
+    source = open_demos(root, refuse_doubt=True)
+    np.testing.assert_allclose(source[0].joint_position, rows[0][0], atol=1e-6)
+    line = next(note for note in source.notes if note.startswith("joint_position"))
+    assert "forward kinematics of ur5e give the position within" in line
+    assert f"taken for {unit};" in line
+
+
+def test_without_a_pose_the_unit_is_assumed_and_the_line_says_so(tmp_path):
+    root = write_folder(
+        tmp_path / "set",
+        [{STATE: motion(k)} for k in range(3)],
+        {STATE: [f"joint_{i}.pos" for i in range(6)]},
+    )
+    (line,) = [n for n in load_demos(root).notes if n.startswith("joint_position")]
+    assert "taken for rad (assumed, not known); overrule with" in line
+
+
+def test_a_joint_that_counts_the_other_way_is_asked_about(model, tmp_path):
+    root, _ = write(tmp_path / "set", model, lambda q: q * [1, 1, -1, 1, 1, 1])
+    with pytest.raises(DatasetError, match=r"mm only with elbow_joint with the other sign"):
+        open_demos(root, refuse_doubt=True)
+    demos = open_demos(root, units={"joint_position": "rad"}, refuse_doubt=True)
+    assert len(demos) == 3
+
+
+def test_the_check_says_by_how_many_degrees_zeros_are_off(model, tmp_path):
+    offset = np.deg2rad([0, 2.5, 0, -4, 0, 0])
+    root, _ = write(tmp_path / "off", model, lambda q: q - offset)
+    (line,) = [str(i) for i in check_dataset(root).warnings if "zeros of joints" in str(i)]
+    assert "joint_1 +2.5 deg, joint_3 -4.0 deg" in line
+    root, _ = write(tmp_path / "sound", model, lambda q: q)
+    assert not [i for i in check_dataset(root).warnings if "zeros of joints" in str(i)]
+
+
+@pytest.mark.parametrize("unit", [1.0, np.pi / 180], ids=["rad", "deg"])
+def test_a_repair_moves_the_zeros_that_are_named_and_no_others(model, tmp_path, unit):
+    offset = np.deg2rad([0, 2.5, 0, -4, 0, 0])
+    root, episodes = write(tmp_path / "off", model, lambda q: (q - offset) / unit)
+    options = RepairOptions(trim=False, offsets={"joint_1": 2.5, "joint_3": -4.0})
+    report = repair_dataset(root, tmp_path / "out", options)
+    assert "moved joint_1 by +2.5 deg; moved joint_3 by -4 deg" in str(report)
+    for demo, q in zip(load_demos(tmp_path / "out"), episodes, strict=True):
+        np.testing.assert_allclose(demo.joint_position, q, atol=1e-6)
+    assert not [i for i in check_dataset(tmp_path / "out").warnings if "zeros" in str(i)]
+    repair_dataset(root, tmp_path / "plain", RepairOptions(trim=False))
+    for demo, q in zip(load_demos(tmp_path / "plain"), episodes, strict=True):
+        np.testing.assert_allclose(demo.joint_position, q - offset, atol=1e-6)
+    with pytest.raises(DatasetError, match="is measured; there are joint_0"):
+        repair_dataset(root, tmp_path / "no", RepairOptions(offsets={"elbow": 1.0}))
+    assert not (tmp_path / "no").exists()
+
+
+def test_an_unknown_arm_is_read_as_before(model, tmp_path):
+    root, episodes = write(tmp_path / "set", model, lambda q: q, robot="mystery")
+    demos = load_demos(root)
+    np.testing.assert_allclose(demos[0].joint_position, episodes[0], atol=1e-6)
+    assert any("assumed, not known" in note for note in demos.notes)
+
+
+SO101 = [f"{j}.pos" for j in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex")]
+SO101 += ["wrist_roll.pos", "gripper.pos"]
+
+
+def lerobot_positions(ticks, mode):
+    """Values of LeRobot for ticks of its Feetech bus, by its own rules."""
+    motors = pytest.importorskip("lerobot.motors")
+    feetech = pytest.importorskip("lerobot.motors.feetech")
+    names = [name.removesuffix(".pos") for name in SO101]
+    low, high = ticks.min(0) - 90, ticks.max(0) + 130 + 37 * np.arange(6)
+    bus = feetech.FeetechMotorsBus(
+        port="",
+        motors={n: motors.Motor(k, "sts3215", mode) for k, n in enumerate(names)},
+        calibration={
+            n: motors.MotorCalibration(k, 0, 0, int(low[k]), int(high[k]))
+            for k, n in enumerate(names)
+        },
+    )
+    rows = [bus._normalize(dict(enumerate(map(int, row)))) for row in ticks]
+    return np.array([[row[k] for k in range(6)] for row in rows])
+
+
+@pytest.mark.parametrize("mode", ["DEGREES", "RANGE_M100_100"])
+def test_steps_of_encoders_tell_degrees_from_fractions_of_a_range(tmp_path, mode):
+    """The two units of LeRobot's hobby arms, of which size tells nothing."""
+    motors = pytest.importorskip("lerobot.motors")
+    ticks = [np.rint(2048 + motion(k, 0.9) * 400).astype(int) for k in range(3)]
+    ticks = [t - t.min(0) + 1200 for t in ticks]
+    values = [lerobot_positions(t, getattr(motors.MotorNormMode, mode)) for t in ticks]
+    root = write_folder(tmp_path / "set", [{STATE: v} for v in values], {STATE: SO101})
+    write_info(root, read_info(root) | {"robot_type": "so101_follower"})
+    if mode == "DEGREES":
+        source = open_demos(root, refuse_doubt=True)
+        np.testing.assert_allclose(
+            source[0].joint_position[:, :5], np.deg2rad(values[0][:, :5]), atol=1e-5
+        )
+        assert any("as an encoder of 4096 steps does in deg" in note for note in source.notes)
+    else:
+        with pytest.raises(DatasetError, match="--units joint_position"):
+            open_demos(root, refuse_doubt=True)
+
+
+@pytest.mark.parametrize("step", [360 / 4096, 2 * np.pi / 4096, 0.5])
+def test_the_step_of_an_encoder(step):
+    smooth = motion()
+    values = (np.rint(smooth / step * (20 if step == 0.5 else 1)) * step).astype(np.float32)
+    found = measure(values.astype(float)).step
+    levels = np.array([len(np.unique(column)) for column in values.T])
+    np.testing.assert_allclose(found[levels > 15], step, rtol=1e-3)
+    assert not measure(smooth).step.any()
