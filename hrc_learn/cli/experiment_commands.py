@@ -38,23 +38,13 @@ from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
 from hrc_learn.sim.scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.store import read_json, write_json
+from hrc_learn.store import read_json, read_toml, write_json
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import show_command, software_versions
 
 MODELS = Path("outputs/demo")
 """Folder of the demo, whose models are used if none are given."""
-_APPLIES = {
-    "placing": ("placing", "collaboration"),
-    "aiming": ("grasping", "collaboration"),
-    "camera": ("grasping", "collaboration"),
-    "page": ("grasping", "collaboration"),
-    "markerless": ("grasping", "collaboration"),
-    "pulls": ("collaboration",),
-    "camera_moved": ("collaboration",),
-    "worker": ("collaboration",),
-    "handover": ("collaboration",),
-}
+_APPLIES: dict[str, list[str]] = read_toml(Path(__file__).with_name("option_experiments.toml"))
 """Experiments that an option belongs to."""
 _SIMULATED_ONLY = "markerless trials serve page camera_moved worker handover"
 

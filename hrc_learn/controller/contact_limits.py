@@ -20,8 +20,10 @@ certified safety function.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import torch
@@ -53,21 +55,8 @@ class BodyRegion(NamedTuple):
     """Smallest gap that does not crush the region [m]: ISO 13854:2017, table 1."""
 
 
-BODY_REGIONS: dict[str, BodyRegion] = {
-    # Transient limits do not exist for skull and face; a tracker does not tell the larynx,
-    # for which there are none either, from the rest of the neck.
-    "head": BodyRegion(0.0, 0.0, 75.0, 4.4, 0.3),
-    "neck": BodyRegion(0.0, 0.0, 50.0, 1.2, 0.3),
-    "back and shoulders": BodyRegion(210.0, 160.0, 35.0, 40.0, 0.5),
-    "chest": BodyRegion(140.0, 120.0, 25.0, 40.0, 0.5),
-    "abdomen": BodyRegion(110.0, 140.0, 10.0, 40.0, 0.5),
-    "pelvis": BodyRegion(180.0, 210.0, 25.0, 40.0, 0.5),
-    "upper arm": BodyRegion(150.0, 190.0, 30.0, 3.0, 0.12),
-    "lower arm": BodyRegion(160.0, 180.0, 40.0, 2.0, 0.12),
-    "hand": BodyRegion(140.0, 190.0, 75.0, 0.6, 0.1),
-    "thigh": BodyRegion(220.0, 220.0, 50.0, 75.0, 0.18),
-    "lower leg": BodyRegion(130.0, 210.0, 60.0, 75.0, 0.18),
-}
+_REGIONS = tomllib.loads(Path(__file__).with_name("body_regions.toml").read_text("utf-8"))
+BODY_REGIONS = {name: BodyRegion(*row) for name, row in _REGIONS.items()}
 """Regions by name: ISO/TS 15066:2016, tables A.2 and A.3."""
 _TABLE = Constant(torch.tensor(list(BODY_REGIONS.values()), dtype=torch.float64))
 # Transient limits are this many times the quasi-static ones (table A.2).

@@ -29,17 +29,8 @@ from hrc_learn.regions import (
     VisionRegion,
 )
 
-INTERVENTIONS = (
-    "velocity",
-    "position",
-    "acceleration",
-    "jerk",
-    "tcp_speed",
-    "separation",
-    "invalid",
-    "stopped",
-    "start",
-)
+_NAMES = "velocity position acceleration jerk tcp_speed separation invalid stopped start"
+INTERVENTIONS = tuple(_NAMES.split())
 """Kinds of interventions, in the order of the last axis of their flags and counts."""
 
 
