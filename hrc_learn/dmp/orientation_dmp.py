@@ -299,9 +299,9 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             return None
         offset, q = motion.goal[..., E].tolist(), [x / norm for x in q.tolist()]
         q = quaternion.product_of_components(exp_numbers(offset), q)
-        numbers = (x.tolist()[E] for x in parts)
+        e, v = (x.tolist()[E] for x in parts)
         turned = [x.numpy().copy() for x in parts]
-        for x, new in zip(turned, retarget_numbers(*numbers, frame.tolist(), q), strict=True):
+        for x, new in zip(turned, retarget_numbers(e, v, frame.tolist(), q), strict=True):
             x[E] = new
         position, rate = map(torch.from_numpy, turned)
         return replace(columns, position=position, rate=rate), frame.new_tensor(q)

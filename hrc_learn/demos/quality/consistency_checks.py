@@ -366,8 +366,9 @@ def joint_zeros(
     if (known := known_arm(robot_type, joint_names)) is None:
         return
     arm, columns = known
-    joints = np.concatenate([demo.joint_position[:, columns] for demo in demos])
-    offsets = zero_offsets(arm, joints, np.concatenate([demo.position for demo in demos]))
+    joints = [q[:, columns] for demo in demos if (q := demo.joint_position) is not None]
+    positions = [p for demo in demos if (p := demo.position) is not None]
+    offsets = zero_offsets(arm, np.concatenate(joints), np.concatenate(positions))
     found = [
         f"{joint_names[k]} {np.rad2deg(offset):+.1f} deg"
         for k, offset in zip(columns, offsets, strict=True)
