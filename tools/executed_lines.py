@@ -26,7 +26,7 @@ _tests: dict[str, tuple[float, list[tuple[str, int]]]] = {}
 
 
 def _line(code: CodeType, number: int) -> object:
-    if (code.co_filename or "").startswith(_PACKAGE):
+    if code.co_filename.startswith(_PACKAGE):
         _lines.add((code.co_filename[len(_PACKAGE) :], number))
     return _MONITORED.DISABLE
 
@@ -58,6 +58,8 @@ def pytest_runtest_protocol(item):
 
 def pytest_sessionfinish(session):
     file = session.config.getoption("--executed")
+    if file:  # lines of the interpreter's end would meet a module that is cleared already
+        _MONITORED.set_events(_TOOL, _MONITORED.events.NO_EVENTS)
     worker = getattr(session.config, "workerinput", None)
     if not file or not _tests:
         return
