@@ -141,8 +141,7 @@ class FrankaArm(Connected):
     @property
     def report(self) -> Report:
         """Newest report of the loop, with its counts of cycles and faults."""
-        # None: it died in the middle of a line.
-        return self._shared.report.read() or Report(phase=Phase.ENDED)
+        return self._shared.report.read()
 
     def read(self) -> ArmState:
         """Return the newest state, by the clock of the robot.

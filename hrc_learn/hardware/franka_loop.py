@@ -235,8 +235,7 @@ class ControlLoop:
             self._runner.step()
 
     def _read_orders(self) -> None:
-        # None: its writer died or is stopped; what was wanted runs out.
-        self._orders = self._shared.orders.read() or self._orders
+        self._orders = self._shared.orders.read()
         self.ending |= self._orders.end
 
     def _wanted(self) -> Float[np.ndarray, "7"]:

@@ -17,9 +17,6 @@ from jaxtyping import Float
 JOINTS = 7
 _TEXT = 2000
 """Longest message about a fault [bytes]."""
-_TRIES = 100
-"""Readings of a mailbox before its writer is taken for dead in the middle of a line: a line is
-written within a microsecond or two."""
 
 
 class Phase(IntEnum):
@@ -63,13 +60,14 @@ class Numbers:
 class Mailbox[Line: Numbers]:
     """The newest line of numbers that one process writes and others read, without a lock.
 
-    The first number counts: odd while a line is being written. A reader takes a line only if
-    the count was even and has not changed meanwhile, and never waits for a writer.
+    The memory holds two lines and the number of lines written, which tells which one is the
+    newest. The writer fills the other one, then counts. So a reader always finds a whole line,
+    even while the writer is suspended or has died in the middle of one.
     """
 
     def __init__(self, line: Line):
         """Take shared memory for lines of this kind, with this one in it."""
-        self.__setstate__((type(line), RawArray("d", len(line.line()) + 1)))
+        self.__setstate__((type(line), RawArray("d", 2 * len(line.line()) + 1)))
         self.write(line)
 
     def __getstate__(self) -> tuple[type[Line], Any]:
@@ -77,24 +75,22 @@ class Mailbox[Line: Numbers]:
 
     def __setstate__(self, state: tuple[type[Line], Any]) -> None:
         self._kind, self._memory = state
-        self._line = np.frombuffer(self._memory, dtype=float)
+        numbers = np.frombuffer(self._memory, dtype=float)
+        self._written, self._lines = numbers[:1], numbers[1:].reshape(2, -1)
 
     def write(self, line: Line) -> None:
         """Replace the line. There is one writer at a time."""
-        # Odd whatever it was: a signal may have ended an earlier writing half-way.
-        count = self._line[0] // 2 * 2 + 1
-        self._line[0] = count
-        self._line[1:] = line.line()
-        self._line[0] = count + 1
+        self._lines[int(self._written[0] + 1) % 2] = line.line()
+        self._written += 1
 
-    def read(self) -> Line | None:
-        """Return the newest line; None: its writer stays in the middle of one."""
-        for _ in range(_TRIES):
-            before = self._line[0]
-            line = self._line[1:].copy()
-            if before % 2 == 0 and self._line[0] == before:
+    def read(self) -> Line:
+        """Return the newest line."""
+        while True:
+            written = self._written[0]
+            line = self._lines[int(written) % 2].copy()
+            # After another line, the writer may have begun to replace this one.
+            if self._written[0] == written:
                 return self._kind.of(line)
-        return None
 
 
 @dataclass

@@ -19,6 +19,7 @@ from loop_on_franka import loop_of
 from programs_as_modules import load_program
 
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
+from hrc_learn.hardware.franka_memory import Phase
 from hrc_learn.hardware.protocol_server import ServedArm, serve_world
 from hrc_learn.kinematics import fr3 as FR3
 from hrc_learn.kinematics import panda
@@ -79,15 +80,17 @@ def test_joints_move_as_they_are_told_and_rest_once_nobody_tells(arm):
     share = (now.joint_position - start.joint_position) / (0.8 * velocity)
     assert share.min() > 0.5
     assert share.max() < 1.02
-    # From 0.2 rad/s at 3 rad/s^2 rest takes 0.07 s, and ramps of the jerk.
-    wait_until(lambda: arm.read().time > now.time + CONFIG.timeout + 0.15)
-    at_rest = arm.read()
+    begun = arm.report
+    wait_until(lambda: arm.report.phase == Phase.IDLE)
+    at_rest, ended = arm.read(), arm.report
+    # From 0.2 rad/s at 3 rad/s^2 rest takes 0.07 s, and ramps of the jerk. On a machine that
+    # answers every n-th cycle only, it takes n times as long.
+    answered = ended.cycles - begun.cycles
+    slowness = (answered + ended.lost - begun.lost) / answered
+    assert at_rest.time - now.time < CONFIG.timeout + 0.15 * slowness + 0.1
     wait_until(lambda: arm.read().time > at_rest.time + 0.2)
     still = arm.read().joint_position - at_rest.joint_position
     assert np.abs(still).max() < 2e-3
-    assert np.abs(at_rest.joint_position - now.joint_position).max() < 0.2 * (
-        CONFIG.timeout + 0.15
-    )
 
 
 def test_a_stop_is_over_when_the_arm_rests_and_what_was_told_before_is_forgotten(arm):

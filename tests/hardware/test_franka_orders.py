@@ -269,13 +269,6 @@ def test_closing_asks_for_the_end_and_kills_only_a_loop_that_hangs(loop, hangs):
     assert loop.killed == hangs
 
 
-def test_a_report_that_was_cut_off_is_the_end(loop, arm):
-    loop.shared.report._line[0] += 1  # a writer that died in the middle
-    assert arm.report.phase == Phase.ENDED
-    with pytest.raises(DriverError, match="has ended"):
-        arm.command(VELOCITY)
-
-
 def test_the_gripper_is_the_drivers_with_the_settings(monkeypatch):
     calls = []
 
