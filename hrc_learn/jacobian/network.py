@@ -46,9 +46,9 @@ class RBFImageJacobian(nn.Module):
 
         x_dot = J_s(r) r_dot,   vec(J_s_hat(r)^T) = vec(J_camera(r)^T) + W theta(r)
 
-    That of a camera found from demonstrations comes first; the network represents what lens,
-    misalignment and unmodelled kinematics leave. Without a camera the first term is zero, and
-    the second the paper's (approxNN_vec).
+    The first term is the image Jacobian of a camera found from demonstrations. The second, the
+    network, represents the rest: lens, misalignment and unmodelled kinematics. Without a camera
+    the first term is zero and the second is the paper's (approxNN_vec).
 
     r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear, angular)
     in the base frame, *not* the derivative of the rotation vector, so J_s J is the Jacobian
@@ -147,11 +147,13 @@ class RBFImageJacobian(nn.Module):
         config: ImageJacobianFitConfig | None = None,
         camera: CameraFit | None = None,
     ) -> RBFImageJacobian:
-        """Fit to demonstrations read one by one; several processes read a part each.
+        """Fit to demonstrations, which are read one by one.
+
+        In a distributed run, each process reads a part of them.
 
         Args:
             demonstrations: Demonstrations in memory, or a sequence that reads them on access.
-            neurons: Neurons of the network, whose dtype and device are those of their centres.
+            neurons: Neurons of the network; their centres give its dtype and device.
             config: Noise, prior and the choice of key frames.
             camera: Camera fitted to these demonstrations; the network then learns what it
                 leaves, and the prior should be that of a residual. None: none.

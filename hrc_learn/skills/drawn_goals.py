@@ -1,8 +1,8 @@
 """Goals drawn by a person: a region or a target for the end effector, and a turn.
 
 The paper's expert draws the Cartesian region in the AR interface and adjusts the coarse
-orientation (section VII). The region is a box there (CaFun), and here: its walls are those that
-were drawn.
+orientation (section VII). As in the paper (CaFun), the region is a box. Its walls are the walls
+that were drawn.
 """
 
 import math
