@@ -46,7 +46,7 @@ MODELS = Path("outputs/demo")
 """Folder of the demo, whose models are used if none are given."""
 _APPLIES: dict[str, list[str]] = read_toml(Path(__file__).with_name("option_experiments.toml"))
 """Experiments that an option belongs to."""
-_SIMULATED_ONLY = "markerless trials serve page camera_moved worker handover"
+_SIMULATED = ("markerless", "trials", "serve", "page", "camera_moved", "worker", "handover")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ def run(args: Run) -> int:
         if args.experiment not in experiments:
             refuse_given(args, [name], f"is an option of hrc run {' and '.join(experiments)}")
     refuse_existing(folder, args.overwrite)
-    is_real = args.drives_real_arm(_SIMULATED_ONLY.split())
+    is_real = args.drives_real_arm(_SIMULATED)
     if args.arm == "lerobot":
         raise ValueError(
             "hrc run leads Franka arms only, not --arm lerobot: hrc page guides the arm and "

@@ -29,8 +29,8 @@ from hrc_learn.regions import (
     VisionRegion,
 )
 
-_NAMES = "velocity position acceleration jerk tcp_speed separation invalid stopped start"
-INTERVENTIONS = tuple(_NAMES.split())
+_LIMITS = ("velocity", "position", "acceleration", "jerk", "tcp_speed", "separation")
+INTERVENTIONS = (*_LIMITS, "invalid", "stopped", "start")
 """Kinds of interventions, in the order of the last axis of their flags and counts."""
 
 

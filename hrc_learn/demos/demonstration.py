@@ -11,8 +11,8 @@ from torch import Tensor
 
 from hrc_learn.demos.issues import DatasetError
 
-_JOINT_FIELDS = "joint_position joint_velocity joint_effort human_effort command_position"
-JOINT_FIELDS = (*_JOINT_FIELDS.split(), "command_velocity")
+_MEASURED = ("joint_position", "joint_velocity", "joint_effort", "human_effort")
+JOINT_FIELDS = (*_MEASURED, "command_position", "command_velocity")
 """Fields with one column per joint, in the order of `joint_names`."""
 
 _WIDTHS = {"position": 3, "orientation": 4, "feature": 2}

@@ -28,8 +28,8 @@ _KEYS = {name: key for key, names in _WORDS["synonyms"].items() for name in name
 """Names of whole fields in recordings -> the names that datasets use."""
 _INDEXED = re.compile(r"(.*?)[_.\[ ]?(\d+)\]?")
 # ALOHA's `qpos`, `qvel`, `effort` and `action`: github.com/tonyzhaozh/act, record_episodes.py.
-_ALOHA_ARM = "waist shoulder elbow forearm_roll wrist_angle wrist_rotate gripper"
-_ALOHA = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_ARM.split())
+_ARM = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
+_ALOHA = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ARM)
 
 
 @dataclass(frozen=True, kw_only=True)

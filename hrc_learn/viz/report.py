@@ -406,13 +406,13 @@ def _from_file(content: _ReportFile, folder: Path) -> Report:
     return Report(**values)
 
 
-_PACKAGES = "hrc-learn torch mujoco lerobot opencv-python-headless rerun-sdk viser"
+_LIBRARIES = ("torch", "mujoco", "lerobot", "opencv-python-headless", "rerun-sdk", "viser")
 
 
 def software_versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on, by name."""
     found = {"python": platform.python_version()}
-    for name in _PACKAGES.split():
+    for name in ("hrc-learn", *_LIBRARIES):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
