@@ -56,7 +56,7 @@ class BodyRegion(NamedTuple):
 
 
 _REGIONS = tomllib.loads(Path(__file__).with_name("body_regions.toml").read_text("utf-8"))
-BODY_REGIONS = {name: BodyRegion(*row) for name, row in _REGIONS.items()}
+BODY_REGIONS = {name: BodyRegion(**row) for name, row in _REGIONS.items()}
 """Regions by name: ISO/TS 15066:2016, tables A.2 and A.3."""
 _TABLE = Constant(torch.tensor(list(BODY_REGIONS.values()), dtype=torch.float64))
 # Transient limits are this many times the quasi-static ones (table A.2).
