@@ -17,11 +17,12 @@ CONFIDENT = 0.75
 ASSUMED = 0.95
 """Highest confidence of a guess from the size of values: it is assumed, not known."""
 
-# Two turns: wrists turn further than one, and no demonstration stays within 13 degrees.
-_RADIANS, _DEGREES = 4 * math.pi, 400.0
-# Largest fraction of a range, allowing for noise.
-_FINGER_RATIO, _PERCENT = 1.05, 105.0
-_BYTE = 255.5
+_BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES.items()}
+"""Largest value by quantity and unit, allowing for noise."""
+# Wrists turn further than once, and no demonstration stays within 13 degrees.
+_TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
+_FINGER_RATIO = 1.05
+_PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
 # LeRobot divides a turn by 4095.
 _ENCODERS = (("deg", 360 / 4095), ("deg", 360 / 4096), ("rad", math.tau / 4096))
 _FEWEST_STEPS, _FEWEST_ENCODERS = 10, 3
@@ -151,14 +152,14 @@ def guess_joints(
             )
             return Guess(unit, 0.97, text)
     most = np.median(peaks[moving])
-    limit = next((x for x in (_RADIANS, _DEGREES) if most <= x), math.inf)
+    limit = next((x for x in (_TWO_TURNS, _DEGREES) if most <= x), math.inf)
     fitting = moving & (peaks <= limit)
     outliers = np.flatnonzero(moving & ~fitting).tolist()
     largest = float(peaks[fitting].max())
     reach = f"values usually reach {largest:.3g}"
-    if limit == _RADIANS:
+    if limit == _TWO_TURNS:
         # Radians beyond a turn are rare; small values in degrees are not.
-        guess = Guess("rad", 0.95 if largest <= 2 * math.pi else 0.8, reach, "deg")
+        guess = Guess("rad", 0.95 if largest <= math.tau else 0.8, reach, "deg")
     elif limit == _DEGREES:
         guess = _degrees_or_range(sizes, fitting, largest, labels, robot_type)
     else:
@@ -218,7 +219,7 @@ def guess_fingers(
         ("byte", counted),
         ("m", metres),
         ("1", sizes.peak <= _FINGER_RATIO),
-        ("rad", (sizes.peak <= _RADIANS) & (not hobby)),
+        ("rad", (sizes.peak <= _TWO_TURNS) & (not hobby)),
         ("%", (sizes.peak <= _PERCENT) & (hobby or not degrees)),
         ("byte", (sizes.peak <= _BYTE) & (sizes.whole | (not degrees))),
     )
