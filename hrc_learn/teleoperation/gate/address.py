@@ -12,11 +12,14 @@ import subprocess
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from hrc_learn.store import cache_home
 
 _FIRST_PORTS = range(8080, 8180)  # tried in turn where none was asked for
+_NO_ADDRESS = {errno.EADDRNOTAVAIL, socket.EAI_NONAME, socket.EAI_AGAIN, socket.EAI_FAIL}
 _VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
-_LEAST_DAYS = 7  # that one of our own lasts still when it is used again
+_LEAST = 7 * 24 * 3600  # seconds that one of our own lasts still when it is used again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,10 +115,10 @@ def listening_socket(config: AddressConfig) -> socket.socket:
     last: OSError | None = None
     for port in ports:
         try:
-            return socket.create_server((config.host, port), family=family, backlog=32)
+            return socket.create_server((config.host, port), family=family)
         except OSError as error:
             last = error
-            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            if error.errno in _NO_ADDRESS:
                 raise ValueError(
                     f"host {config.host} is no address of this machine: {error.strerror}"
                 ) from error
@@ -135,7 +138,8 @@ def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
     long as it lasts, so that browsers ask about it once.
 
     Raises:
-        ValueError: There is neither a certificate nor a program to make one, or it is no good.
+        ValueError: There is neither a certificate nor a program that makes one, or it is no
+            good.
     """
     if config.local and config.certificate is None:
         return None
@@ -167,16 +171,18 @@ def _own_certificate(name: str) -> tuple[Path, Path]:
     except ValueError:
         kind = f"DNS:{name}"
     made = folder / f"{secrets.token_hex(4)}.new"
-    subprocess.run(
+    run = subprocess.run(
         [
             *(openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
             *("-nodes", "-days", str(_VALID_DAYS), "-subj", "/CN=hrc page"),
             *("-addext", f"subjectAltName={kind}"),
             *("-keyout", str(made.with_suffix(".key")), "-out", str(made)),
         ],
-        check=True,
         capture_output=True,
+        text=True,
     )
+    if run.returncode:
+        raise ValueError(f"openssl cannot make a certificate: {run.stderr.strip()}")
     made.with_suffix(".key").replace(key)
     made.replace(certificate)
     return certificate, key
@@ -184,8 +190,7 @@ def _own_certificate(name: str) -> tuple[Path, Path]:
 
 def _lasts(certificate: Path) -> bool:
     """True if the certificate stays valid for a few more days."""
-    seconds = str(_LEAST_DAYS * 24 * 3600)
-    command = ["openssl", "x509", "-noout", "-checkend", seconds, "-in", str(certificate)]
+    command = ["openssl", "x509", "-noout", "-checkend", str(_LEAST), "-in", str(certificate)]
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
@@ -201,13 +206,10 @@ def qr_code(text: str) -> str:
     try:
         import cv2
 
-        code = cv2.QRCodeEncoder.create().encode(text) > 0
+        code = cv2.QRCodeEncoder.create().encode(text)
     except (ImportError, AttributeError):
         return ""
-    light = [[True, *row, True] for row in code.tolist()]
-    light += [[True] * len(light[0])] * (2 - len(light) % 2)
-    pairs = zip(light[::2], light[1::2], strict=True)
-    blocks = {(True, True): "█", (True, False): "▀", (False, True): "▄", (False, False): " "}
-    return "\n".join(
-        "".join(blocks[pair] for pair in zip(*rows, strict=True)) for rows in pairs
-    )
+    # A code has an odd number of rows; on a dark terminal it needs light on either side.
+    light = np.pad(code // 255, ((0, 1), (1, 1)), constant_values=1)
+    blocks = np.array([[" ", "▄"], ["▀", "█"]])
+    return "\n".join("".join(row) for row in blocks[light[::2], light[1::2]].tolist())
