@@ -11,7 +11,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate
+from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate import gate as gate_module
 from hrc_learn.teleoperation.gate.gate import incoming
 from hrc_learn.teleoperation.gate.messages import MessageError
@@ -220,6 +220,17 @@ def test_a_wrong_message_and_too_many_close_a_socket_with_the_reason(gate, monke
 )
 def test_content_has_the_type_of_its_name(name, kind):
     assert Content.of(name, b"").kind == kind
+
+
+def test_a_folder_is_served_by_name_and_its_index_as_the_page(tmp_path):
+    (tmp_path / "a.js").write_bytes(b"code")
+    (tmp_path / "folder").mkdir()
+    code = {"/a/a.js": Content(body=b"code", kind="text/javascript")}
+    assert folder_contents(tmp_path, "/a/") == code
+    (tmp_path / "index.html").write_bytes(b"page")
+    page = Content(body=b"page", kind="text/html")
+    assert folder_contents(tmp_path, "/a/") == code | {"/a/index.html": page, "/": page}
+    assert set(folder_contents(tmp_path)) == {"/static/a.js", "/static/index.html", "/"}
 
 
 def test_refused_clients_do_not_fill_the_log(gate, caplog):

@@ -44,6 +44,9 @@ _HANDSHAKE = 30.0
 """Longest time from connecting to the answer [s]; the slowest is a block of images."""
 _SESSION_WAIT = 3.0
 """Longest time that another socket waits for the session of its client [s]."""
+_POLL = 0.05  # s between looks for that session
+_FAREWELL, _CLOSING = 0.5, 1.0  # longest times to send the last message, and to close [s]
+_PING, _PONG = 5.0, 10.0  # time between pings, and longest time to the answer [s]
 _TOO_MUCH, _FAILED, _FULL = 1008, 1011, 1013  # codes of the WebSocket protocol (RFC 6455)
 _SECRET = "secret."  # begins the subprotocol that carries the secret
 
@@ -196,9 +199,9 @@ class Gate:
             max_size=_LARGEST,
             compression=None,
             open_timeout=_HANDSHAKE,
-            close_timeout=1,
-            ping_interval=5,
-            ping_timeout=10,
+            close_timeout=_CLOSING,
+            ping_interval=_PING,
+            ping_timeout=_PONG,
             logger=_quiet_logger(),
         ):
             self._ready.set()
@@ -206,7 +209,7 @@ class Gate:
             words = json.dumps({"type": "end", "words": self._farewell})
             for session in list(self._open["session"].values()):
                 with suppress(Exception):  # the client may be gone
-                    await asyncio.wait_for(session.send(words), 0.5)
+                    await asyncio.wait_for(session.send(words), _FAREWELL)
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket through."""
@@ -253,10 +256,10 @@ class Gate:
         if route == "session":
             self._admission.right(_secret(request))
             return
-        for _ in range(round(_SESSION_WAIT / 0.05)):
+        for _ in range(round(_SESSION_WAIT / _POLL)):
             if client in self._visitors:
                 return
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(_POLL)
         raise RefusedError(401, "This client has no session.")
 
     async def _handle(self, connection: ServerConnection) -> None:
