@@ -217,11 +217,18 @@ def test_noise_of_ten_times_the_usual_and_half_a_percent(noise, usual, told):
 
 
 @pytest.mark.parametrize(
-    ("distinct", "held", "told"), [(19, 9, True), (20, 9, False), (19, 10, False)]
+    ("distinct", "held", "usual", "told"),
+    [
+        (19, 9, 100, True),
+        (20, 9, 100, False),
+        (19, 10, 100, False),
+        (9, 9, 50, True),
+        (11, 9, 50, False),
+    ],
 )
-def test_levels_of_less_than_a_fifth_of_the_usual(distinct, held, told):
-    odd = profile(distinct=[100, distinct, 100], held=[1, held, 1])
-    found = said(checks.noise(feature(alike(odd))))
+def test_levels_of_less_than_a_fifth_of_the_usual(distinct, held, usual, told):
+    odd = profile(distinct=[usual, distinct, usual], held=[1, held, 1])
+    found = said(checks.noise(feature(alike(odd, distinct=usual))))
     text = "is of far fewer levels than in the other episodes: b"
     assert found == ([(4, ("b",), text)] if told else [])
 
@@ -265,6 +272,12 @@ def test_a_gripper_is_compared_where_all_others_switch():
     for goal, told in ((0.5, 0), (0.52, 1)):
         half = [*(gripper(0, goal) for _ in range(4)), stays]
         assert len(said(checks.switches(feature(half, smooth=False)))) == told
+
+
+@pytest.mark.parametrize(("start", "goal", "told"), [(1, 9, False), (9, 1, True)])
+def test_ends_at_a_tenth_of_the_range_count_as_the_same_level(start, goal, told):
+    given = [*(gripper(0, 10, 10) for _ in range(4)), gripper(start, goal, 10)]
+    assert bool(said(checks.switches(feature(given, smooth=False)))) == told
 
 
 def figures(*columns, span=1.0):
