@@ -262,7 +262,7 @@ def _within(value: Any, place: str = "") -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, Mapping):
         for name, item in value.items():
             yield from _within(item, f"{place}/{name}".lstrip("/"))
-    elif isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "fiub":
+    elif isinstance(value, np.ndarray) and value.size and value.dtype.kind in "fiub":
         yield place, value
 
 

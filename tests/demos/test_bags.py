@@ -210,6 +210,24 @@ def test_a_wanted_rate_thins_the_states(tmp_path):
     np.testing.assert_allclose(np.diff(thin.demonstration.time), 0.04, atol=1e-5)
 
 
+@pytest.mark.parametrize("odd", ["a stamp twice", "two stamps exchanged"])
+def test_images_count_by_their_reception_where_their_stamps_do_not_rise(tmp_path, odd):
+    messages = ros2()
+    for t in START + STATES:
+        messages.state("/joint_states", t, UR, joints(t - START))
+    stamps = IMAGES.copy()
+    stamps[[10, 11]] = stamps[[10, 10]] if odd == "a stamp twice" else stamps[[11, 10]]
+    for k, (stamp, received) in enumerate(zip(stamps, IMAGES + 0.003, strict=True)):
+        messages.image("/wrist_camera/color/image_raw", START + stamp, shown(k))
+        messages.rows[-1] = (START + received, *messages.rows[-1][1:])
+    (episode,) = plan(write2(tmp_path / "bag", messages)).episodes()
+    demo = episode.demonstration
+    # The first state after each image, all of which are kept.
+    assert len(demo) == len(IMAGES)
+    first = np.ceil((IMAGES + 0.003) * 100) / 100
+    np.testing.assert_allclose(demo.time + demo.start_time - START, first, atol=1e-4)
+
+
 def test_a_bag_that_is_silent_in_between_becomes_two_episodes(tmp_path):
     messages = work(ros2())
     messages.rows = [row for row in messages.rows if not 0.8 < row[0] - START < 1.3]

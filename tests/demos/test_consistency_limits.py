@@ -358,6 +358,10 @@ def test_an_episode_that_runs_the_other_way():
     one = [turned(RISING), FALLING, usual[2]]
     # Two of three would be far off the other way.
     assert compared(one, usual) == []
+    # Backwards it must be 0.4 times as far off as forwards: (1.16 + 1.8 d) / 3 against d.
+    for shift, told in ((0.19, True), (0.22, False)):
+        odd = [moved(turned(column), shift) for column in usual]
+        assert [t == text for *_, t in compared(odd, usual)] == [told]
 
 
 def test_a_moved_zero_shifts_all_figures_alike():
@@ -447,6 +451,19 @@ def test_delays_differ_by_more_than_three_frames(usual, delay, told):
     assert found == ([(4, "error", text)] if told else [])
 
 
+def test_findings_on_commands_of_several_features_are_kept_with_the_first():
+    mixed = replace(
+        COMMAND, columns=(("action.left", 0), ("action.left", 1), ("action.right", 0))
+    )
+    given = [*(tracking() for _ in range(4)), tracking(9)]
+    profiles = [
+        EpisodeProfile(entry=entry(k), columns={}, tracking={"command_position": own})
+        for k, own in enumerate(given)
+    ]
+    (issue,) = checks.command_tracking(mixed, profiles)
+    assert (issue.episode, issue.key) == (4, "action.left")
+
+
 def test_long_delays_scatter_by_a_tenth():
     assert tracked(tracking(44), usual=tracking(40)) == []
     assert len(tracked(tracking(45), usual=tracking(40))) == 1
@@ -464,6 +481,8 @@ def test_delays_that_scatter_tell_nothing():
     odd = [tracking(d) for d in (9, -9, 15)]
     assert [episode for episode, *_ in tracked(*odd)] == [4, 5, 6]
     assert [episode for episode, *_ in tracked(*odd, tracking(18), count=3)] == []
+    half = [tracking(d) for d in (-9, 2, 2, 20)]
+    assert tracked(*half, count=0) == []
     # Two frames from the usual delay are agreement.
     near = [tracking(4), tracking(4), tracking(2), tracking(2), tracking(2), tracking(14)]
     assert [episode for episode, *_ in tracked(*near, count=0)] == [5]

@@ -88,7 +88,8 @@ def test_cells_of_matlab_are_episodes_with_frames_in_their_columns(tmp_path):
 
     cells = np.empty(2, object)
     for k in range(2):
-        cells[k] = {"pos": 0.1 * Q.T + k, "t": TIME[None]}
+        note = {"operator": "A", "empty": np.zeros((0, 0)), "weight": 0.2}
+        cells[k] = {"pos": 0.1 * Q.T + k, "t": TIME[None], "note": note}
     savemat(tmp_path / "demos.mat", {"demos": cells})
     demos = read(tmp_path / "demos.mat")
     np.testing.assert_allclose(demos[1].position, 0.1 * Q + 1)
