@@ -77,6 +77,20 @@ def test_forcing_ends_where_the_basis_says(basis):
     assert (basis.kernels(basis.centre_times()).argmax(-1) == torch.arange(basis.count)).all()
 
 
+@pytest.mark.parametrize("width", [0.2, 0.35, 0.5])
+@pytest.mark.parametrize("count", [5, 40])
+def test_forcing_of_gaussians_is_lost_behind_their_follower_and_smooth_in_between(width, count):
+    """Past the end the last of them is exp(-39) of the next one, whose weight is none."""
+    basis = GaussianBasis(count=count, width=width, phase=ExponentialPhase(decay=1.0))
+    x = (basis.horizon - 1) * (count - 1)
+    own, follower = -(x**2) / (2 * width**2), -((x - 1) ** 2) / (2 * width**2)
+    assert own - follower == pytest.approx(-39)
+    # The logistic ratio of two neighbours has its nearest pole at pi width^2 spacings.
+    reach = basis.smooth_interval * (count - 1) / (np.pi * width**2)
+    assert 0.44 < reach < 0.45 or basis.smooth_interval == 0.5 / (count - 1)
+    assert GaussianBasis(count=count, domain="phase").horizon == ExponentialPhase().horizon
+
+
 def test_a_weight_of_a_spline_acts_on_its_support_alone():
     """Before it nothing changes to the last bit; after it the spring alone goes on."""
     basis = SplineBasis(count=30)

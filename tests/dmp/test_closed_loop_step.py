@@ -21,7 +21,7 @@ from hrc_learn.dmp import (
     Stepper,
     response_of,
 )
-from hrc_learn.dmp.closed_loop_step import host_value
+from hrc_learn.dmp.closed_loop_step import host_value, uncoupled_step
 from hrc_learn.geometry import Pose
 
 
@@ -158,8 +158,8 @@ def test_coupling_sampled_at_the_start_of_a_step_is_of_first_order():
 
 
 @pytest.mark.parametrize("spring", [SpringDamper(), SpringDamper(alpha=12.0, beta=20.0)])
-@pytest.mark.parametrize("n_steps", [3, 200])
-def test_a_filtered_goal_solves_the_equation(n_steps, spring):
+@pytest.mark.parametrize(("n_steps", "slow"), [(3, 7.0), (3, 0.5), (200, 7.0)])
+def test_a_filtered_goal_solves_the_equation(n_steps, slow, spring):
     """As a push of alpha beta (g - target), with g in closed form."""
     time, position = arm_motion(n_joints=1, duration=2.0)
     dmp = JointDMP.fit(time, position, n_basis=15, spring=spring, approach=0)
@@ -170,14 +170,14 @@ def test_a_filtered_goal_solves_the_equation(n_steps, spring):
         dmp.initial_state().rate.item(),
         1.5,
         (0.0, 0.9),
-        lambda s, y, rate: spring.stiffness * (goal - 1.5) * np.exp(-7.0 * s),
+        lambda s, y, rate: spring.stiffness * (goal - 1.5) * np.exp(-slow * s),
     )
     state = dmp.initial_state()
     for k in range(n_steps):
         change = {"goal": [1.5]} if k == 0 else {}
-        state = dmp.step(state, 2.0 * 0.9 / n_steps, goal_filter=7.0, **change)
+        state = dmp.step(state, 2.0 * 0.9 / n_steps, goal_filter=slow, **change)
     np.testing.assert_allclose([state.position.item(), state.rate.item()], expected, atol=1e-8)
-    assert state.goal.item() == pytest.approx(1.5 + (goal - 1.5) * np.exp(-7.0 * 0.9))
+    assert state.goal.item() == pytest.approx(1.5 + (goal - 1.5) * np.exp(-slow * 0.9))
 
 
 def test_curvature_is_the_derivative_of_the_rate():
@@ -401,6 +401,22 @@ def test_a_step_that_the_fast_way_is_not_for_goes_the_other():
         with torch.no_grad():
             plain = dmp.step(dmp.step(dmp.initial_state(), 0.4), 0.3)
         torch.testing.assert_close(plain.position, derived.position.detach())
+
+
+def test_numpy_steps_single_motions_in_float64_without_gradients():
+    time = torch.linspace(0, 2, 200, dtype=torch.float64)
+    wave = torch.sin(2 * time)[:, None]
+    one, several = (JointDMP.fit(time, w, 20) for w in (wave, torch.stack([wave, wave])))
+
+    def stepped(dmp):
+        motion = dmp.motion
+        return uncoupled_step(dmp.initial_state(), 0.1, motion.response, motion.weights)
+
+    assert stepped(one) is None
+    with torch.no_grad():
+        assert stepped(one) is not None
+        assert stepped(several) is None
+        assert stepped(one.float()) is None
 
 
 def pose_of(position):
