@@ -1,6 +1,8 @@
+import numpy as np
 import pytest
 import torch
 from demo_motions import minimum_jerk
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.coupling import (
@@ -59,6 +61,34 @@ def test_steering_neither_drives_nor_brakes():
     torch.testing.assert_close(power, torch.zeros_like(power), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("given", [{}, {"gain": 30.0, "sharpness": 2.0}, {"reach": 0.4}])
+def test_steering_is_the_published_formula(given):
+    """gamma R v phi exp(-beta phi), with gamma = 1000 and beta = 20 / pi in the paper."""
+    rng = np.random.default_rng(1)
+    position, velocity, obstacles = (
+        rng.normal(size=3), rng.normal(size=3), rng.normal(size=(4, 3)),
+    )  # fmt: skip
+    gain, sharpness = given.get("gain", 1000), given.get("sharpness", 20 / np.pi)
+    expected = np.zeros(3)
+    for towards in obstacles - position:
+        distance = np.linalg.norm(towards)
+        phi = np.arccos(towards @ velocity / distance / np.linalg.norm(velocity))
+        axis = np.cross(towards, velocity)
+        turn = Rotation.from_rotvec(np.pi / 2 * axis / np.linalg.norm(axis))
+        term = gain * turn.apply(velocity) * phi * np.exp(-sharpness * phi)
+        expected += term * (np.exp(-distance / given["reach"]) if "reach" in given else 1)
+    arguments = map(torch.from_numpy, (position, velocity, obstacles))
+    np.testing.assert_allclose(steering(*arguments, **given), expected)
+
+
+def test_a_clock_runs_at_half_speed_at_one_over_the_root_of_the_gain():
+    planned = torch.tensor([[0.3, -0.2], [0.3, 0.0]], dtype=torch.float64)
+    measured = torch.tensor([0.0, 0.2], dtype=torch.float64)
+    stopping = phase_stopping(planned, measured, gain=1 / 0.25)
+    np.testing.assert_allclose(stopping, [1.0, 4 * (0.09 + 0.04)])
+    np.testing.assert_allclose(1 / (1 + stopping[0]), 0.5)
+
+
 def test_steering_turns_away_from_the_obstacle():
     velocity = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     for side in (-1.0, 1.0):
@@ -87,6 +117,10 @@ def test_repulsion_is_the_gradient_of_its_potential():
     potential = 0.5e-3 * (1 / distance - 1 / 0.4).clamp_min(0) ** 2
     (gradient,) = torch.autograd.grad(potential.sum(), position)
     torch.testing.assert_close(repulsion(position, obstacles, reach=0.4), -gradient)
+    twice = repulsion(position, obstacles, reach=0.4, gain=2e-3)
+    torch.testing.assert_close(twice, -2 * gradient)
+    # On the obstacle there is no direction.
+    assert repulsion(obstacles, obstacles[:1], reach=0.4).isfinite().all()
     assert (gradient == 0).any(dim=-1).any()
 
 

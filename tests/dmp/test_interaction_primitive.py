@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from demo_motions import minimum_jerk
@@ -103,6 +104,24 @@ def test_probabilities_are_those_of_gaussians(model):
     assert 0.01 < estimate.probability.min() < 0.5
 
 
+def test_kinds_have_the_fractions_and_durations_of_their_demonstrations():
+    """Durations vary by a twentieth at least; without names there is one kind."""
+    durations = [2.0, 2.0, 2.4, 1.5, 3.0]
+    shown = [handover(0.4 + 0.01 * k, 1.0, tau, 60) for k, tau in enumerate(durations)]
+    given = [list(x) for x in zip(*shown, strict=True)]
+    named = InteractionPrimitive.fit(*given, ["b", "b", "a", "a", "a"])
+    assert named.kinds == ("b", "a")
+    torch.testing.assert_close(named.prior, torch.tensor([0.4, 0.6], dtype=torch.float64))
+    for found, own in zip(named.log_duration, (durations[:2], durations[2:]), strict=True):
+        logarithm = np.log(own)
+        expected = [logarithm.mean(), max(logarithm.std(ddof=1), 0.05)]
+        np.testing.assert_allclose(found, expected)
+    assert all(one.primitive.basis.count == 15 for one in named.models)
+    one = InteractionPrimitive.fit(*given)
+    assert (one.kinds, one.prior.tolist()) == (("interaction",), [1.0])
+    assert one.observed == 2
+
+
 def test_refuses_with_a_sentence(model):
     time, hand, robot = handover(0.5, 1.0, 2.0)
     both = torch.stack([hand, hand]), torch.stack([robot, robot])
@@ -112,6 +131,8 @@ def test_refuses_with_a_sentence(model):
         InteractionPrimitive.fit(time, *both, ["a", "b", "b"])
     with pytest.raises(ValueError, match="must be \\(B, T, columns\\)"):
         InteractionPrimitive.fit(time, hand, robot)
+    with pytest.raises(ValueError, match="must be \\(B, T, columns\\)"):
+        InteractionPrimitive.fit(time, both[0], robot[None].repeat(3, 1, 1))
     with pytest.raises(ValueError, match="must be \\(n,\\) and"):
         model.observe(time[:3], hand[:4], 0.1)
     with pytest.raises(ValueError, match="no value of the person"):
