@@ -1,8 +1,9 @@
+import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion
 
-from hrc_learn.dmp import select_basis_count
+from hrc_learn.dmp import JointDMP, select_basis_count
 
 CANDIDATES = (5, 10, 20, 40, 80, 120)
 
@@ -32,6 +33,33 @@ def test_held_out_samples_are_not_fitted():
     chosen = select_basis_count(time, position, (50,))
     rmse = chosen.error[0] * (position.max() - position.min())
     assert rmse > 0.5 / 60**0.5
+
+
+@pytest.mark.parametrize(("given", "n_folds"), [({"n_folds": 2}, 2), ({}, 5)])
+def test_errors_are_those_of_a_loop_over_folds(given, n_folds):
+    """Two demonstrations; every n-th sample is held out, but for the first and the last."""
+    time, position = arm_motion(n_samples=41, n_joints=2)
+    rng = torch.Generator().manual_seed(3)
+    noise = 0.02 * torch.randn(2, *position.shape, generator=rng, dtype=torch.float64)
+    position = torch.stack([position, 3 * position]) + noise
+    chosen = select_basis_count(time, position, (6, 12), **given)
+    expected = []
+    for count in (6, 12):
+        square, held_out = 0.0, 0
+        for fold in range(n_folds):
+            held = np.arange(1, 42) % n_folds == fold
+            held[[0, -1]] = False
+            for one in position:
+                fitted = JointDMP.fit(time[~held], one[~held], count)
+                with torch.no_grad():
+                    error = (fitted.rollout(time).position - one)[held]
+                square += error.square().sum().item()
+                held_out += error.numel()
+        expected.append((square / held_out) ** 0.5)
+    span = (position.amax(1) - position.amin(1)).max().item()
+    np.testing.assert_allclose(chosen.error, np.array(expected) / span, rtol=1e-6)
+    near = [n for n, e in zip((6, 12), expected, strict=True) if e <= 1.05 * min(expected)]
+    assert chosen.count == near[0]
 
 
 def test_masks_are_kept():

@@ -117,3 +117,18 @@ def test_the_shortest_admissible_duration():
         (name, limit), fine = next(iter(limits.items())), np.linspace(0, 1, 3001)
         made = np.abs(dmp.rollout(fine * tau.item(), duration=tau).numpy()[name]).max(0)
         assert (made / np.asarray(limit)).max() == pytest.approx(1.0, abs=2e-3)
+
+
+def test_durations_of_a_batch_keep_both_limits_towards_another_goal():
+    time, position = arm_motion(150, n_joints=2)
+    dmp = JointDMP.fit(time, torch.stack([position, 0.2 * position]), 30)
+    goal, velocity, acceleration = dmp.goal + 0.4, [0.3, 0.5], [0.6, 2.0]
+    tau = dmp.admissible_duration(velocity, acceleration, goal=goal)
+    fine = torch.linspace(0, 1, 2001, dtype=torch.float64)
+    made = dmp.rollout(fine * dmp.duration[:, None], goal=goal)
+    for k in range(2):
+        v, a = (x[k].detach().abs().amax(0).numpy() for x in (made.velocity, made.acceleration))
+        factor = max((v / velocity).max(), np.sqrt((a / acceleration).max()))
+        assert tau[k].item() == pytest.approx(factor * dmp.duration[k].item(), rel=2e-3)
+    with pytest.raises(ValueError, match="a limit must be positive"):
+        dmp.admissible_duration(velocity=0.0)
