@@ -110,9 +110,10 @@ def install(uv: str, wheel: Path, environment: str, python: str, folder: Path) -
     inside = folder / "venv" / "bin" / "python"
     into = (uv, "pip", "install", "--quiet", "--python", str(inside))
     run(*into, "--requirement", str(resolved), "--constraint", str(resolved), *TOOLS)
-    run(*into, "--no-deps", str(wheel), *DESCRIPTIONS)
+    run(*into, "--no-deps", str(wheel))
     # The wheel's own metadata has the last word on what it needs.
     run(uv, "pip", "check", "--quiet", "--python", str(inside))
+    run(*into, "--no-deps", *DESCRIPTIONS)
     names = {
         found["name"] for text in lower_bounds(chosen) if (found := REQUIREMENT.match(text))
     }
