@@ -1,5 +1,6 @@
 """Requests that the gate answers and sockets that it opens, one condition at a time."""
 
+import asyncio
 import base64
 import json
 import logging
@@ -13,7 +14,7 @@ from websockets.sync.client import connect
 
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate import gate as gate_module
-from hrc_learn.teleoperation.gate.gate import incoming
+from hrc_learn.teleoperation.gate.gate import first_of, incoming
 from hrc_learn.teleoperation.gate.messages import MessageError
 
 CLIENT = "c" * 18
@@ -205,6 +206,29 @@ def test_a_wrong_message_and_too_many_close_a_socket_with_the_reason(gate, monke
             assert answer(one) == f"{CLIENT} act hello"
         one.send("hello")
         assert closed(one) == (1008, "too many messages")
+
+
+def test_work_ends_with_the_first_that_ends_and_with_its_error():
+    ended = []
+
+    async def rest(name):
+        try:
+            await asyncio.sleep(60)
+        finally:
+            ended.append(name)
+
+    async def fail():
+        raise KeyError("lost")
+
+    async def cleanly():
+        await first_of(rest("a"), asyncio.sleep(0), rest("b"))
+        return "goes on"
+
+    assert asyncio.run(cleanly()) == "goes on"
+    assert sorted(ended) == ["a", "b"]
+    with pytest.raises(KeyError, match="lost"):
+        asyncio.run(first_of(rest("c"), fail()))
+    assert ended[2:] == ["c"]
 
 
 @pytest.mark.parametrize(
