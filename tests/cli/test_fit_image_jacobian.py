@@ -1,20 +1,29 @@
-"""`hrc fit image-jacobian`: files and figures of the fit."""
+"""`hrc fit image-jacobian`: files and figures of the fit, and `hrc evaluate` of its model."""
 
 import json
+import re
 
+import pytest
+import torch
 from commands import done
-from pinhole import Pinhole, wander
+from pinhole import wander
 from sampling import generator
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.jacobian import RBFImageJacobian
+from hrc_learn.sim import World
+from hrc_learn.sim.workplace import Workplace
 
 FRAMES = 60
 
 
-def test_it_writes_a_model_and_a_dashboard(tmp_path):
+def test_it_writes_a_model_like_the_camera_of_the_work_cell(tmp_path):
     poses = wander(FRAMES, 4, rng=generator(0))
-    features = Pinhole.overhead(roll=0.7).project(poses)
+    workplace = Workplace()
+    camera, world = workplace.scene.camera, World(workplace.scene)
+    world.reset(workplace.home_joints().numpy(), {})
+    marker = poses.apply(torch.from_numpy(world.hand_marker_offset()))
+    features = torch.from_numpy(camera.project(marker.numpy()))
     with DatasetWriter(tmp_path / "set", 20, "any") as writer:
         for episode in range(4):
             writer.start_episode("look")
@@ -30,9 +39,25 @@ def test_it_writes_a_model_and_a_dashboard(tmp_path):
     options = ("--no-learn", "--json", tmp_path / "values.json")
     output = done("fit", "image-jacobian", tmp_path / "set", "--out", model, *options).output
     assert "held-out error, relative to that motion" in output
-    assert "focal length 14" in output
+    (focal,) = re.findall(r"focal length (\d+) px", output)
+    assert int(focal) == pytest.approx(camera.focal[0], rel=0.02)
     metrics = json.loads((model / "metrics.json").read_text())
     assert json.loads((tmp_path / "values.json").read_text()) == metrics
     assert 0 < metrics["held_out_relative"] < 0.02
     assert (model / "fit.rrd").is_file()
     RBFImageJacobian.load(model / "jacobian")
+
+    # Compared with the simulator's camera, the pixels were its own.
+    evaluate = ("evaluate", "--model", model, "--dataset", tmp_path / "set")
+    outcome = done(*evaluate, "--json", tmp_path / "errors.json")
+    errors = json.loads((tmp_path / "errors.json").read_text())
+    kinds = ("relative_error_median", "relative_error_p95", "within_1_sigma", "within_2_sigma")
+    assert [*errors] == [f"{grid}_{kind}" for grid in ("upright", "tilted") for kind in kinds]
+    for grid in ("upright", "tilted"):
+        median, most, *within = (errors[f"{grid}_{kind}"] for kind in kinds)
+        assert 0 < median < most < 0.05
+        assert 0 < within[0] <= within[1] <= 1
+    assert errors["tilted_relative_error_median"] != errors["upright_relative_error_median"]
+    (limited,) = [row for row in outcome.output.splitlines() if " ok " in row]
+    assert "upright relative error median" in limited
+    assert "0.05" in limited
