@@ -17,8 +17,6 @@ from hrc_learn.kinematics.registry import arm
 
 pytest.importorskip("scservo_sdk")
 
-pytestmark = pytest.mark.realtime
-
 STEP = 2 * math.pi / 4095
 MIDDLES = [sum(ends) / 2 for ends in RANGES.values()]
 
@@ -28,6 +26,7 @@ def options(kind, device, port, folder):
     return [f"--{kind}.{name}={value}" for name, value in given.items()]
 
 
+@pytest.mark.realtime
 @shapes_unchecked()  # a loop at 50 Hz
 def test_a_follower_records_what_its_leader_shows(tmp_path):
     (tmp_path / "mine.json").write_text(json.dumps(calibration()))
@@ -95,3 +94,18 @@ def test_a_leader_that_is_not_there_is_one_line(tmp_path):
     asked = hrc(*words, "--teleop.type=so101_leder")
     assert asked.status == 2
     assert "did you mean so101_leader?" in asked.error
+
+
+@pytest.mark.parametrize(
+    ("duration", "pause", "refused"),
+    [(0.02, 0, True), (0.04, -0.1, True), (0.04, 0, False)],
+)
+def test_a_demonstration_has_two_frames_or_more(tmp_path, duration, pause, refused):
+    """Of 20 ms each; what is not refused goes on to the leader, which is not there."""
+    (tmp_path / "mine.json").write_text(json.dumps(calibration()))
+    timing = (f"demonstration.duration={duration}", f"demonstration.pause={pause}")
+    words = ("record", "leader", "--robot", "so101", "--out", tmp_path / "set")
+    devices = options("teleop", "so101_leader", "/dev/nothing", tmp_path)
+    outcome = hrc(*words, *devices, "--config", *timing)
+    assert outcome.status == (2 if refused else 1)
+    assert ("demonstration.duration must be positive" in outcome.error) == refused
