@@ -137,8 +137,8 @@ def test(python: Path, folder: Path, tests: list[str]) -> int:
         here, there = ROOT / "tests" / name, folder / "tests" / name
         there.parent.mkdir(exist_ok=True)
         shutil.copytree(here, there) if here.is_dir() else shutil.copy(here, there)
-    for helper in (ROOT / "tests").glob("*.py"):
-        if not helper.name.startswith("test_"):
+    for helper in (ROOT / "tests").glob("*.*"):
+        if helper.is_file() and not helper.name.startswith("test_"):
             shutil.copy(helper, folder / "tests")
     for name in ("benchmarks", "plugins"):
         shutil.copytree(ROOT / name, folder / name)
