@@ -21,6 +21,7 @@ import ast
 import contextlib
 import copy
 import importlib
+import itertools
 import json
 import os
 import random
@@ -94,35 +95,43 @@ class Mutant:
         return f"{self.path}:{self.line}  {self.before}  ->  {self.after}"
 
 
-def mutants_of(path: Path) -> Iterator[Mutant]:
-    """Every mutant of a file, in the order of the source."""
-    text = (ROOT / path).read_text(encoding="utf-8")
-    tree = ast.parse(text)
-    lines = text.splitlines(keepends=True)
-    starts = [0]
-    for line in lines:
-        starts.append(starts[-1] + len(line.encode()))
-    raw = text.encode()
-    for node, kind, changed in _changes(tree):
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One expression that may change, and how."""
+
+    path: Path
+    """Relative to the checkout."""
+    node: ast.expr
+    kind: str
+    edit: Callable[[ast.expr], ast.expr | None]
+
+    def mutant(self) -> Mutant | None:
+        """The file with the change; None at a place where no parenthesis may stand."""
+        raw = (ROOT / self.path).read_bytes()
+        node, changed = self.node, copy.deepcopy(self.node)
+        changed = self.edit(changed) or changed
+        starts = list(itertools.accumulate(map(len, raw.splitlines(keepends=True)), initial=0))
         first = starts[node.lineno - 1] + node.col_offset
         last = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
-        after = f"({ast.unparse(changed)})"
-        source = (raw[:first] + after.encode() + raw[last:]).decode()
+        before, after = raw[first:last].decode(), ast.unparse(changed)
+        source = (raw[:first] + f"({after})".encode() + raw[last:]).decode()
         try:
             ast.parse(source)
-        except SyntaxError:  # a place where no parenthesis may stand
-            continue
-        before = raw[first:last].decode()
-        yield Mutant(path, node.lineno, kind, _short(before), _short(after[1:-1]), source)
+        except SyntaxError:
+            return None
+        return Mutant(self.path, node.lineno, self.kind, _short(before), _short(after), source)
 
 
-def _changes(tree: ast.Module) -> Iterator[tuple[ast.expr, str, ast.expr]]:
-    """Expressions that may change, how, and to what."""
-    for node in _code(tree):
+def changes_of(path: Path) -> Iterator[Change]:
+    """Every change of a file, in the order of the source."""
+    for node in _code(ast.parse((ROOT / path).read_bytes())):
         for kind, edit in _edits(node):
-            changed = copy.deepcopy(node)
-            changed = edit(changed) or changed
-            yield node, kind, changed
+            yield Change(path, node, kind, edit)
+
+
+def mutants_of(path: Path) -> Iterator[Mutant]:
+    """Every mutant of a file, in the order of the source."""
+    return filter(None, (change.mutant() for change in changes_of(path)))
 
 
 def _code(node: ast.AST) -> Iterator[ast.expr]:
@@ -382,9 +391,11 @@ def main() -> int:
     args = parser.parse_args()
 
     files = [file for target in args.targets for file in sources(target)]
-    everything = [mutant for file in files for mutant in mutants_of(file)]
-    sample = random.Random(args.seed).sample(everything, min(args.number, len(everything)))
-    print(f"{len(sample)} of {len(everything)} mutants of {len(files)} modules", flush=True)
+    everything = [change for file in files for change in changes_of(file)]
+    random.Random(args.seed).shuffle(everything)
+    mutants = filter(None, (change.mutant() for change in everything))
+    sample = list(itertools.islice(mutants, args.number))
+    print(f"{len(sample)} of {len(everything)} changes of {len(files)} modules", flush=True)
     if args.list:
         print(*sample, sep="\n")
         return 0
