@@ -248,18 +248,18 @@ class AdaptiveController(nn.Module):
         """
         joint_position = self.safety.joint_vector(joint_position, "joint_position")
         J = self.chain.jacobian(joint_position)
-        still = torch.zeros_like(J[..., 0])
+        still, zero = (J.new_zeros(x.shape[:-1]) for x in (J, joint_position))
         return ControllerState(
             blending=self.blending.initial_state(
                 joint_position, self.estimator.network.rows // 2
             ),
-            task_level=torch.zeros_like(joint_position[..., 0]),
+            task_level=zero,
             pose_drift=PoseDrift(
                 drift=still,
                 joint_position=joint_position,
                 jacobian=J,
                 planned=still,
-                active=torch.zeros_like(still[..., 0], dtype=torch.bool),
+                active=torch.zeros_like(zero, dtype=torch.bool),
             ),
             safety=self.safety.initial_state(
                 joint_position, joint_velocity, joint_acceleration
@@ -464,9 +464,7 @@ class AdaptiveController(nn.Module):
         until the next step: any other motion is drift.
         """
         if motion.pose_drift is None:
-            return replace(
-                before, active=torch.zeros_like(motion.twist[..., 0], dtype=torch.bool)
-            )
+            return replace(before, active=torch.zeros_like(before.active))
         J = motion.jacobian
         planned = law.planned_motion(motion.task_twist, motion.twist, J, joint_velocity, dt)
         # An arm that only brakes does not drift.

@@ -104,7 +104,7 @@ class ArmLoop:
             joint_velocity: Measured joint velocities [rad/s]; None: at rest.
         """
         still = torch.zeros_like(joint_position)
-        clock = still[..., 0] + time
+        clock = still.new_full(still.shape[:-1], time)
         never = torch.zeros_like(clock, dtype=torch.bool)
         return ArmLoopState(
             safety=self.safety.initial_state(joint_position, joint_velocity),
@@ -196,7 +196,7 @@ class ArmLoop:
         q, J = reading.joint_position, reading.jacobian
         config, bounds = self.config, self._law.task_margin.velocity_bounds(q)
 
-        one = torch.ones_like(q[..., 0])
+        one = q.new_ones(q.shape[:-1])
         eased = apply_where(
             acts,
             lambda part: eased_null_velocity(self.chain, *part, dt=config.dt, config=config),
@@ -301,7 +301,7 @@ class ArmLoop:
         """True where people near the arm hold it back, or their distance is not known."""
         slowed, people = reading.stop, reading.people
         if slowed is None:
-            slowed = torch.zeros_like(sent[..., 0], dtype=torch.bool)
+            slowed = torch.zeros_like(reading.pause)
         if people is None:
             return slowed
         slowed = slowed | (people.speed_scale < 1)
@@ -318,7 +318,7 @@ class ArmLoop:
     ) -> ArmReport:
         """The report with the part of a push that the safety filter removes."""
         J, people, config = reading.jacobian, reading.people, self.safety.config
-        slowed = torch.zeros_like(sent[..., 0], dtype=torch.bool)
+        slowed = torch.zeros_like(reading.pause)
         if people is not None:
             slowed = people.speed_scale < 1
             if config.constraints is not None:

@@ -142,7 +142,7 @@ class PathState:
             joint_position: Joint positions [rad].
             pose: Pose of the end effector.
         """
-        zero = torch.zeros_like(joint_position[..., 0])
+        zero = joint_position.new_zeros(joint_position.shape[:-1])
         never = torch.zeros_like(zero, dtype=torch.bool)
         return cls(
             progress=zero,

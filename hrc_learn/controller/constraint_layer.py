@@ -93,7 +93,7 @@ def least_change(
     nothing = torch.zeros_like(lower)
     eye = torch.eye(p, dtype=rows.dtype, device=rows.device).expand(*batch, p, p)
     now = _Step(
-        y=torch.zeros_like(rows[..., 0]),
+        y=rows.new_zeros(rows.shape[:-1]),
         dual=nothing,
         side=nothing,
         operators=torch.cat([eye, torch.zeros_like(rows)], dim=-1),
@@ -350,7 +350,7 @@ def constrained_velocity(
     config = config or ConstraintConfig()
     dtype, m = wanted.dtype, jacobian.shape[-2]
     if task_fraction is None:
-        task_fraction = torch.ones_like(wanted[..., 0])
+        task_fraction = wanted.new_ones(wanted.shape[:-1])
     # Weights are 1e7 apart, and float32 has seven digits.
     wanted, task, J, lower, upper, fraction = (
         x.double() for x in (wanted, task, jacobian, lower, upper, task_fraction)

@@ -241,7 +241,7 @@ class DirectReturn:
     @classmethod
     def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:
         """No return under way."""
-        q, zero = joint_position, torch.zeros_like(joint_position[..., 0])
+        q, zero = joint_position, joint_position.new_zeros(joint_position.shape[:-1])
         clocks = {"progress": zero, "duration": zero, "time": zero}
         never = torch.zeros_like(zero, dtype=torch.bool)
         return cls(start=q, goal=q, **clocks, active=never, blocked=never)

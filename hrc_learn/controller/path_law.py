@@ -140,7 +140,7 @@ class PathLaw:
                 together may bend the null space more than the push alone, which is eased.
         """
         q, config = reading.joint_position, self.config
-        zero = torch.zeros_like(q[..., 0])
+        zero = q.new_zeros(q.shape[:-1])
         never = torch.zeros_like(zero, dtype=torch.bool)
 
         def track(part: tuple[Any, ...]) -> TrackedPose:
@@ -149,7 +149,7 @@ class PathLaw:
             J = self.chain.jacobian(q + config.command_delay * velocity)
             correction = config.pose_gain * here.twist_to(pose)
             task, null = resolved_rate(J, twist + correction, null_velocity)
-            one, moves = torch.ones_like(q[..., 0]), (null != 0).any(-1)
+            one, moves = q.new_ones(q.shape[:-1]), null.norm(dim=-1) > 0
             blocked, distance = torch.zeros_like(moves), torch.full_like(one, torch.inf)
             slowdown, clear = one, one
             if slows:
@@ -159,7 +159,7 @@ class PathLaw:
                 kept = kept_clear(q, task, null, self.clearance, config.clearance)
                 clear = fraction_kept(null, kept.null)
                 distance, blocked = kept.distance, kept.blocked & moves
-                null = torch.where(moves.unsqueeze(-1), kept.null, null)
+                null = kept.null
             margin = self.task_margin.velocity_bounds(q)
             within = self._within_limits(q, J, task, null, margin)
             return TrackedPose(
@@ -287,7 +287,7 @@ class PathLaw:
             goal=target.goal,
             pose=pose,
             twist=twist,
-            blocked=off.aside & tracked.blocked,
+            blocked=tracked.blocked,
             narrow_ahead=target.narrow_ahead,
             direct_return=replace(direct, time=later),
         )
@@ -335,7 +335,6 @@ class PathLaw:
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
-        null_error = null_error.masked_fill(~aside.unsqueeze(-1), 0.0)
         lost = torch.zeros_like(aside)
         fraction = torch.ones_like(path.rate)
         # Joints return where the path waits for them, and once they are let go.
@@ -343,11 +342,10 @@ class PathLaw:
         if config.after_push == "return":
             alignment = joint_path.return_alignment(null_error, error)
             lost = aside & joint_path.may_not_return(error, alignment, state.lost & ~pushed)
-            kept = joint_path.push_fraction(state.null_velocity, null_error, alignment)
-            fraction = torch.where(aside, kept, 1.0)
+            fraction = joint_path.push_fraction(state.null_velocity, null_error, alignment)
             returns = returns | ~pushed
         null_error = null_error.masked_fill(~returns.unsqueeze(-1), 0.0)
-        fastest = config.return_speed / null_error.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+        fastest = config.return_speed / null_error.norm(dim=-1, keepdim=True)
         back, last = fastest.clamp(max=config.pose_gain) * null_error, state.return_velocity
         back = last + min(config.dt / config.nullspace_rise, 1.0) * (back - last)
         return OffPath(

@@ -387,7 +387,7 @@ class VisionBlending(nn.Module):
             like: Joint positions, of which batch shape, dtype and device are taken.
             points: Number of points of the feature.
         """
-        level = torch.zeros_like(like[..., 0])
+        level = like.new_zeros(like.shape[:-1])
         return BlendingState(
             active=torch.zeros_like(level, dtype=torch.bool),
             level=level,

@@ -166,7 +166,7 @@ class SafetyFilter(nn.Module):
         def motion(values: ArrayLike | None, name: str) -> Tensor:
             return still.clone() if values is None else still + self.joint_vector(values, name)
 
-        zero = torch.zeros_like(still[..., 0])
+        zero = q.new_zeros(q.shape[:-1])
         return SafetyState(
             velocity=motion(joint_velocity, "joint_velocity"),
             acceleration=motion(joint_acceleration, "joint_acceleration"),
@@ -185,7 +185,7 @@ class SafetyFilter(nn.Module):
             (state.velocity, zero),
             (state.acceleration, zero),
             (state.position, (upper - lower) / 2),
-            (state.too_fast, zero[..., 0]),
+            (state.too_fast, torch.zeros_like(state.too_fast)),
         )
         v, a, q, time = (torch.where(is_number(x), x, instead) for x, instead in fallback)
         valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
@@ -390,7 +390,7 @@ class SafetyFilter(nn.Module):
         self, given: _Inputs, u: Tensor, human_distance: Tensor | None
     ) -> tuple[Tensor, Tensor | float, Tensor, Tensor]:
         """The velocity slowed down, the cap, and the flags `tcp_speed` and `separation`."""
-        never = torch.zeros_like(u[..., :1], dtype=torch.bool)
+        never = torch.zeros_like(given.invalid)
         if given.points is None:
             return u, math.inf, never, never
         speed = _speed(given.points, u)
