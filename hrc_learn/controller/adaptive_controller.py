@@ -409,7 +409,7 @@ class AdaptiveController(nn.Module):
         pose_drift = None
         if d is not None and rate > 0:
             # A joint-space approach plans no tool path, so there is no drift.
-            active = (d != 0).any(-1) & ((task_level == 1) | (goals.posture is None))
+            active = (d.norm(dim=-1) > 0) & ((task_level == 1) | (goals.posture is None))
             pose_drift = law.measure_drift(state.pose_drift, q, controlled, active)
             twist = torch.add(task_twist, pose_drift.drift, alpha=rate)
 

@@ -57,8 +57,6 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# Null-space input below which one that has ended is over [N m].
-_LEAST_INPUT = 0.05
 # Fraction of the task given up by the constraint layer that exceeds rounding.
 _SLOWED = 1e-3
 # Twist below which the task counts as resting (metres and radians mixed) [1/s].
@@ -189,8 +187,7 @@ class ArmLoop:
     ) -> tuple[Tensor, tuple[Limitation, ...]]:
         """Null-space velocity requested by the push now, and the limitations of it."""
         requested = self._requested_null_velocity(reading)
-        asked = (requested != 0).any(-1)
-        acts = asked | state.pushed
+        acts = (requested.norm(dim=-1) > 0) | state.pushed
         if not bool(acts.any()):
             return requested, ()
         q, J = reading.joint_position, reading.jacobian
@@ -203,11 +200,9 @@ class ArmLoop:
             (q, J, state.null_velocity, requested, bounds),
             EasedVelocity(requested, requested, one, one, requested, requested),
         )
-        small = config.damping * eased.velocity.abs().amax(-1) < _LEAST_INPUT
-        velocity = eased.velocity.masked_fill((~asked & small).unsqueeze(-1), 0.0)
         if not reading.explain:
-            return velocity, ()
-        return velocity, (
+            return eased.velocity, ()
+        return eased.velocity, (
             Limitation("task", fraction_in_null_space(requested, eased.projected)),
             Limitation("speed", eased.slowdown),
             Limitation("singularity", eased.fade),

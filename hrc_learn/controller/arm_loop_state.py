@@ -205,7 +205,7 @@ class ArmLoopState:
     @property
     def pushed(self) -> Bool[Tensor, "*batch"]:
         """True while the null space is pushed."""
-        return (self.null_velocity != 0).any(-1)
+        return self.null_velocity.norm(dim=-1) > 0
 
 
 @pytree

@@ -1,5 +1,6 @@
 """The control law, one step against its parts."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -29,9 +30,10 @@ from hrc_learn.jacobian import (
     CompositeEstimator,
     FixedEstimator,
     KalmanEstimator,
+    Measurement,
     PaperEstimator,
 )
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import arm, panda
 
 
 class TestTheLaw:
@@ -73,6 +75,18 @@ class TestTheLaw:
         v = command.joint_velocity
         torch.testing.assert_close(v / v.norm(), u / u.norm())
         assert command.safety.acted("acceleration")
+        # How fast the potential falls, and how much the estimate has learned.
+        torch.testing.assert_close(command.potential_rate, s @ (J @ v))
+        weight = self.controller.estimator.network.weight
+        torch.testing.assert_close(command.weight_norm, weight.square().sum().sqrt())
+
+    def test_the_printed_law_has_no_extension(self):
+        config = ControllerConfig.paper()
+        speeds = config.linear_speed, config.angular_speed, config.vision_rate
+        assert speeds == (math.inf, math.inf, math.inf)
+        assert not config.yields_to_limits
+        assert config.drift_compensation_rate == 0
+        assert config.blending.hysteresis == config.blending.blend_time == 0
 
     def test_the_twist_is_capped_and_the_activation_blends(self):
         controller, _ = grasping(rng=sampling.generator(2))
@@ -232,3 +246,116 @@ def test_bad_settings_are_refused():
         ControllerConfig(null_damping=0.0)
     with pytest.raises(ValueError, match="drift_compensation_rate must not be negative"):
         ControllerConfig(drift_compensation_rate=-1.0)
+
+
+# Fields of an observation, and whether the estimator learns from the image.
+IMAGES = {
+    "new": ({}, True),
+    "taken elsewhere": ({"image_joint_position": POSTURE + 0.02}, True),
+    "taken at unknown joints": ({"image_joint_position": POSTURE * math.nan}, False),
+    "used before": ({"feature_new": torch.tensor(False)}, False),
+    "without the feature": ({"feature_visible": torch.tensor(False)}, False),
+    "too old": ({"feature_age": torch.tensor(0.3, dtype=DOUBLE)}, False),
+    "of joints that are not known": ({"joint_state_stale": torch.tensor(True)}, False),
+    "with the feature at its border": (
+        {"feature": torch.tensor([0.0, 500.0], dtype=DOUBLE)},
+        True,
+    ),
+    "with the feature beyond its border": (
+        {"feature": torch.tensor([-0.5, 500.0], dtype=DOUBLE)},
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("approached", [False, True])
+@pytest.mark.parametrize("dt", [0.01, math.nan])
+def test_the_estimator_learns_from_new_images_where_they_were_taken(approached, dt):
+    """Also during an approach in joint space, which vision does not guide."""
+    camera = overhead_camera()
+    J = camera.image_jacobian(Pose(CENTRE, DOWN))
+    goals = Goals.at(CENTRE, DOWN, torch.tensor([700.0, 500.0], dtype=DOUBLE))
+    if approached:
+        goals = goals.approached_by(POSTURE + 1.0)
+    estimator = CompositeEstimator(network(J))
+    controller = AdaptiveController(panda, estimator, goals)
+    usual = {
+        "feature": torch.tensor([690.0, 520.0], dtype=DOUBLE),
+        "feature_visible": torch.tensor(True),
+        "feature_new": torch.tensor(True),
+        "feature_age": torch.tensor(0.02, dtype=DOUBLE),
+        "joint_state_stale": torch.tensor(False),
+        "image_joint_position": POSTURE,
+    }
+    rows = [usual | fields for fields, _ in IMAGES.values()]
+    valid = torch.tensor([learned for _, learned in IMAGES.values()])
+    q = POSTURE.expand(len(rows), 7)
+    first = observe(q - 0.01, dt=0.01)
+    _, state = controller.step(controller.initial_state(q), first)
+    fields = {name: torch.stack([row[name] for row in rows]) for name in usual}
+    observation = observe(q, dt=torch.tensor(dt, dtype=DOUBLE), **fields)
+    command, after = controller.step(state, observation)
+    known = fields["image_joint_position"]
+    known = torch.where(known.isnan(), q, known)
+    sound = not math.isnan(dt)
+    expected = estimator.update(
+        state.estimator,
+        Measurement(
+            pose=panda.forward(known),
+            feature=fields["feature"],
+            valid=valid & sound,
+            dt=dt if sound else 0.0,
+            xi_x=command.xi_x if sound else torch.zeros_like(command.xi_x),
+            xi_r=command.xi_r if sound else torch.zeros_like(command.xi_r),
+        ),
+    )
+    leaves = (_pytree.tree_leaves(x) for x in (after.estimator, expected))
+    for one, other in zip(*leaves, strict=True):
+        torch.testing.assert_close(one, other)
+    changed = (after.estimator.key.feature != state.estimator.key.feature).any(-1)
+    assert changed.tolist() == (valid & sound).tolist()
+    assert bool((command.vision_level > 0).any()) == (not approached)
+
+
+def test_the_drift_of_a_pushed_arm_is_measured_from_step_to_step():
+    controller, _ = grasping(rng=sampling.generator(5))
+    q = (POSTURE + 0.1).expand(3, 7)
+    push = torch.zeros(3, 7, dtype=DOUBLE)
+    push[1, 2], push[2] = 2.0, 1.0
+    dt = torch.tensor(0.01, dtype=DOUBLE)
+    command, state = controller.step(
+        controller.initial_state(q), observe(q, nullspace_input=push, dt=dt)
+    )
+    assert state.pose_drift.active.tolist() == [False, True, True]
+    # What the filter leaves of the twist is the plan for the step.
+    J = panda.jacobian(q)
+    done = (J @ command.joint_velocity[..., None])[..., 0]
+    square = command.twist.square().sum(-1, keepdim=True)
+    fraction = (done * command.twist).sum(-1, keepdim=True) / square
+    assert (fraction < 1).all()
+    torch.testing.assert_close(
+        state.pose_drift.planned, dt * fraction * command.twist, rtol=1e-6, atol=1e-12
+    )
+    # An arm that brakes for a step of unknown length does not drift.
+    lost = observe(q, nullspace_input=push, dt=dt * math.nan)
+    command, braking = controller.step(state, lost)
+    done = (J @ command.joint_velocity[..., None])[..., 0]
+    assert done.norm() > 0
+    torch.testing.assert_close(braking.pose_drift.planned, 0.01 * done)
+    # Nor does one that is not pushed, or that approaches in joint space.
+    _, rested = controller.step(state, observe(q, dt=dt))
+    assert not rested.pose_drift.active.any()
+    goals = controller.goals.approached_by(POSTURE + 0.1)
+    for level, active in ((0.5, False), (1.0, True)):
+        begun = replace(state, task_level=torch.full((3,), level, dtype=DOUBLE))
+        approach = observe(q, nullspace_input=push, dt=dt, goals=goals)
+        _, later = controller.step(begun, approach)
+        assert later.pose_drift.active.tolist() == [False, active, active]
+
+
+def test_six_joints_are_enough_for_a_pose_and_five_are_not():
+    estimator = FixedEstimator(network(torch.zeros(2, 6, dtype=DOUBLE)))
+    goals = Goals.at(CENTRE, DOWN, torch.tensor([700.0, 500.0], dtype=DOUBLE))
+    controller = AdaptiveController(arm("ur5e"), estimator, goals)
+    assert controller.null_space_dimension() == 0
+    assert controller.null_space_dimension("position") == 3

@@ -371,3 +371,82 @@ def test_a_jacobian_that_is_not_finite_leaves_the_report_finite():
     assert float(report.speed_excess) == float(report.speed_excess_time) == 0.0
     assert ((v >= 0) & (v < u)).all()
     assert all(x.isfinite().all() for x in (after.velocity, after.acceleration, after.position))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(("beyond", "wrong"), [(0.99, False), (1.01, True)])
+def test_one_joint_that_is_not_as_fast_as_a_start_says_restarts_the_filter(beyond, wrong, side):
+    """3 % of its highest velocity may be noise of the encoders."""
+    safety = SafetyFilter(LIMITS)
+    measured = torch.zeros(2, 7, dtype=torch.float64)
+    highest = (1 - SafetyConfig().velocity_margin) * LIMITS.velocity
+    measured[0, 3] = side * beyond * 0.03 * highest[3]
+    q, still = READY.expand(2, 7), torch.zeros_like(measured)
+    speeding_up = 0.5 * LIMITS.acceleration.expand(2, 7)
+    state = safety.initial_state(q, still, speeding_up)
+    u = 0.5 * torch.ones_like(q)
+    v, after, report = safety.step(state, q, u, 0.004, joint_velocity=measured)
+    assert report.acted("start").tolist() == [wrong, False]
+    restarted = safety.initial_state(q, measured)
+    start = restarted if wrong else state
+    expected = [safety.step(x, q, u, 0.004)[0][k] for k, x in enumerate((start, state))]
+    torch.testing.assert_close(v, torch.stack(expected), rtol=0, atol=0)
+    assert not after.fresh.any()
+
+
+def test_a_state_that_is_not_finite_restarts_at_rest_in_the_middle_of_the_range():
+    safety = SafetyFilter(LIMITS)
+    good = safety.initial_state(READY, 0.1 * LIMITS.velocity, 0.2 * LIMITS.acceleration)
+    assert float(good.dt) == pytest.approx(0.001)
+    assert bool(good.fresh)
+    longest = safety.config.longest_step
+    lost = dataclasses.replace(
+        good,
+        velocity=torch.full_like(READY, torch.nan),
+        acceleration=torch.full_like(READY, torch.inf),
+        position=torch.full_like(READY, torch.nan),
+        too_fast=torch.tensor(torch.nan).double(),
+    )
+    found = safety.restored(lost)
+    torch.testing.assert_close(found.position, LIMITS.middle)
+    for rest in (found.velocity, found.acceleration, found.too_fast):
+        assert not rest.any()
+    kept = safety.restored(good)
+    for name in ("velocity", "acceleration", "position", "dt"):
+        assert torch.equal(getattr(kept, name), getattr(good, name))
+    for dt, valid in ((longest, True), (1.001 * longest, False), (0.0, False), (1e-4, True)):
+        state = dataclasses.replace(good, dt=torch.tensor(dt, dtype=torch.float64))
+        assert float(safety.restored(state).dt) == pytest.approx(dt if valid else 0.001)
+        # So with the step of an irregular clock.
+        _, after, report = safety.step(
+            good, READY, 0.1 * LIMITS.velocity, torch.tensor(dt, dtype=torch.float64)
+        )
+        assert report.acted("invalid") != valid
+        assert float(after.dt) == pytest.approx(dt if valid else 0.001)
+    safety.step(good, READY, READY, longest)
+
+
+@pytest.mark.parametrize(("beyond", "flagged"), [(1e-7, False), (1e-5, True)])
+def test_an_excess_above_a_millionth_is_reported(beyond, flagged):
+    J = panda.jacobian(READY)
+    u = torch.linspace(0.2, -0.3, 7, dtype=torch.float64)
+    speed = float((J[:3] @ u).norm())
+    config = SafetyConfig(tcp_speed=0.3)
+    safety = SafetyFilter(LIMITS, config)
+
+    def flags(u, **given):
+        state = safety.initial_state(READY, u.clone())
+        return safety.step(state, READY, u, 0.001, jacobian=J, **given)[2]
+
+    near = torch.tensor(0.5, dtype=torch.float64)
+    safe = float(config.separation.highest_speed(near))
+    assert 0 < safe < 0.3
+    report = flags((1 + beyond) * safe / speed * u, human_distance=near)
+    assert bool(report.acted("separation")) == flagged
+    alone = torch.zeros_like(u)
+    alone[6] = -(1 + beyond) * (1 - config.velocity_margin) * LIMITS.velocity[6]
+    assert bool(flags(alone).acted("velocity")) == flagged
+    # A person so near that nothing may move is reported in any case.
+    for distance, stops in ((0.01, True), (0.5, False)):
+        near = torch.tensor(distance, dtype=torch.float64)
+        assert bool(flags(0 * u, human_distance=near).acted("separation")) == stops
