@@ -299,6 +299,19 @@ def test_settings_out_of_range_are_refused(name: str, value: float):
         ConstraintConfig(**{name: value})
 
 
+def test_one_step_of_the_solver_is_enough_for_one_limit():
+    J, still = panda.jacobian(panda.ready), torch.zeros(7, dtype=DOUBLE)
+    wide = torch.full((7,), 9.0, dtype=DOUBLE)
+    upper = wide.clone()
+    upper[2] = -0.1
+    found = constrained(still, still, J, -wide, upper, None, ConstraintConfig(steps=1))
+    assert found.solved
+    assert float(found.joint_velocity[2]) == pytest.approx(-0.1)
+    torch.testing.assert_close(
+        J @ found.joint_velocity, torch.zeros(6, dtype=DOUBLE), rtol=0, atol=1e-6
+    )
+
+
 class TestInTheFilter:
     """`SafetyConfig.constraints`."""
 
@@ -453,7 +466,7 @@ class TestInTheFilter:
             "approach_speed": torch.zeros(3, 1, dtype=DOUBLE),
         }
         bad = {key: x.clone() for key, x in parts.items()}
-        bad[name][1] = value
+        bad[name][1].view(-1)[0] = value
         state = safety.initial_state(q, torch.full((3, 7), -0.5, dtype=DOUBLE))
         arguments = (state, q, state.velocity, 0.01)
         given = {"jacobian": panda.jacobian(q)}

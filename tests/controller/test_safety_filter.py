@@ -450,3 +450,30 @@ def test_an_excess_above_a_millionth_is_reported(beyond, flagged):
     for distance, stops in ((0.01, True), (0.5, False)):
         near = torch.tensor(distance, dtype=torch.float64)
         assert bool(flags(0 * u, human_distance=near).acted("separation")) == stops
+
+
+@pytest.mark.parametrize(("braking", "jitter"), [(0.3, 0.0), (1.0, 0.2), (0.6, 0.1)])
+def test_the_driver_uses_a_part_of_acceleration_and_jerk_and_its_steps_vary(braking, jitter):
+    dt, joint = 0.001, 5
+    safety = SafetyFilter(LIMITS, SafetyConfig(braking=braking, jitter=jitter))
+    u = torch.zeros(7, dtype=torch.float64)
+    u[joint] = 2.0
+    state, speeds = safety.initial_state(READY), [0.0, 0.0]
+    for _ in range(60):
+        v, state, _ = safety.step(state, READY, u, dt)
+        speeds.append(float(v[joint]))
+    a = torch.tensor(speeds, dtype=torch.float64).diff() / dt
+    usable = braking * (1 - jitter)
+    for found, limit in ((a, LIMITS.acceleration), (a.diff() / dt, LIMITS.jerk)):
+        assert float(found.abs().max()) == pytest.approx(usable * float(limit[joint]), rel=1e-6)
+
+
+def test_a_load_of_which_one_coordinate_is_unknown_brakes_its_arm_alone():
+    safety, u = SafetyFilter(panda), 0.1 * torch.ones(2, 7, dtype=torch.float64)
+    load = torch.tensor([[0.0, 0.0, 0.1], [torch.nan, 0.0, 0.1]], dtype=torch.float64)
+    q = READY.expand(2, 7)
+    state, J = safety.initial_state(q, u), panda.jacobian(q)
+    v, _, report = safety.step(state, q, u, 0.002, jacobian=J, load=load)
+    assert report.acted("invalid").tolist() == [False, True]
+    torch.testing.assert_close(v[0], u[0])
+    assert (v[1] < u[1]).all()
