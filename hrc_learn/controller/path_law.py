@@ -196,7 +196,7 @@ class PathLaw:
         """Null-space velocity that leaves the task its margin before the joint limits."""
         gives_way = null_space_giving_way(J, task, null, *margin)
         gives_way = apply_where(
-            (gives_way != null).any(-1),
+            (gives_way - null).norm(dim=-1) > 0,
             lambda part: self._slowdown(*part).unsqueeze(-1) * part[1],
             (q, gives_way),
             gives_way,
