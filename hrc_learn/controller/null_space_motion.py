@@ -319,9 +319,8 @@ def fraction_kept(
         rest: Length below which a velocity counts as rest.
     """
     square = torch.linalg.vecdot(before, before)
-    moving = square >= rest**2
-    along = torch.linalg.vecdot(before, after) / torch.where(moving, square, 1.0)
-    return torch.where(moving, along, 1.0).clamp(0.0, 1.0)
+    along = torch.linalg.vecdot(before, after) / square
+    return torch.where(square >= rest**2, along, 1.0).clamp(0.0, 1.0)
 
 
 def fraction_in_null_space(
@@ -336,8 +335,8 @@ def fraction_in_null_space(
     square = torch.linalg.vecdot(requested, requested)
     # For an orthogonal projection N, |N w|^2 = w^T N w.
     inside = torch.linalg.vecdot(requested, projected).clamp(min=0)
-    fraction = (inside / torch.where(square > 0, square, 1.0)).sqrt()
-    return torch.where((square > 0) & (fraction < _ACROSS), fraction, 1.0)
+    fraction = (inside / square).sqrt()  # not a number, and not below a tenth, at rest
+    return torch.where(fraction < _ACROSS, fraction, 1.0)
 
 
 def limiting_joint(

@@ -477,3 +477,27 @@ def test_a_load_of_which_one_coordinate_is_unknown_brakes_its_arm_alone():
     assert report.acted("invalid").tolist() == [False, True]
     torch.testing.assert_close(v[0], u[0])
     assert (v[1] < u[1]).all()
+
+
+@shapes_unchecked()  # for speed
+def test_each_arm_of_a_batch_is_capped_by_its_own_points():
+    """Some are far below the cap, some meet it only by the end of their load."""
+    safety, rng = SafetyFilter(panda, SafetyConfig(tcp_speed=0.25)), sampling.generator(5)
+    q = READY + 0.3 * torch.randn(5, 7, generator=rng, dtype=torch.float64)
+    scale = torch.tensor([0.02, 0.2, 0.5, 1.0, 2.0], dtype=torch.float64)[:, None]
+    u = scale * torch.randn(5, 7, generator=rng, dtype=torch.float64)
+    load = 0.3 * torch.randn(5, 3, generator=rng, dtype=torch.float64)
+    state, J = safety.initial_state(q), panda.jacobian(q)
+    alone = [safety.initial_state(x) for x in q]
+    near = torch.tensor([2.0, 0.6, 2.0, 0.3, 0.5], dtype=torch.float64)
+    for _ in range(20):
+        v, state, report = safety.step(
+            state, q, u, 0.01, jacobian=J, load=load, human_distance=near
+        )
+        for k in range(5):
+            given = {"jacobian": J[k], "load": load[k], "human_distance": near[k]}
+            one, alone[k], told = safety.step(alone[k], q[k], u[k], 0.01, **given)
+            torch.testing.assert_close(v[k], one, rtol=0, atol=1e-12)
+            assert torch.equal(told.flags, report.flags[k])
+    capped = report.acted("tcp_speed") | report.acted("separation")
+    assert 0 < capped.sum() < 5
