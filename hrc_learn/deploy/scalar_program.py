@@ -353,6 +353,14 @@ class _Unroller:
         weights = self._each("exp", self._each("sub", x, self.aten_amax(x, [dim], True)))
         return self._each("div", weights, self.aten_sum(weights, dim, True))
 
+    def aten_logsumexp(self, x: Tensor, dim: list[int], keepdim: bool = False) -> Tensor:
+        most = self.aten_amax(x, dim, True)
+        finite = self._each("lt", self._each("abs", most), math.inf)
+        most = self._each("select", finite, most, 0.0)
+        weights = self._each("exp", self._each("sub", x, most))
+        result = self._each("add", most, self._each("log", self.aten_sum(weights, dim, True)))
+        return result if keepdim else result.squeeze(dim)
+
     def _best(self, better: str, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
         """Position of the first best element along an axis; NaN is better than any number."""
         first, *others = x.unbind(dim)

@@ -40,6 +40,7 @@ def operations(x: Tensor) -> list[Tensor]:
         torch.linalg.vector_norm(a, dim=0)[None], torch.linalg.vecdot(a, b, dim=0)[None],
         torch.linalg.vector_norm(a, ord=math.inf, dim=0)[None],
         a.softmax(0), a.argmax(0)[None].to(x.dtype),
+        a.logsumexp(0, keepdim=True), a.logsumexp(0)[None],
         a.argmin(0, keepdim=True).to(x.dtype), a.gather(0, b.argmax(0, keepdim=True)),
         filled(a), a.flip(0), a.roll(3, 0), torch.stack([a, b], 1).reshape(16, *a.shape[1:]),
         torch.nn.functional.pad(a.movedim(0, -1), (1, 2)).movedim(-1, 0),
