@@ -310,13 +310,14 @@ def test_a_draft_is_on_disk_until_it_is_saved_or_discarded(folder):
         for k in range(count):
             now[0] = k / FPS
             recorder.add(frame(k))
-        recorder._thread.submit(int).result()  # wait for the thread
+            recorder._thread.submit(int).result()  # wait for the thread
 
     def drafted():
         left = folder.with_name("copy.recording")
         shutil.copytree(folder.with_name("demos.recording"), left)
         try:
-            return [len(demo) for demo in load_demos(recover_dataset(left.with_suffix("")))]
+            demos = load_demos(recover_dataset(left.with_suffix("")))
+            return [(len(demo), demo.task) for demo in demos]
         except DatasetError:
             return []
         finally:
@@ -327,8 +328,11 @@ def test_a_draft_is_on_disk_until_it_is_saved_or_discarded(folder):
         show(recorder, 10)
         assert drafted() == []  # not yet two seconds
         recorder.handle("discard")
-        show(recorder, 16)
-        assert drafted() == [11]
+        show(recorder, 20)
+        assert drafted() == [(11, UNNAMED)]
+        recorder.handle("discard")
+        show(recorder, 22)  # two seconds later there is another
+        assert drafted() == [(21, UNNAMED)]
         recorder.handle("discard")
         recorder._thread.submit(int).result()
         assert drafted() == []

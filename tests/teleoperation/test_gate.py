@@ -160,6 +160,83 @@ def test_who_leaves_leads_no_more(control):
     assert control.view("d")["role"] == "leads"  # alone
 
 
+def after(time):
+    return math.nextafter(time, math.inf)
+
+
+def test_times_count_up_to_their_very_end(clock):
+    control = Control(0.25, 0.5, clock=clock)
+    control.join("a")
+    for time, present, gone in (
+        (0.25, True, False),
+        (after(0.25), False, False),
+        (0.5, False, False),
+        (after(0.5), False, True),
+    ):
+        clock.time = time
+        assert (control.present, control.gone) == (present, gone)
+    for lag, present in ((0.5, True), (after(0.5), False)):
+        control.hear("a", lag=lag)
+        assert (control.present, control.gone) == (present, not present)
+
+
+@pytest.mark.parametrize(
+    ("silence", "lag", "slow"),
+    [(0.25, 0.25, False), (after(0.25), 0.0, True), (0.0, after(0.25), True)],
+)
+def test_slow_is_silence_or_half_of_the_longest_lag_and_is_told_for_three_seconds(
+    clock, silence, lag, slow
+):
+    control = Control(0.25, 0.5, clock=clock)
+    assert control.slow == (0, 0)
+    control.join("a")
+    clock.time = silence
+    control.hear("a", lag=lag)
+    assert control.slow == ((silence, lag) if slow else (0, 0))
+    clock.time = silence + 3.0
+    assert control.slow == ((silence, lag) if slow else (0, 0))
+    clock.time = after(silence + 3.0)
+    assert control.slow == (0, 0)
+
+
+def test_whoever_asked_first_leads_after_ten_idle_seconds(control, clock):
+    for client in "abc":
+        control.join(client)
+    assert not control.view("b")["asked"]
+    for time, client in ((1.0, "b"), (2.0, "c"), (3.0, "b"), (3.0, "a"), (3.0, "nobody")):
+        clock.time = time
+        control.ask(client)
+    clock.time = 10.5
+    assert control.act("a", idle=True)
+    clock.time = 11.0
+    assert control.act("b")
+    control.hand_over("b")
+    control.hand_over("c")  # nobody has asked
+    assert not control.view("a")["taken"]
+    control.ask("a")  # it is free
+    assert control.view("a") == {
+        "role": "leads",
+        "taken": True,
+        "asked": False,
+        "may_lead": True,
+    }
+
+
+def test_clients_that_only_watch_never_lead(control):
+    control.join("a", may_lead=False)
+    control.hear("nobody")
+    nothing = {"role": "watches", "taken": False, "asked": False}
+    assert control.view("a") == nothing | {"may_lead": False}
+    assert control.view("nobody") == nothing | {"may_lead": False}
+    control.join("b")
+    control.ask("a")
+    assert not control.view("b")["asked"]
+    control.leave("b")
+    assert not control.view("a")["taken"]
+    control.leave("nobody")
+    assert control.people == 1
+
+
 def test_times_make_sense():
     with pytest.raises(ValueError, match="silence must be positive"):
         Control(silence=1.0, timeout=0.5)

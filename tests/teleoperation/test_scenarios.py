@@ -5,10 +5,12 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import World
 from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
+from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 from hrc_learn.teleoperation.scenarios import (
     Grasping,
@@ -190,3 +192,45 @@ def test_the_picture_holds_table_and_cabinet():
     corners = np.array([[0.0, 0.3, 0.0], [0.5, 0.8, 0.0], [0.6, 0.0, 0.35]])
     shelves = np.array([[0.4, config.cabinet.front, h] for h in (0.12, 0.36, 0.60)])
     assert camera.in_view(np.vstack([corners, shelves])).all()
+
+
+def test_a_grasp_succeeds_if_the_object_is_held_and_lifted_by_half_of_15_centimetres():
+    grasping = Grasping()
+    workplace = grasping.workplace
+    world, item = World(workplace.scene), workplace.scene.objects[0]
+    hover = workplace.hover()
+    low = torch.tensor([0.0, 0.0, max(item.half_size)], dtype=torch.float64)
+    for height, held, succeeds in (
+        (0.073, True, False),
+        (0.077, True, True),
+        (0.077, False, False),
+    ):
+        tool = Pose(hover.position.clone(), hover.orientation)
+        tool.position[2] = height + low[2]
+        q = panda.inverse(tool, near=workplace.hover_joints()).numpy()
+        world.hold(item.name, q)
+        if not held:
+            pose = world.object_pose(item.name)
+            world.reset(workplace.home_joints().numpy(), {item.name: pose})
+        bottom = world.object_pose(item.name)[2, 3] - max(item.half_size)
+        assert bottom == pytest.approx(height, abs=1e-3)
+        assert world.holds(item.name) == held
+        assert grasping.succeeded(world) == succeeds
+
+
+def test_the_gripper_closes_after_the_approach_and_the_object_lies_on_the_table():
+    grasping = Grasping()
+    world = World(grasping.workplace.scene)
+    item = grasping.workplace.scene.objects[0]
+    shown = grasping.begin(world, np.random.default_rng(0))
+    place = world.object_pose(item.name)[:3, 3]
+    assert place[2] - item.half_size[2] == pytest.approx(world.table_top)
+    for time, width in ((0.0, OPEN), (3.99, OPEN), (4.0, CLOSED), (4.7, CLOSED), (7.2, CLOSED)):
+        state = ArmState(
+            time=time,
+            joint_position=READY,
+            joint_velocity=np.zeros(7),
+            gripper_width=0.0,
+        )
+        assert shown.read(state).gripper == width
+    assert grasping.duration == pytest.approx(7.2)
