@@ -257,6 +257,35 @@ class _Posture:
         )
 
 
+def touched_place(
+    before: Place, above: Explanation, hand: Explanation, none: float, config: TouchConfig
+) -> Place:
+    """Place that is touched, judged by the evidence for each.
+
+    Args:
+        before: Place that was touched last.
+        above: Force at the elbow.
+        hand: Force at the hand.
+        none: Evidence that nothing is touched.
+        config: Thresholds.
+    """
+    likelier = hand.evidence - above.evidence
+    evidence = max(above, hand).evidence - none
+    # Once touched, half of the force is enough, as long as something tells of it and it is
+    # not far likelier to be elsewhere.
+    stays = {
+        "nothing": False,
+        "elbow": likelier < _CHANGES and above.size > 0.5 * config.elbow_force,
+        "hand": likelier > -_CHANGES and hand.size > 0.5 * config.hand_force,
+    }
+    sure = evidence > config.evidence
+    if evidence > 0 and stays[before]:
+        return before
+    if sure and likelier < 0 and above.size > config.elbow_force:
+        return "elbow"
+    return "hand" if sure and likelier > _SURE and hand.size > config.hand_force else "nothing"
+
+
 class Touch(Human):
     """Person that pushes the arm itself.
 
@@ -313,7 +342,9 @@ class Touch(Human):
         if meets:  # whatever the hand meets says nothing of the elbow
             unknown = unknown + arm.jacobian.T @ np.diag(_MET**2) @ arm.jacobian
         above, hand = arm.explained(self._felt, unknown)
-        self._look(above, hand, log_density(self._felt, unknown))
+        none = log_density(self._felt, unknown)
+        self.place = touched_place(self.place, above, hand, none, config)
+        self.force = {"elbow": above.force, "hand": hand.force}.get(self.place, np.zeros(3))
         self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
         if self.place == "hand" and not meets:
             self._pushed = self._time
@@ -342,29 +373,6 @@ class Touch(Human):
         self._width = state.gripper_width
         since = state.time - self._fingers_moved
         return self._expected or since < self._config.gripper_settles
-
-    def _look(self, above: Explanation, hand: Explanation, none: float) -> None:
-        """See where the arm is touched; `none` is the evidence that it is not."""
-        config, before = self._config, self.place
-        likelier = hand.evidence - above.evidence
-        evidence = max(above, hand).evidence - none
-        # Once touched, half of the force is enough, as long as something tells of it and it is
-        # not far likelier to be elsewhere.
-        stays = {
-            "nothing": False,
-            "elbow": likelier < _CHANGES and above.size > 0.5 * config.elbow_force,
-            "hand": likelier > -_CHANGES and hand.size > 0.5 * config.hand_force,
-        }
-        sure = evidence > config.evidence
-        if evidence > 0 and stays[before]:
-            self.place = before
-        elif sure and likelier < 0 and above.size > config.elbow_force:
-            self.place = "elbow"
-        elif sure and likelier > _SURE and hand.size > config.hand_force:
-            self.place = "hand"
-        else:
-            self.place = "nothing"
-        self.force = {"elbow": above.force, "hand": hand.force}.get(self.place, np.zeros(3))
 
     def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
         """Null-space torques [N m], faded in above the dead band."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 
 from hrc_learn.geometry import quaternion
@@ -15,29 +16,17 @@ from hrc_learn.teleoperation.demonstration_recorder import RecordingQuality, pre
 from hrc_learn.teleoperation.devices import KeyboardState, deflection, rumble_strength
 from hrc_learn.teleoperation.page_scene import box_edges
 from hrc_learn.teleoperation.region_editor import meet_box, meet_plane, region_over, view_ray
-from hrc_learn.teleoperation.touch import Explanation, TorqueBias, _Posture
+from hrc_learn.teleoperation.touch import (
+    Explanation,
+    TorqueBias,
+    TouchConfig,
+    touched_place,
+)
 
 pytestmark = pytest.mark.simulation
 
 READY = panda.ready
 JACOBIAN = panda.jacobian(READY).numpy()
-
-
-def test_a_posture_has_the_jacobian_of_the_elbow_and_the_null_space():
-    origins, jacobian = panda.joint_origins_and_jacobian(READY)
-    arm = _Posture.of(origins.numpy(), jacobian.numpy())
-    np.testing.assert_allclose(
-        arm.elbow, panda.joint_jacobian(READY, 4).numpy()[:3], atol=1e-12
-    )
-    np.testing.assert_allclose(arm.jacobian @ arm.null, 0, atol=1e-12)
-    np.testing.assert_allclose(arm.null.T @ arm.null, np.eye(1), atol=1e-12)
-    # Torques of a force at either place are explained best by it.
-    force = np.array([15.0, -10.0, 5.0])
-    for rows, larger in ((arm.elbow, 0), (arm.jacobian[:3], 1)):
-        found = arm.explained(rows.T @ force, 0.09 * np.eye(7))
-        assert found[larger].evidence > found[1 - larger].evidence + 8
-        np.testing.assert_allclose(found[larger].force, force, atol=3)  # the prior pulls
-    assert max(found) is found[1]
 
 
 def filtered(bias, rows):
@@ -106,24 +95,7 @@ def force(size, evidence):
     ],
 )
 def test_where_the_arm_is_touched(before, above, hand, none, place):
-    touch = Touch(panda)
-    touch.place = before
-    touch._look(force(*above), force(*hand), none)
-    assert touch.place == place
-    expected = {"nothing": 0.0, "elbow": above[0], "hand": hand[0]}[place]
-    assert touch.force.tolist() == [0, expected, 0]
-
-
-@pytest.mark.parametrize(
-    ("size", "gain"), [(6.0, 0), (7.0, 0), (10.5, 1), (14.0, 2), (50.0, 2)]
-)
-def test_the_null_space_follows_from_the_dead_band_to_twice_of_it(size, gain):
-    touch = Touch(panda)
-    origins, jacobian = panda.joint_origins_and_jacobian(READY)
-    arm = _Posture.of(origins.numpy(), jacobian.numpy())
-    touch.force, touch._felt = np.array([0.0, 0, -size]), np.arange(7.0)
-    expected = gain * arm.null @ (arm.null.T @ np.arange(7.0))
-    np.testing.assert_allclose(touch._nullspace_input(arm), expected, atol=1e-12)
+    assert touched_place(before, force(*above), force(*hand), none, TouchConfig()) == place
 
 
 def reading(time, torque=None, width=0.08):
@@ -134,19 +106,6 @@ def reading(time, torque=None, width=0.08):
         gripper_width=width,
         external_torque=np.zeros(7) if torque is None else torque,
     )
-
-
-@pytest.mark.parametrize(
-    ("moved", "after", "meets"),
-    [(0.9e-4, 0.0, False), (1.1e-4, 0.0, True), (-1.1e-4, 0.49, True), (0.01, 0.51, False)],
-)
-def test_fingers_that_move_may_touch_their_object_for_half_a_second(moved, after, meets):
-    touch = Touch(panda)
-    assert not touch._meets_objects(reading(0.0))
-    touch._meets_objects(reading(1.0, width=0.08 + moved))
-    assert touch._meets_objects(reading(1.0 + after, width=0.08 + moved)) == meets
-    touch.tell(Feedback(contact_expected=True))
-    assert touch._meets_objects(reading(9.0, width=0.08 + moved))
 
 
 def held_for(seconds, size, touch=None, dt=0.01):
@@ -169,58 +128,111 @@ def test_a_task_resumes_a_while_after_the_hand_is_released():
     assert not any(one.pause for one in held_for(1.0, 5.0).values())
 
 
+ELBOW = panda.joint_jacobian(READY, 4).numpy()[:3]
+HAND = JACOBIAN[:3]
+
+
+def felt(torques, touch=None, **state):
+    """Touch and its inputs, for torques that follow each other by 10 ms after a second."""
+    touch = touch or Touch(panda)
+    for k in range(100):
+        touch.read(reading(0.01 * k))
+    return touch, [
+        touch.read(replace(reading(1 + 0.01 * k, torque), **state))
+        for k, torque in enumerate(torques)
+    ]
+
+
+@pytest.mark.parametrize(("rows", "place"), [(ELBOW, "elbow"), (HAND, "hand")])
+def test_a_push_is_found_at_its_place_with_its_force(rows, place):
+    push = np.array([15.0, -10.0, 5.0])
+    touch, _ = felt([rows.T @ push] * 40)
+    assert touch.place == place
+    np.testing.assert_allclose(touch.force, push, atol=3)  # the prior pulls
+    touch, _ = felt([rows.T @ push] * 40 + [np.zeros(7)] * 40)
+    assert touch.place == "nothing"
+    assert not touch.force.any()
+
+
+@pytest.mark.parametrize(("size", "whole"), [(10.5, False), (13.0, False), (25.0, True)])
+def test_the_null_space_follows_from_the_dead_band_to_twice_of_it(size, whole):
+    # A strong push first: then half of the dead band is felt.
+    way = ELBOW.T @ np.array([0.8, -0.53, 0.27])
+    pushes = [s * way for s in [25.0] * 40 + [size] * 60]
+    touch, asked = felt(pushes)
+    assert touch.place == "elbow"
+    gain = 2 * min(np.linalg.norm(touch.force) / 7 - 1, 1)
+    assert 0.5 < gain < 1.8 or whole
+    null = scipy.linalg.null_space(JACOBIAN)
+    expected = gain * null @ (null.T @ pushes[-1])
+    # The bias has taken a few per cent of the torques before the touch was sure.
+    np.testing.assert_allclose(asked[-1].nullspace_input, expected, rtol=0.06, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("moved", "meets"), [(0.9e-4, False), (1.1e-4, True), (-1.1e-4, True), (0.01, True)]
+)
+def test_fingers_that_move_may_touch_their_object_for_half_a_second(moved, meets):
+    """A push at the hand, which then counts for nothing; the task resumes after 0.4 s."""
+    push = HAND.T @ np.array([0.0, 0.0, -20.0])
+    touch, _ = felt([push] * 50)
+    paused = [
+        touch.read(reading(1.5 + 0.01 * k, push, width=0.08 + moved)).pause for k in range(100)
+    ]
+    if meets:
+        assert paused.index(False) in (39, 40)
+        assert paused[45:].index(True) + 45 in (50, 51)
+    else:
+        assert all(paused)
+    touch.tell(Feedback(contact_expected=True))
+    asked = [
+        touch.read(reading(2.5 + 0.01 * k, push, width=0.08 + moved)).pause for k in range(50)
+    ]
+    assert asked.index(False) in (39, 40)
+    assert not any(asked[40:])
+
+
 @pytest.mark.parametrize(
     ("sizes", "met"),
-    [((0, 29), False), ((0, 33), True), ((20, 49), False), ((20, 55), True), ((60, 20), True)],
+    [((0, 29), False), ((0, 34), True), ((20, 49), False), ((20, 56), True), ((60, 20), True)],
 )
 def test_a_change_that_no_hand_makes_stops_the_arm(sizes, met):
-    """The change comes from one reading to the next."""
-    touch = Touch(panda)
-    origins, jacobian = panda.joint_origins_and_jacobian(READY)
-    arm = _Posture.of(origins.numpy(), jacobian.numpy())
-    unknown = 0.01 * np.eye(7)
-    way = JACOBIAN[:3].T @ np.array([0.0, 1.0, 0.0])
-    none = force(0.0, 0.0)
-    for time, size in ((1.0, sizes[0]), (1.01, sizes[1])):
-        touch._time = time
-        touch._watch_for_collision(arm, size * way, unknown, none, False)
-    assert bool(touch._why) == met
+    """The change comes from one reading to the next; what came before rises slowly."""
+    slow = np.arange(sizes[0] + 1).repeat(2)
+    pushes = [size * HAND[1] for size in (*slow, *[sizes[0]] * 20, sizes[1])]
+    _, asked = felt(pushes)
+    assert not any(one.stop for one in asked[:-1])
+    assert asked[-1].stop.startswith("something has met the arm, with ") == met
     if met:
-        change = abs(sizes[1] - sizes[0])
-        number = float(touch._why.split("with ")[1].split()[0])
-        assert number == pytest.approx(change, abs=2)
-    # Where the gripper meets its object there may be any change, but not any force.
-    other = Touch(panda)
-    for time, size in ((1.0, sizes[0]), (1.01, sizes[1])):
-        other._time = time
-        other._watch_for_collision(arm, size * way, unknown, none, True)
-    assert other._why == ""
-    for size, stops in ((109.0, False), (111.0, True)):
-        other._watch_for_collision(arm, 0 * way, unknown, force(size, 0.0), True)
-        assert bool(other._why) == stops
+        number = float(asked[-1].stop.split("with ")[1].split()[0])
+        assert number == pytest.approx(abs(sizes[1] - sizes[0]), abs=3)
+    # Where the gripper meets its object there may be any change.
+    touch = Touch(panda)
+    touch.tell(Feedback(contact_expected=True))
+    assert not any(one.stop for one in felt(pushes, touch)[1])
 
 
-def test_a_rise_that_takes_longer_is_no_collision():
-    touch = Touch(panda)
-    origins, jacobian = panda.joint_origins_and_jacobian(READY)
-    arm = _Posture.of(origins.numpy(), jacobian.numpy())
-    way = JACOBIAN[:3].T @ np.array([0.0, 1.0, 0.0])
-    for k in range(30):
-        touch._time = 1 + 0.01 * k
-        touch._watch_for_collision(arm, 7.0 * k * way, 0.01 * np.eye(7), force(0, 0), False)
-        # Four steps of 10 ms in 40 ms: 28 N.
-        assert touch._why == ""
-    touch = Touch(panda)
-    for k in range(30):
-        touch._time = 1 + 0.01 * k
-        touch._watch_for_collision(arm, 12.0 * k * way, 0.01 * np.eye(7), force(0, 0), False)
-    assert touch._why != ""
-    # It is over once nothing has touched the arm for a while.
-    for later, over in ((0.39, False), (0.41, True)):
-        touch._time = 1.29 + later
-        touch._lately = []
-        touch._watch_for_collision(arm, 0 * way, 0.01 * np.eye(7), force(0, 0), False)
-        assert (touch._why == "") == over
+def test_a_rise_that_takes_longer_is_no_collision_and_one_ends_after_a_while():
+    # Of 40 ms: 7 N in 10 ms make less than 30 N, 12 N make more.
+    _, asked = felt([7.0 * min(k, 12) * HAND[1] for k in range(30)])
+    assert not any(one.stop for one in asked)
+    pushes = [12.0 * min(k, 7) * HAND[1] for k in range(20)] + [np.zeros(7)] * 60
+    stops = [k for k, one in enumerate(felt(pushes)[1]) if one.stop]
+    assert 3 <= stops[0] <= 4
+    assert stops == [*range(stops[0], stops[-1] + 1)]
+    # The fall at 20 is as sudden for 40 ms, then 0.4 s pass without a touch.
+    assert 20 + 40 <= stops[-1] <= 20 + 4 + 40
+
+
+def test_a_force_above_110_newtons_stops_the_arm_however_slowly_it_came():
+    touch, sizes, stops = Touch(panda), [], []
+    felt([], touch)
+    for k in range(130):
+        stops.append(touch.read(reading(1 + 0.01 * k, float(k) * HAND[1])).stop)
+        sizes.append(np.linalg.norm(touch.force))
+    first = next(k for k, stop in enumerate(stops) if stop)
+    assert sizes[first - 1] <= 110 < sizes[first]
+    assert stops[first] == f"something holds the arm with {sizes[first]:.0f} N"
 
 
 def quality(stamps, states=None, arrivals=None, chain=None, fps=20, gripper=0.0, touching=()):
