@@ -113,6 +113,20 @@ def test_the_most_typical_episode_is_shown_next_to_others(unchanged):
     assert distance[shown["usual"]] == min(distance.values())
 
 
+def test_an_episode_that_is_broken_or_cannot_be_read_is_not_typical(ranking, tmp_path):
+    ordered = sorted(ranking.episodes, key=lambda q: q.measures["distance"])
+    first, second, third, *_ = ordered
+    for without, usual in (
+        ([replace(first, broken=True), second, third], second),
+        ([replace(first, measures={}), second, third], second),
+        ([third, second, first], first),
+        ([replace(first, measures={}), replace(second, broken=True)], None),
+    ):
+        less = replace(ranking, episodes=tuple(without))
+        with CurationPage(less, tmp_path / "out", AddressConfig(port=0)) as page:
+            assert page.overview()["usual"] == (None if usual is None else usual.episode)
+
+
 def test_another_site_decides_nothing(unchanged):
     page, client = unchanged
     said = json.dumps({"type": "decide", "episode": 0, "verdict": "reject"})

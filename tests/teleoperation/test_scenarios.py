@@ -1,5 +1,7 @@
 """Scenarios: shown by their expert they succeed, by contacts; left alone they do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -220,8 +222,9 @@ def test_a_grasp_succeeds_if_the_object_is_held_and_lifted_by_half_of_15_centime
 
 def test_the_gripper_closes_after_the_approach_and_the_object_lies_on_the_table():
     grasping = Grasping()
-    world = World(grasping.workplace.scene)
-    item = grasping.workplace.scene.objects[0]
+    scene = grasping.workplace.scene
+    item = replace(scene.objects[0], half_size=(0.02, 0.03, 0.05))  # another than expected
+    world = World(replace(scene, objects=(item, *scene.objects[1:])))
     shown = grasping.begin(world, np.random.default_rng(0))
     place = world.object_pose(item.name)[:3, 3]
     assert place[2] - item.half_size[2] == pytest.approx(world.table_top)
