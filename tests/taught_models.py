@@ -17,11 +17,12 @@ def teach(folder: Path) -> tuple[VisualServoSkill, PlacingSkill]:
     placing, servoing = folder / "placing_demos", folder / "servoing_demos"
     done(
         *("record", "placing", "--out", placing, "--episodes", 1),
-        *("--config", "demonstration.duration=10"),
+        *("--config", "demonstration.duration=7", "demonstration.settle=0.5"),
     )
     done(
         *("record", "servoing", "--out", servoing, "--episodes", 3),
-        *("--config", "demonstration.duration=4", "--json", folder / "servoing.json"),
+        *("--config", "demonstration.duration=3", "demonstration.settle=0.5"),
+        *("--json", folder / "servoing.json"),
     )
     assert json.loads((folder / "servoing.json").read_text())["episodes"] == 3
     done("fit", "--dataset", placing, "--out", folder / "placing")
