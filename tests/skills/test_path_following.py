@@ -77,9 +77,9 @@ def transfer():
 
 
 @cache
-def along_transfer(strength, begin):
+def along_transfer(strength):
     """A transfer with a push until 2.5 s, shared by tests that only read it."""
-    return pushed_along(transfer(), strength * PUSH, (begin, 2.5))
+    return pushed_along(transfer(), strength * PUSH, (0.5, 2.5))
 
 
 def hand_off(cell):
@@ -94,7 +94,7 @@ def hand_off(cell):
 
 def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_goes_on():
     path = transfer()
-    free, pushed = along_transfer(0.0, 0.5), along_transfer(1.0, 0.5)
+    free, pushed = along_transfer(0.0), along_transfer(1.0)
     elbows = [
         panda.link_poses(torch.from_numpy(cell.log["joint_position"][: len(path)])).position
         for cell in (free, pushed)
@@ -218,7 +218,7 @@ def test_joints_stay_beside_the_path_if_wanted():
 def test_nobody_pushes_the_arm_into_what_is_around_it():
     """A wall where the elbow would be pushed to; the hand goes on all the same."""
     path = transfer()
-    free = along_transfer(1.0, 0.5)
+    free = along_transfer(1.0)
     reached = panda.link_poses(torch.from_numpy(free.log["joint_position"])).position[:, 3]
     middle, start = reached[reached[:, 1].argmax()], reached[0]
 
@@ -285,7 +285,7 @@ def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
 def test_the_path_waits_where_the_arm_aside_would_meet_something():
     """A wall across the way of the elbow that is pushed aside, but not of the planned one."""
     path = transfer()
-    free, pushed = along_transfer(0.0, 0.5), along_transfer(1.0, 0.2)
+    free, pushed = along_transfer(0.0), along_transfer(1.0)
 
     def elbow(cell):
         return panda.link_poses(torch.from_numpy(cell.log["joint_position"])).position[:, 3]
@@ -296,7 +296,7 @@ def test_the_path_waits_where_the_arm_aside_would_meet_something():
     def clearance(q):
         return (panda.link_poses(q).position[..., 3, :] - aside).norm(dim=-1) - 0.05
 
-    kept = pushed_along(path, PUSH, (0.2, 2.5), clearance=clearance)
+    kept = pushed_along(path, PUSH, (0.5, 2.5), clearance=clearance)
     assert clearance(torch.from_numpy(pushed.log["joint_position"])).min() < 0
     assert clearance(torch.from_numpy(kept.log["joint_position"])).min() > 0.015
     q = torch.from_numpy(kept.log["joint_position"])
