@@ -381,7 +381,7 @@ def _searched(
     """Cameras, dampings and information after Levenberg-Marquardt steps."""
 
     def cost_of(candidates: Tensor) -> Tensor:
-        seen, _ = marker_pixels(candidates, pose)
+        seen, _ = pixels_and_depth(candidates, marker_points(candidates, pose))
         misfit = (weight * (pixel - seen).square().sum(-1)).sum(-1)
         return misfit + (_from_prior(candidates, prior) / spread).square().sum(-1)
 
