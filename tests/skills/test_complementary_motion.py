@@ -12,12 +12,24 @@ from hrc_learn.controller.joint_path import FAR_ASIDE
 from hrc_learn.controller.null_space_motion import YieldingConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
-from hrc_learn.skills import ComplementaryMotion, joint_line
+from hrc_learn.skills import ComplementaryMotion, complementary_motion, joint_line
 
 pytestmark = pytest.mark.simulation
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def usual_steps():
+    """Marks tests whose loop makes five steps for one of the policy, as a user's does."""
+
+
+@pytest.fixture(autouse=True)
+def coarse_steps(monkeypatch, request):
+    """Two steps of the loop for one of the policy: they show the same in half the time."""
+    if "usual_steps" not in request.fixturenames:
+        monkeypatch.setattr(complementary_motion, "_STEP", DT / 2)
 
 
 class Pusher(Human):
@@ -89,6 +101,7 @@ def test_what_nobody_pushes_is_handed_on_as_it_is():
     assert openings == widths.tolist()
 
 
+@pytest.mark.usefixtures("usual_steps")
 def test_elbow_goes_aside_and_back_while_the_hand_goes_on():
     wishes = line(seconds=3.0, still=5.5)
     postures, joints, _ = followed(wishes, Pusher(-2.0 * SIDEWAYS, 0.5, 1.3))
@@ -170,6 +183,7 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
     assert hand_off(postures, kept)[0] < 1e-6
 
 
+@pytest.mark.usefixtures("usual_steps")
 def test_where_an_arm_aside_cannot_go_on_it_waits_and_then_does_everything_that_was_asked():
     wishes, blocked = line(seconds=3.0, still=4.5), {}
     widths = np.arange(len(wishes), dtype=float)
