@@ -218,7 +218,7 @@ def test_a_marker_never_seen_is_said(demonstrations):
             # Enough to fit a camera, never enough within a second.
             visible=demo.visible & (torch.arange(len(demo.visible)) % 10 == 0),
         )
-        for demo in demonstrations
+        for demo in demonstrations[:3]
     ]
     with pytest.raises(ValueError, match="no demonstration shows"):
         CameraReference.fit(hidden, FPS, IMAGE)
@@ -228,11 +228,11 @@ def test_a_marker_never_seen_is_said(demonstrations):
 def test_placements_tell_episodes_of_a_moved_camera_apart():
     rng = np.random.default_rng(10)
     knocked = moved(np.deg2rad([0.3, -0.4, 0.0]), np.array([0.004, 0.0, 0.0]))
-    places = 6 * [(ROTATION, SHIFT)] + 4 * [knocked] + 2 * [(ROTATION, SHIFT)]
-    demos = [demonstration(rng, place, frames=80) for place in places]
+    places = 4 * [(ROTATION, SHIFT)] + 3 * [knocked] + 2 * [(ROTATION, SHIFT)]
+    demos = [demonstration(rng, place, frames=60) for place in places]
     first, second = camera_placements(demos, IMAGE)
-    assert first.episodes == (0, 1, 2, 3, 4, 5, 10, 11)
-    assert second.episodes == (6, 7, 8, 9)
+    assert first.episodes == (0, 1, 2, 3, 7, 8)
+    assert second.episodes == (4, 5, 6)
     assert first.motion.displacement == pytest.approx(0.0, abs=1.0)
     # Of 0.5 degrees and 4 mm: 1700 px times about 9 mrad, and what the shift adds.
     assert 8.0 < second.motion.displacement < 25.0
@@ -240,8 +240,8 @@ def test_placements_tell_episodes_of_a_moved_camera_apart():
 
 @pytest.mark.simulation
 def test_a_camera_that_stood_still_has_one_placement(demonstrations):
-    (only,) = camera_placements(demonstrations, IMAGE)
-    assert only.episodes == tuple(range(len(demonstrations)))
+    (only,) = camera_placements(demonstrations[:4], IMAGE)
+    assert only.episodes == (0, 1, 2, 3)
 
 
 def shown_at(points, place=(ROTATION, SHIFT)):
