@@ -16,6 +16,7 @@ from hrc_learn.lerobot.episode_recording import add_frame, new_dataset
 from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
 from hrc_learn.lerobot.policy.policy_base import read_episodes
 from hrc_learn.protocols import HumanInput
+from hrc_learn.skills import complementary_motion
 from hrc_learn.teleoperation import ScriptedForce
 
 pytestmark = pytest.mark.simulation
@@ -29,6 +30,8 @@ PULL = ScriptedForce(start=0.5, duration=2.5, towards=(-0.4, 0.6, 0.2), max_forc
 @pytest.fixture
 def pulled(simulated, monkeypatch):
     """A simulated arm whose elbow is pulled aside, or not at all."""
+    # Two steps of the loop for one action in place of five.
+    monkeypatch.setattr(complementary_motion, "_STEP", 0.5 / FPS)
 
     def robot(*pulls, **settings):
         monkeypatch.setattr(person, "scripted_pulls", lambda seed: pulls)
