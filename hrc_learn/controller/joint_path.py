@@ -213,7 +213,7 @@ def _length(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
 
 
 # Samples of a path that a direct return may lead to, and postures checked on the way.
-_RETURN_GOALS, _CHECKED = 20, 50
+_RETURN_GOALS, _CHECKED = 20, 51
 
 
 @pytree
@@ -271,7 +271,7 @@ class DirectReturn:
         if clearance is None:
             clear = torch.ones_like(order, dtype=torch.bool)
         else:
-            fraction = torch.linspace(0, 1, _CHECKED + 1, dtype=goals.dtype)
+            fraction = torch.linspace(0, 1, _CHECKED, dtype=goals.dtype)
             fraction = fraction.reshape(-1, *(1 for _ in goals.shape))
             distance = clearance(torch.lerp(start, goals, fraction))
             ends = distance[[0, -1]].amin(0)

@@ -172,6 +172,7 @@ class TestScaleTask:
     def test_a_cut_that_makes_it_faster_slows_all(self):
         # Asked for 1.25 - 1.2 = 0.05 m/s; cut, the first joint would leave -0.2 m/s.
         assert self.scaled(1.25, 1.5, 0.0) == pytest.approx([0.8333333, 1.0, 0.0])
+        assert self.scaled(-1.25, -1.5, 0.0) == pytest.approx([-0.8333333, -1.0, 0.0])
 
     def test_both_speeds_count_by_their_caps(self):
         # 0.05 m/s and 1 rad/s of (0.25, 1): 1.02. Cut: 0.2 and 0.5: 0.94, which is slower.

@@ -501,3 +501,21 @@ def test_each_arm_of_a_batch_is_capped_by_its_own_points():
             assert torch.equal(told.flags, report.flags[k])
     capped = report.acted("tcp_speed") | report.acted("separation")
     assert 0 < capped.sum() < 5
+
+
+@pytest.mark.parametrize("stops", [{"stop": torch.tensor(True)}, {"u": torch.nan}])
+def test_a_stop_above_the_cap_brakes_as_hard_as_one_without_a_cap(stops):
+    """Where the cap alone would let the arm ease off."""
+    safety, q = SafetyFilter(panda), READY
+    u = torch.tensor([0.9, 0.4, 0, 0, 0, 0, 0], dtype=torch.float64)
+    asked = torch.full_like(u, stops["u"]) if "u" in stops else u
+    stop = {name: value for name, value in stops.items() if name == "stop"}
+    given = {"jacobian": panda.jacobian(q)}
+    speed = float((given["jacobian"][:3] @ u).norm())
+    for factor in (0.5, 0.97, 1.0):
+        safety = SafetyFilter(panda, SafetyConfig(tcp_speed=factor * speed))
+        state = safety.initial_state(q, u)
+        hard, _, _ = safety.step(state, q, asked, 0.004, **stop)
+        capped, _, report = safety.step(state, q, asked, 0.004, **given, **stop)
+        assert not report.acted("tcp_speed")  # the stop is the reason
+        torch.testing.assert_close(capped, hard, rtol=0, atol=0)
