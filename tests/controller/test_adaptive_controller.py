@@ -115,6 +115,8 @@ class TestTheLaw:
             )
             rate = (J @ J.mT @ command.xi_x).norm() / (10**2 + 30**2) ** 0.5
             assert rate <= 4.1
+            if scale > 1:  # 4 1/s, and 1 px/s in any case
+                assert float(rate) == pytest.approx(4 + 1 / math.hypot(10, 30))
 
     def test_the_null_space_is_that_of_the_joints_after_the_delay(self):
         delay, velocity = 0.05, torch.linspace(-0.8, 0.8, 7, dtype=DOUBLE)
@@ -361,3 +363,14 @@ def test_six_joints_are_enough_for_a_pose_and_five_are_not():
     controller = AdaptiveController(arm("ur5e"), estimator, goals)
     assert controller.null_space_dimension() == 0
     assert controller.null_space_dimension("position") == 3
+
+
+def test_a_step_of_the_longest_duration_is_valid():
+    controller, _ = grasping(rng=sampling.generator(6))
+    state = controller.initial_state(POSTURE)
+    longest = controller.config.safety.longest_step
+    for length, valid in ((longest, True), (1.001 * longest, False)):
+        dt = torch.tensor(length, dtype=DOUBLE)
+        command, after = controller.step(state, observe(POSTURE, dt=dt))
+        assert command.safety.acted("invalid") != valid
+        assert bool(after.blending.level > 0) == valid

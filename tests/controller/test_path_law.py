@@ -529,6 +529,22 @@ def test_a_direct_return_is_a_minimum_jerk_motion_after_which_the_path_goes_on(e
         assert float(path.nearest) == math.inf
 
 
+def test_each_arm_of_a_batch_ends_its_own_direct_return():
+    state = state_of(2, progress=70.0, waited=21.0, rate=0.0)
+    direct = replace(
+        state.path.direct_return,
+        progress=torch.tensor([40.0, 40.0]).double(),
+        duration=torch.tensor([1.0, 1.0]).double(),
+        time=torch.tensor([1.02, 0.4]).double(),
+        active=torch.tensor([True, True]),
+    )
+    state = replace(state, path=replace(state.path, direct_return=direct))
+    request = FollowPath(paths=PATHS, path=torch.tensor([1, 1]))
+    _, later = law().follow(state, reading_at(Q.expand(2, 7)), request)
+    assert later.path.direct_return.active.tolist() == [False, True]
+    assert later.path.progress.tolist() == [40.0, 70.0]
+
+
 @pytest.mark.parametrize(
     ("waited", "blocked", "begins"),
     [(20.0, False, False), (20.1, False, True), (30, True, False)],
