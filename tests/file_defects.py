@@ -229,7 +229,9 @@ FILES = {
     "a column of strings": Kind(column(STATE, lambda t: pa.array(["up"] * len(t)))),
     "a column of pickles": Kind(column(STATE, lambda t: pa.array([b"\x80\x04."] * len(t)))),
     "a column of nulls": Kind(
-        column(STATE, lambda t: pa.nulls(len(t), pa.list_(t.schema.field(STATE).type.value_type)))
+        column(
+            STATE, lambda t: pa.nulls(len(t), pa.list_(t.schema.field(STATE).type.value_type))
+        )
     ),
     "a row with a component less": Kind(column(STATE, short_row), local=True),
     "numbers of another type": Kind(
