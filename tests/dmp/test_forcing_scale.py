@@ -306,6 +306,29 @@ def test_motions_that_end_where_they_start_are_refused():
         JointDMP.fit(time, both, 8, scaling="rotation")
 
 
+@pytest.mark.parametrize("scaling", ["paper", "rotation"])
+@pytest.mark.parametrize(("offset", "refused"), [(1.01e-3, False), (0.99e-3, True)])
+def test_ends_must_be_a_thousandth_of_the_range_apart(scaling, offset, refused):
+    """Each demonstration by its own range; in a rotation by the largest of its columns."""
+    s = torch.linspace(0, 1, 60, dtype=torch.float64)
+    way = torch.stack([torch.sin(torch.pi * s), s], dim=-1)
+    paths = torch.stack([way * size for size in (1.0, 50.0)])
+    paths[1, :, 1] *= 0.01 if scaling == "rotation" else 1.0
+    ends = torch.linspace(0, offset, 60, dtype=torch.float64)
+    if scaling == "rotation":
+        # A distance of which the first column is the whole.
+        paths[..., 1] = paths[..., 1] * (1 - s)
+    span = paths[1, :, 0].max()
+    paths[1, :, 0] += span * ends
+    paths[0, :, 0] += 0.1 * s
+    if not refused:
+        JointDMP.fit(TIME[-1] * s, paths, 8, scaling=scaling)
+        return
+    name = "paper" if scaling == "paper" else "rotation"
+    with pytest.raises(ValueError, match=f"demonstration 1: scaling '{name}' divides by"):
+        JointDMP.fit(TIME[-1] * s, paths, 8, scaling=scaling)
+
+
 def test_a_line_cannot_turn():
     with pytest.raises(ValueError, match="2 coordinates or more"):
         JointDMP.fit(TIME, POSITION[:, :1], 8, scaling="rotation")

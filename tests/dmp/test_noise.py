@@ -6,7 +6,7 @@ import torch
 from demo_motions import arm_motion
 from scipy.interpolate import CubicHermiteSpline
 
-from hrc_learn.dmp import JointDMP
+from hrc_learn.dmp import GaussianBasis, JointDMP
 
 
 def recorded(n_samples, noise, seed):
@@ -107,6 +107,24 @@ def test_few_samples_are_joined_by_cubics_with_slopes_of_second_order(count):
     made = JointDMP.fit(s, y, smooth=False).rollout(fine).numpy()["position"][:, 0]
     joined = CubicHermiteSpline(s, y, np.gradient(y, s, edge_order=2))(fine)
     np.testing.assert_allclose(made, joined, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "removed"),
+    [
+        ({}, True),
+        ({"n_basis": 30}, False),
+        ({"basis": GaussianBasis(count=30)}, False),
+        ({"n_basis": 30, "smooth": True}, True),
+        ({"smooth": False}, False),
+    ],
+)
+def test_noise_is_removed_unless_basis_functions_are_chosen(given, removed):
+    s, samples, *_ = recorded(80, 0.01, 0)
+    report = JointDMP.fit(s, samples, **given).fit_report
+    assert (report.noise is not None) == removed
+    if removed:
+        np.testing.assert_allclose(report.noise, 0.01, rtol=0.4)
 
 
 def test_the_shortest_admissible_duration():

@@ -71,6 +71,26 @@ def test_periods_are_found_in_noise():
     assert np.sum(np.abs(np.array(found) - 1.7) < 0.03) >= 9
 
 
+@pytest.mark.parametrize("lag", [7, 20, 33])
+def test_the_period_is_where_the_motion_resembles_itself_first(lag):
+    """Spikes at one distance: the means over what overlaps, of a plain loop."""
+    y = torch.zeros(160, 1, dtype=torch.float64)
+    y[::lag] = 1.0
+    y[1::lag] = 0.5
+    elapsed = torch.arange(160.0, dtype=torch.float64) / 50
+    centred = (y - y.mean(0))[:, 0].numpy()
+    means = [centred[k:] @ centred[: 160 - k] / (160 - k) for k in range(120)]
+    first = next(
+        k
+        for k in range(1, 119)
+        if means[k] >= max(means[k - 1], means[k + 1])
+        and min(means[:k]) < 0
+        and means[k] > 0.5 * max(means[lag - 2 :])
+    )
+    assert first == lag
+    assert fit_rhythmic(elapsed, y).duration.item() == pytest.approx(lag / 50, rel=0.02)
+
+
 def test_a_run_in_goes_over_to_the_rhythm():
     """Swelling from rest, the demonstration is met once it swings in full."""
     time, y = rhythm(duration=8.0, n_samples=900)
