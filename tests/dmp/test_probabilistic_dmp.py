@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -66,6 +68,55 @@ def test_conditioning_agrees_with_the_textbook(distribution):
     torch.testing.assert_close(given.mean.flatten(), expected)
     left = cov - gain @ observe @ cov
     torch.testing.assert_close(given.spread @ given.spread.mT, left, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("dependence", [0.0, 0.6, 1.0])
+def test_given_ends_condition_by_the_dependence(distribution, dependence):
+    """As on dense matrices, with the covariance of weights and ends times the factor."""
+    some = replace(distribution, dependence=dependence)
+    start, goal = torch.tensor([[0.2, -0.1], [1.1, 1.4]], dtype=torch.float64)
+    given = some.at(start, goal)
+    cov = (some.spread @ some.spread.mT).view(*some.mean.shape, *some.mean.shape)
+    rest = cov[:, :-2, :, :-2].reshape(2 * 16, 2 * 16)
+    cross = cov[:, :-2, :, -2:].reshape(2 * 16, 4)
+    ends = cov[:, -2:, :, -2:].reshape(4, 4)
+    gain = cross @ torch.linalg.pinv(ends, rtol=1e-12, hermitian=True)
+    shift = (torch.stack([start, goal], 1) - some.mean[:, -2:]).flatten()
+    moved = some.mean[:, :-2].flatten() + dependence * gain @ shift
+    torch.testing.assert_close(given.mean[:, :-2].flatten(), moved, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(given.mean[:, -2:], torch.stack([start, goal], 1))
+    left = (given.spread @ given.spread.mT).view_as(cov)
+    expected = (rest - dependence**2 * gain @ cross.mT).view(2, 16, 2, 16)
+    torch.testing.assert_close(left[:, :-2, :, :-2], expected, rtol=1e-5, atol=1e-6)
+    assert (left[:, -2:] == 0).all()
+
+
+@pytest.mark.parametrize("n", [3, 4, 7])
+def test_the_dependence_is_what_predicts_held_out_paths_best(n):
+    """Of fewer than four demonstrations it is one."""
+    rng = np.random.default_rng(n)
+    s = S.numpy()[:, None]
+    ends = rng.normal(size=(n, 2, 1, 1))
+    bend = 0.4 * (ends[:, 0] + ends[:, 1]) + 0.6 * rng.normal(size=(n, 1, 1))
+    motions = ends[:, 0] + (ends[:, 1] - ends[:, 0]) * minimum_jerk(S)[:, None].numpy()
+    motions = motions + bend * np.sin(np.pi * s) ** 2
+    batch = JointDMP.fit(2 * S, motions, n_basis=10)
+    found = ProbabilisticDMP.fit(batch).dependence
+    if n < 4:
+        assert found == 1
+        return
+    x = batch.motion.coordinates().detach()[:, 0].numpy()
+    rows = batch.response.evaluate(torch.linspace(0, 1, 30).double())[:, 0, :-2].numpy()
+    paths, ends = x[:, :-2] @ rows.T, x[:, -2:]
+    agree = size = 0.0
+    for i in range(n):
+        rest = np.arange(n) != i
+        design = np.hstack([np.ones((n - 1, 1)), ends[rest] - ends[rest].mean(0)])
+        fit = np.linalg.lstsq(design, paths[rest], rcond=1e-6)[0]
+        predicted = (ends[i] - ends[rest].mean(0)) @ fit[1:]
+        agree += predicted @ (paths[i] - paths[rest].mean(0))
+        size += predicted @ predicted
+    assert found == pytest.approx(np.clip(agree / size, 0, 1), abs=1e-6)
 
 
 def test_via_points_and_via_velocities_are_passed(distribution):
