@@ -110,3 +110,71 @@ def test_gives_up_where_nobody_comes(scene):
     person.begin(0.0)
     lived(world, person, person.hand_over.visit.end + 26.0)
     assert person.hand_over.carried[-1][1] == pytest.approx(world.time, abs=1.5)
+
+
+def until(world, person, condition, most=60.0):
+    """Time at which something happens first [s], within 0.05 s."""
+    last = world.time + most
+    while world.time < last:
+        lived(world, person, world.time + 0.04)
+        if condition():
+            return world.time
+    return None
+
+
+@pytest.fixture
+def waiting(scene):
+    """The person holds the object out, and the robot rests where it was."""
+    world, person = scene
+    person.begin(0.0)
+    lived(world, person, person.hand_over.visit.end + 1.0)
+    return world, person
+
+
+@pytest.mark.parametrize(("distance", "brought"), [(0.049, False), (0.051, True)])
+def test_the_object_is_brought_to_a_hand_that_came_nearer_and_rests(waiting, distance, brought):
+    world, person = waiting
+    shown, moved = person.hand_over, world.time
+    world.tool[1, 3] += distance
+    at = until(world, person, lambda: person.hand_over is not shown, 2.0)
+    assert (at is not None) == brought
+    if brought:
+        # It was seen to rest for half a second, two steps after it moved at the earliest.
+        assert 0.5 < at - moved < 0.7
+
+
+@pytest.mark.parametrize(("speed", "brought"), [(0.019, True), (0.021, False)])
+def test_a_hand_rests_below_20_mm_per_s(waiting, speed, brought):
+    world, person = waiting
+    shown, start = person.hand_over, world.tool[1, 3]
+    world.tool[1, 3] = start + 0.1
+    for _ in range(40):
+        world.time += 0.05
+        world.tool[1, 3] += 0.05 * speed
+        person.update()
+    assert (person.hand_over is not shown) == brought
+
+
+def test_a_grip_of_0_3_s_without_interruption_releases_the_object(waiting):
+    world, person = waiting
+    world.tool[1, 3] += 0.1
+    shown = person.hand_over
+    assert until(world, person, lambda: person.hand_over is not shown, 2.0)
+    held_out = person.hand_over
+    lived(world, person, held_out.visit.end + 0.2)
+    for _ in range(4):
+        world.held = True
+        lived(world, person, world.time + 0.2)
+        world.held = False
+        lived(world, person, world.time + 0.1)
+    assert person.hand_over is held_out
+    world.held, begun = True, world.time
+    at = until(world, person, lambda: person.hand_over is not held_out, 1.0)
+    assert 0.3 < at - begun < 0.45
+
+
+def test_the_object_is_held_out_for_25_s(waiting):
+    world, person = waiting
+    shown, end = person.hand_over, person.hand_over.visit.end
+    at = until(world, person, lambda: person.hand_over is not shown)
+    assert 25.0 < at - end < 25.1
