@@ -40,6 +40,26 @@ def handed(receipt):
     return {"picks": picks, "hand_over": plan}
 
 
+def test_the_worst_placed_object_counts_and_what_was_not_released_does_not():
+    """Boxes 3 mm and 5 mm off on the table, turned by 2 and 1 degrees about the vertical."""
+    poses, picks = {}, []
+    goal = Pose(torch.tensor([0.4, 0.1, 0.3]).double(), gripper_down())
+    placed = (("a", [3e-3, 0], 2.0), ("b", [3e-3, 4e-3], 1.0), ("c", [0.5, 0.5], 40.0))
+    for name, shift, angle in placed:
+        turn = quaternion.exp(torch.tensor([0, 0, math.radians(angle)], dtype=torch.float64))
+        poses[name] = np.eye(4)
+        poses[name][:3, :3] = quaternion.to_matrix(turn).numpy()
+        poses[name][:3, 3] = goal.position.numpy() + np.array([*shift, 0.2])
+        release = None if name == "c" else 1.0
+        item = SimpleNamespace(name=name)
+        picks.append(SimpleNamespace(release=release, item=item, goal=goal))
+    world = SimpleNamespace(object_pose=poses.__getitem__)
+    assert value("place error", picks=picks, world=world) == pytest.approx(5.0)
+    assert value("place tilt", picks=picks, world=world) == pytest.approx(2.0)
+    assert value("place error", picks=picks[2:], world=world) is None
+    assert value("place tilt", picks=picks[2:], world=world) is None
+
+
 def test_a_hand_over_is_measured_from_its_reach_and_left_out_without_one():
     receipt = Receipt(
         recognised=10.5,
