@@ -54,7 +54,8 @@ class ArmLoopConfig(YieldingConfig):
     both; None: a person's push."""
 
     def __post_init__(self) -> None:
-        check_settings(self, fraction=["speed"])
+        super().__post_init__()
+        check_settings(self, positive=["dt"], fraction=["speed"])
 
 
 @pytree

@@ -142,9 +142,9 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     z, lost = _combine(passed[..., :p], now.operators[..., :p]), passed[..., p:]
     zz = (z * z).sum(-1, keepdim=True)
     independent = zz > _DEPENDENT**2 * (c * c).sum(-1, keepdim=True)
-    full = torch.where(independent, excess / zz, math.inf)
+    full = torch.where(independent, excess / torch.where(independent, zz, 1.0), math.inf)
     losing = (now.side != 0) & (lost > 0)
-    ratio = torch.where(losing, now.dual / lost, math.inf)
+    ratio = torch.where(losing, now.dual / torch.where(losing, lost, 1.0), math.inf)
     leaving = ratio.argmin(-1, keepdim=True)
     partial = ratio.gather(-1, leaving)
     length = torch.minimum(full, partial)
@@ -157,7 +157,7 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     v = _column(now.operators, leaving + p)
     direction = torch.where(adds, z, v)
     square = torch.where(adds, zz, (v * v).sum(-1, keepdim=True))
-    scale = torch.where(acts, 1 / square, 0.0)
+    scale = torch.where(acts, 1 / torch.where(acts, square, 1.0), 0.0)
     # A rank-one update: the projector loses the direction of an added limit and gains that of
     # a dropped one; both make the pseudo-inverse orthogonal to it.
     entering = torch.cat([z, lost - enters.to(c.dtype)], dim=-1)

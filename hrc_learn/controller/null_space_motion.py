@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.controller.resolved_rate import scale_null_space
-from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.geometry.numerics import check_settings, null_projection
 from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain
 
 LOOK_AHEAD = 0.15
@@ -78,6 +78,9 @@ class YieldingConfig:
     clearance: float = 0.03
     """Distance from obstacles that a push cannot reduce further [m]: three times the
     calibration errors of base and table."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, positive=["damping", "nullspace_rise", "return_speed"])
 
 
 def guided_elbow_speed(cap: float) -> float:

@@ -335,8 +335,7 @@ class PathLaw:
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
-        lost = torch.zeros_like(aside)
-        fraction = torch.ones_like(path.rate)
+        lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)
         # Joints return where the path waits for them, and once they are let go.
         returns = path.rate <= 0
         if config.after_push == "return":

@@ -458,7 +458,7 @@ class SafetyFilter(nn.Module):
         # The arm has picked up this fraction of the command so far.
         square = torch.linalg.vecdot(command, command)
         along = torch.linalg.vecdot(command, v)
-        fraction = torch.where(square > 0, along / square, 0.0)
+        fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
         v, report = constrained_velocity(
             v,
             command,

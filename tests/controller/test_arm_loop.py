@@ -171,3 +171,9 @@ def test_joints_that_find_no_way_back_return_directly(blocked):
 def test_the_speed_must_be_a_fraction():
     with pytest.raises(ValueError, match="speed must be"):
         ArmLoopConfig(speed=1.5)
+
+
+@pytest.mark.parametrize("name", ["dt", "damping", "nullspace_rise", "return_speed"])
+def test_a_setting_that_is_a_divisor_is_above_zero(name):
+    with pytest.raises(ValueError, match=f"{name} must be positive, but is 0"):
+        ArmLoopConfig(**{name: 0.0})

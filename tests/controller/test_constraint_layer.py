@@ -490,3 +490,29 @@ class TestInTheFilter:
         layered = SafetyFilter(panda.limits, self.config)
         with pytest.raises(ValueError, match="jacobian"):
             layered.step(layered.initial_state(q), q, q, 0.01, distances=near)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 2.0])
+def test_a_constrained_velocity_has_the_slope_of_finite_differences(scale):
+    """A policy can be trained through the filter, also of an arm that nobody moves."""
+    safety = SafetyFilter(panda, SafetyConfig(constraints=ConstraintConfig()))
+    rng = sampling.generator(3)
+    q = panda.ready.double() + 0.1 * torch.randn(30, 7, generator=rng, dtype=DOUBLE)
+    wanted = scale * torch.randn(30, 7, generator=rng, dtype=DOUBLE)
+    near = Distances(
+        distance=torch.full((30, 2), 0.05, dtype=DOUBLE),
+        gradient=torch.randn(30, 2, 7, generator=rng, dtype=DOUBLE),
+        approach_speed=torch.zeros(30, 2, dtype=DOUBLE),
+    )
+    state, J = safety.initial_state(q), panda.jacobian(q)
+
+    def sent(u: Tensor) -> Tensor:
+        return safety.step(state, q, u, 0.01, jacobian=J, distances=near)[0].sum()
+
+    (slope,) = torch.autograd.grad(sent(u := wanted.clone().requires_grad_()), u)
+    assert slope.isfinite().all()
+    if scale:  # an arm at rest has a kink, where differences mean nothing
+        for k in range(7):
+            step = 1e-6 * torch.eye(7, dtype=DOUBLE)[k]
+            difference = (sent(wanted + step) - sent(wanted - step)) / 2e-6
+            torch.testing.assert_close(slope[:, k].sum(), difference, rtol=1e-4, atol=1e-6)
