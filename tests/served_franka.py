@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import pytest
 from franky_servers import READY
 from lerobot.robots import make_robot_from_config
 
@@ -48,6 +50,8 @@ def served_franka(folder: Path, joints=READY, **settings) -> Iterator[ServedFran
         joints: Where the arm is [rad].
         settings: Other ones of the robot.
     """
+    if find_spec("franky") is None:
+        pytest.skip("franky comes with the extra hardware")
     world = World(SceneConfig(objects=()))
     world.reset(joints)
     settings = {"fps": 20.0, "timeout": 600.0} | settings
