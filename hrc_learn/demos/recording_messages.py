@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.recording_files import Field, StreamRead
-from hrc_learn.demos.videos import Image, decode_image
+from hrc_learn.demos.videos import Image, decode_image, rgb_image
 
 _JOINTS = {"position": "joint_positions", "velocity": "joint_velocities"}
 _JOINTS |= {"effort": "joint_efforts"}
@@ -174,7 +174,7 @@ def _decoded(name: str, codec: str, contents: Iterator[tuple[Any, bytes]]) -> It
     image = None
     for _, data in contents:
         for frame in decoder.decode(av.Packet(data)):
-            image = frame.to_ndarray(format="rgb24")
+            image = rgb_image(frame)
         if image is None:
             raise DatasetError("begins without a key frame", key=name)
         yield image
@@ -203,6 +203,4 @@ def _rgb(message: Any, data: bytes, channels: int, form: str) -> np.ndarray:
         image = image.reshape(message.height, message.width, channels)
     if form == "rgb24":
         return image
-    return av.VideoFrame.from_ndarray(np.ascontiguousarray(image), form).to_ndarray(
-        format="rgb24"
-    )
+    return rgb_image(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), form))

@@ -211,7 +211,7 @@ def decode(
                     frame = round((float(image.time or 0.0) - segment.start) * fps)
                     if frame in wanted:  # a second image of a frame is passed over
                         wanted.remove(frame)
-                        yield frame, _rgb(image, size)
+                        yield frame, rgb_image(image, size)
                     if not wanted or frame > run[-1]:
                         break
     except (av.FFmpegError, IndexError) as error:
@@ -248,15 +248,25 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Image:
 
     try:
         with av.open(io.BytesIO(content or b""), "r") as container:
-            image = _rgb(next(container.decode(video=0)), size)
+            return rgb_image(next(container.decode(video=0)), size)
     except (av.FFmpegError, IndexError, StopIteration) as error:
         raise DatasetError(f"holds an image that cannot be decoded ({error})") from error
-    return image
 
 
-def _rgb(image: Any, size: tuple[int, int] | None) -> Image:
-    scaled = {} if size is None else {"height": size[0], "width": size[1]}
-    return image.to_ndarray(format="rgb24", **scaled)
+def rgb_image(image: Any, size: tuple[int, int] | None = None) -> Image:
+    """RGB image of a frame of PyAV.
+
+    Args:
+        image: The frame, an `av.VideoFrame`.
+        size: Height and width to scale to [px]; None keeps the size.
+    """
+    from av.video.reformatter import VideoReformatter
+
+    height, width = size or (image.height, image.width)
+    # Not the one that PyAV keeps: its threads are missing in a process forked after its first
+    # use, such as that of a data loader, which would wait for them for ever.
+    rgb = VideoReformatter().reformat(image, width, height, "rgb24")
+    return rgb.to_ndarray()
 
 
 def subsampled(image: Image) -> Image:

@@ -129,7 +129,9 @@ class CameraModel:
         # Ten steps of the fixed point are enough for common lenses, thirty for wide ones.
         steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         points, lens = pixels.reshape(-1, 1, 2), np.array(self.distortion)
-        found = cv2.undistortPointsIter(points, self.matrix, lens, None, None, steps)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        # OpenCV 5 has one function for both.
+        undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+        found = undistort(points, self.matrix, lens, R=None, P=None, criteria=steps)
         return np.asarray(found).reshape(pixels.shape)
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:

@@ -95,6 +95,7 @@ def test_columns_have_the_types_of_the_library_datasets():
 
 
 def test_tasks_are_the_index_of_their_table(tmp_path):
+    pytest.importorskip("pandas")
     metadata.write_tasks(tmp_path / "tasks.parquet", ["lift", "place"])
     table = pq.read_table(tmp_path / "tasks.parquet").to_pandas()
     assert table.index.name == "task"
