@@ -7,6 +7,7 @@ belongs to simulation and evaluation.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -130,7 +131,7 @@ class CameraModel:
         steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         points, lens = pixels.reshape(-1, 1, 2), np.array(self.distortion)
         # OpenCV 5 has one function for both.
-        undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+        undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
         found = undistort(points, self.matrix, lens, R=None, P=None, criteria=steps)
         return np.asarray(found).reshape(pixels.shape)
 
