@@ -43,16 +43,16 @@ def test_a_file_plays_at_its_own_rate(video):
     with CaptureCamera(video, timeout=0.3) as camera:
         assert isinstance(camera, TimedCamera)
         time.sleep(0.2)  # it begins with the first reading
+        before, seen = time.monotonic(), set()
         assert number_of(camera.read()) == 0
-        begun, seen = time.monotonic() - camera.age, set()
+        begun = before - camera.age  # of the reading: not later than that, if it is held up
 
         def play():
             for _ in range(2000):
                 number = number_of(camera.read())
                 seen.add(number)
-                age = camera.age
                 # Held up after the reading, this thread sees a later time.
-                taken = time.monotonic() - age - begun
+                taken = time.monotonic() - camera.age - begun
                 assert number / RATE - 2e-3 <= taken < number / RATE + 0.2
                 time.sleep(0.01)
 
