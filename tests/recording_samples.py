@@ -1,12 +1,15 @@
 """Recordings in the formats of other programs, and their demonstrations."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 from lerobot_folders import joint_path
 from scipy.spatial.transform import Rotation
 
+from hrc_learn.demos.recording_files import Recording, array_field
 from hrc_learn.demos.recording_import import plan_import
+from hrc_learn.demos.recording_meaning import understand
 from hrc_learn.demos.recording_names import ImportOptions
 
 TIME = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.004, 40))
@@ -81,3 +84,21 @@ def write_video_and_table(path):
             image = np.full((48, 64, 3), 12 * level, np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
+
+
+WAVES = np.stack([np.sin(np.arange(200) / 20 * (k + 1)) for k in range(3)], axis=1)
+
+
+def understood(options=None, hinted=False, names=None, units=None, **arrays):
+    """What the import understands of a recording with these arrays."""
+    fields = {}
+    for name, array in arrays.items():
+        name = name.replace("__", "/")
+        fields[name] = array_field(
+            name,
+            np.asarray(array),
+            names=(names or {}).get(name),
+            unit=(units or {}).get(name, ""),
+        )
+    one = Recording(file=Path("run.npz"), fields=fields)
+    return understand([one], ImportOptions(**(options or {})), hinted)

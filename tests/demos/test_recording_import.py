@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recording_samples import WAVES as Q
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
@@ -15,23 +16,6 @@ from hrc_learn.demos.recording_meaning import understand
 from hrc_learn.demos.recording_names import ImportOptions
 
 pytestmark = pytest.mark.simulation
-
-
-Q = np.stack([np.sin(np.arange(200) / 20 * (k + 1)) for k in range(3)], axis=1)
-
-
-def understood(options=None, hinted=False, names=None, kinds=None, units=None, **arrays):
-    fields = {}
-    for name, array in arrays.items():
-        name = name.replace("__", "/")
-        fields[name] = array_field(
-            name,
-            np.asarray(array),
-            names=(names or {}).get(name),
-            unit=(units or {}).get(name, ""),
-        )
-    one = Recording(file=Path("run.npz"), fields=fields)
-    return understand([one], ImportOptions(**(options or {})), hinted)
 
 
 def test_images_are_read_in_batches_and_cropped():
