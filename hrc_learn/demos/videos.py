@@ -247,7 +247,7 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Image:
     import av
 
     try:
-        with av.open(io.BytesIO(content or b""), "r") as container:
+        with contextlib.closing(av.open(io.BytesIO(content or b""), "r")) as container:
             return rgb_image(next(container.decode(video=0)), size)
     except (av.FFmpegError, IndexError, StopIteration) as error:
         raise DatasetError(f"holds an image that cannot be decoded ({error})") from error
