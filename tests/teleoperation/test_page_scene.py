@@ -1,5 +1,8 @@
 """The page's 3D scene, read back from the file that viser writes of what browsers are sent."""
 
+import asyncio
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from hrc_learn.geometry import Body, Box, Capsule, Pose
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.headset import PEDESTAL
 from hrc_learn.teleoperation.page_operator import HeldGizmo, HeldGizmos
-from hrc_learn.teleoperation.page_scene import PageScene
+from hrc_learn.teleoperation.page_scene import PageScene, _step_back, box_edges
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 viser = pytest.importorskip("viser", reason="the extra `ui` is not installed")
@@ -200,3 +203,135 @@ def test_twin_region_rings_and_arrows_are_shown_when_they_mean_something(made):
     assert not now["/active_region"]["visible"]
     assert not now["/pull"]["visible"]
     assert now["/twin/knobs/joint4"]["color"] == colour(PERSON)
+
+
+def drag(node, phase, start, end):
+    """What viser calls when a browser drags a node."""
+    event = SimpleNamespace(client_id=1, phase=phase, start_position=start, end_position=end)
+    for entry in node._impl.drag_cb:
+        asyncio.run(entry.callback(event))
+
+
+def dragged_nodes(server):
+    """Nodes of the scene that can be dragged, by their names."""
+    known = server.scene._handle_from_node_name
+    return {name: node for name, node in known.items() if getattr(node._impl, "drag_cb", [])}
+
+
+LINKS = Pose(torch.arange(24.0).reshape(8, 3).double(), torch.eye(1, 4).double().repeat(8, 1))
+
+
+@pytest.mark.parametrize(
+    ("parent", "offset"), [("", (0.0, 0.0, 0.0)), ("/twin", (-0.1, 1.3, 0))]
+)
+@pytest.mark.parametrize(("node", "joint"), [("arm/link3/0", 3), ("knobs/joint6", 6)])
+def test_arm_and_twin_are_dragged_at_the_point_that_is_held(
+    server, made, parent, offset, node, joint
+):
+    _, held, _ = made
+    held.links = lambda: LINKS
+    name, start, end = f"{parent}/{node}", np.array([0.5, 0.6, 0.7]), np.array([1.0, 2.0, 3.0])
+    handle = dragged_nodes(server)[name]
+    drag(handle, "start", offset + start, offset + end)
+    ((key, gizmo),) = held.held().items()
+    assert key == (1, name)
+    assert gizmo.joint == joint
+    np.testing.assert_allclose(gizmo.held_at, start - LINKS.position[joint - 1].numpy())
+    np.testing.assert_allclose(gizmo.pointer, end)
+    drag(handle, "update", offset + start, offset + 2 * end)
+    np.testing.assert_allclose(held.held()[key].pointer, 2 * end)
+    np.testing.assert_allclose(held.held()[key].held_at, gizmo.held_at)
+    drag(handle, "end", offset + start, offset + end)
+    assert held.held() == {}
+
+
+@pytest.mark.parametrize("guides", [True, False])
+def test_the_gripper_is_dragged_where_the_end_effector_is_guided(server, guides):
+    server.scene.reset()
+    bodies = [body("hand", capsules=(LINK,)), body("glass", boxes=(GLASS,))]
+    PageScene(server, bodies, [], HeldGizmos(), guides=guides, turns=False)
+    found = {name for name in dragged_nodes(server) if "/arm/" in name}
+    assert found == ({"/arm/hand/0", "/twin/arm/hand/0"} if guides else set())
+
+
+@pytest.mark.parametrize("guides", [True, False])
+def test_the_gizmo_holds_where_it_guides_and_turns_in_any_case(server, guides):
+    server.scene.reset()
+    held = HeldGizmos(links=lambda: LINKS)
+    scene = PageScene(server, [], [], held, guides=guides, turns=True)
+    half = np.sqrt(0.5)
+
+    def dragged(phase, place, turn, client=1):
+        target = SimpleNamespace(
+            name="/end_effector", position=np.array(place), wxyz=np.array(turn)
+        )
+        event = SimpleNamespace(client_id=client, phase=phase, target=target)
+        asyncio.run(scene._gizmo_dragged(event))
+
+    dragged("start", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), client=None)  # by this program
+    assert held.held() == {}
+    assert not held.turning
+    dragged("start", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
+    assert held.turning
+    if guides:
+        ((key, gizmo),) = held.held().items()
+        assert key == (1, "/end_effector")
+        assert gizmo.joint is None
+        np.testing.assert_array_equal(gizmo.held_at, np.zeros(3))
+        np.testing.assert_array_equal(gizmo.pointer, (1.0, 2.0, 3.0))
+    else:
+        assert held.held() == {}
+    dragged("update", (1.5, 2.5, 3.5), (half, 0.0, 0.0, half))
+    np.testing.assert_allclose(held.turn_vector, (0.0, 0.0, np.pi / 2))
+    assert [tuple(g.pointer) for g in held.held().values()] == [(1.5, 2.5, 3.5)] * guides
+    dragged("end", (1.5, 2.5, 3.5), (half, 0.0, 0.0, half))
+    assert held.held() == {}
+    assert not held.turning
+    # The rotation stays, and what a browser says afterwards changes nothing.
+    dragged("update", (9.0, 9.0, 9.0), (0.0, 1.0, 0.0, 0.0))
+    np.testing.assert_allclose(held.turn_vector, (0.0, 0.0, np.pi / 2))
+
+
+@pytest.mark.parametrize("aspect", [0.4, 0.6, 1.19, 1.2, 2.0])
+def test_a_camera_whose_view_is_narrow_stands_back_until_as_much_is_seen(aspect):
+    usual, look_at = np.array((2.65, 1.05, 1.15)), np.array((0.1, 0.47, 0.12))
+    camera = SimpleNamespace(aspect=aspect, position=usual, look_at="unchanged")
+    asyncio.run(_step_back(SimpleNamespace(camera=camera)))
+    # The width in view at the place looked at is that of a view 1.2 times as wide as high.
+    width = aspect * np.linalg.norm(camera.position - look_at)
+    assert width >= 1.2 * np.linalg.norm(usual - look_at) - 1e-9
+    if aspect < 1.2:
+        assert width == pytest.approx(1.2 * np.linalg.norm(usual - look_at))
+        np.testing.assert_allclose(
+            np.cross(camera.position - look_at, usual - look_at), 0, atol=1e-12
+        )
+        assert camera.look_at == tuple(look_at)
+    else:
+        np.testing.assert_array_equal(camera.position, usual)
+        assert camera.look_at == "unchanged"
+
+
+def test_the_edges_of_a_box_join_corners_that_differ_along_one_axis():
+    edges = box_edges((1.0, 2.0, 3.0))
+    assert edges.shape == (12, 2, 3)
+    np.testing.assert_allclose(np.abs(edges), np.broadcast_to((1.0, 2.0, 3.0), (12, 2, 3)))
+    lengths = edges[:, 1] - edges[:, 0]
+    assert ((lengths != 0).sum(axis=1) == 1).all()
+    assert (lengths >= 0).all()
+    assert len({edge.tobytes() for edge in edges}) == 12
+
+
+def test_the_arrow_and_the_knobs_held_have_the_colour_of_what_follows(made):
+    scene, _, found = made
+    arrows = np.arange(12.0).reshape(2, 2, 3)
+    scene.point(arrows, SKY, held=(2,))
+    now = found()
+    assert scene._arrows.points.tolist() == arrows.tolist()
+    assert set(map(tuple, np.reshape(scene._arrows.colors, (-1, 3)).tolist())) == {
+        tuple(colour(SKY))
+    }
+    assert now["/knobs/joint2"]["color"] == colour(SKY)
+    scene.show_region(DrawnRegion(centre=(0.4, 0.5, 0.6), half_size=(0.1, 0.2, 0.3)))
+    corners = scene._region.points.reshape(-1, 3)
+    np.testing.assert_allclose(corners.min(axis=0), (0.3, 0.3, 0.3), atol=1e-6)
+    np.testing.assert_allclose(corners.max(axis=0), (0.5, 0.7, 0.9), atol=1e-6)
