@@ -123,7 +123,7 @@ class Panel:
             control_width="medium",
             show_logo=False,
             show_share_button=False,
-            brand_color=(0, 114, 178),
+            brand_color=palette.rgba(palette.BLUE)[:3],
         )
         gui.main_panel.dock_right()
         self._task = self._switch = self._keep = None
