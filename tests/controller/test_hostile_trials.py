@@ -9,7 +9,15 @@ from hrc_learn.controller import AdaptiveController, SafetyFilter
 pytestmark = pytest.mark.simulation
 
 
-@pytest.mark.parametrize("fault", ["none", "nan", "late", "lost"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "none",
+        "nan",
+        pytest.param("late", marks=pytest.mark.slow),
+        pytest.param("lost", marks=pytest.mark.slow),
+    ],
+)
 def test_no_limit_is_broken_under_stress(fault: str):
     config = StressConfig(count=40, seed=3, duration=1.8, fault=fault)
     result = run_stress_trials(config)

@@ -52,7 +52,7 @@ def judged(sent: HostileStreams, limits: JointLimits | None, folder: Path, **mor
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("ticks", [12_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ticks", [4_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("judge", JUDGES)
 def test_it_finds_nothing(judge, ticks, tmp_path):
     arm, limits = JUDGES[judge]

@@ -55,8 +55,8 @@ def told(*batch: int, dtype: torch.dtype) -> WantedVelocity:
     ("batch", "dtype", "tolerance"),
     [
         ((ARMS,), torch.float32, 2e-5),
-        ((3, 2), torch.float64, 1e-12),
-        ((1,), torch.float64, 1e-12),
+        pytest.param((3, 2), torch.float64, 1e-12, marks=pytest.mark.slow),
+        pytest.param((1,), torch.float64, 1e-12, marks=pytest.mark.slow),
     ],
 )
 def test_commanded_velocities_equal_the_eager_ones(tmp_path, batch, dtype, tolerance):

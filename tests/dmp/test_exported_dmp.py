@@ -50,7 +50,12 @@ def eager_arguments(inputs):
 
 
 @pytest.mark.parametrize(
-    "kind", ["joint", pytest.param("orientation", marks=pytest.mark.slow), "pose"]
+    "kind",
+    [
+        "joint",
+        pytest.param("orientation", marks=pytest.mark.slow),
+        pytest.param("pose", marks=pytest.mark.slow),
+    ],
 )
 def test_a_program_does_what_the_primitive_does(kind, exported):
     """In a batch that it was not traced with, over goals, pushes and slow-downs."""

@@ -493,6 +493,7 @@ def test_where_no_way_gets_free_the_object_is_put_back(skills):
     assert float((home - WORKPLACE.home_joints()).abs().max()) < 0.02
 
 
+@pytest.mark.slow
 def test_turn_near_image_edge_keeps_marker_in_view(skills):
     """80 degrees, for an object whose grasp has the marker 80 px above the lower edge."""
     servo = VisualServoConfig(timeout=5.0)
