@@ -2,8 +2,10 @@
 
 Arms start anywhere, a quarter of their joints near a limit, and receive bang-bang commands:
 first at random, then drawn by the cross-entropy method, which keeps the sequences that made a
-point fastest and draws the next ones from their distribution. Tool, elbow and the end of a load
-0.2 m past the tool are capped. An independent monitor counts the steps beyond any limit.
+point fastest and draws the next ones from their distribution. With `--cma`, CMA-ES (`pip
+install cma`) searches with the batch as well, for commands and starts together. Tool, elbow
+and the end of a load 0.2 m past the tool are capped. An independent monitor counts the steps
+beyond any limit.
 
 The filter runs as a batch, arm by arm, with the constraint layer, and exported, arm by arm
 and as one loop over a batch; with float32
@@ -13,6 +15,8 @@ the filter is given a delay and a lower cap.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -20,8 +24,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from limit_monitor import LimitMonitor
@@ -39,6 +44,7 @@ KINDS = ("position", "velocity", "acceleration", "jerk", "speed")
 _LOAD = (0.0, 0.0, 0.2)  # far end of the load in the frame of the tool [m]
 _ELITE = 0.1  # fraction of the sequences that are kept
 _LEVELS = 3.0  # commands reach this multiple of the velocity limits
+_POPULATION = 128  # of each search by CMA-ES
 _DT = (0.001, 0.02)  # shortest and longest step [s]
 
 type _Filter = Callable[[Tensor, Tensor, float], tuple[Tensor, int]]
@@ -74,6 +80,7 @@ class Search:
     """Changes of the command in a sequence."""
     rounds: int = 9
     """Sequences drawn from the elite of the round before; the first round is random."""
+    method: Literal["cross-entropy", "CMA-ES"] = "cross-entropy"
     seed: int = 0
 
     @property
@@ -81,6 +88,8 @@ class Search:
         """Name in tables and files."""
         step = f"{1e3 * self.dt:g} ms" if self.dt else "1-20 ms"
         parts = [self.arm, self.path, step, str(self.dtype)[6:]]
+        if self.method != "cross-entropy":
+            parts.append(self.method)
         if self.cap != 1.0:
             parts.append(f"cap {self.cap:g}")
         if self.late:
@@ -118,27 +127,79 @@ def points_of(robot: SerialChain, q: Float[Tensor, "batch n"]) -> Float[Tensor, 
 def search(config: Search) -> Found:
     """Search with one configuration."""
     robot, rng = arm(config.arm), torch.Generator().manual_seed(config.seed)
-    n, B = len(robot.joint_names), config.batch
-    mean = torch.zeros(config.knots, n, dtype=torch.float64)
-    spread, start = torch.ones_like(mean), None
+    drawn = (_CMA if config.method == "CMA-ES" else _CrossEntropy)(config, robot, rng)
     beyond, fastest, reported = torch.zeros(len(KINDS), dtype=torch.int64), 0.0, 0
     for _ in range(config.rounds):
-        noise = torch.randn(B, config.knots, n, generator=rng, dtype=torch.float64)
-        knots = mean + spread * noise
-        q = _start(robot, B, rng) if start is None else start
+        q, knots = drawn.ask()
         speeds, flags, over = _run(config, robot, q, knots, rng)
         beyond, reported = beyond + flags, reported + over
         fastest = max(fastest, float(speeds.max()))
-        best = speeds.topk(max(2, int(_ELITE * B))).indices
-        mean, spread = knots[best].mean(0), knots[best].std(0) + 0.1
-        # From the starts of the elite, each for several arms of the next round.
-        start = q[best].repeat(B // len(best) + 1, 1)[:B]
+        drawn.tell(speeds)
     return Found(
-        steps=config.rounds * B * config.steps,
+        steps=config.rounds * config.batch * config.steps,
         beyond=dict(zip(KINDS, beyond.tolist(), strict=True)),
         fastest=fastest / config.cap,
         reported=reported,
     )
+
+
+class _CrossEntropy:
+    """Commands from the normal distribution of the elite, starts from the elite's starts."""
+
+    def __init__(self, config: Search, robot: SerialChain, rng: torch.Generator):
+        self._rng, self._count = rng, config.batch
+        self._mean = torch.zeros(config.knots, len(robot.joint_names), dtype=torch.float64)
+        self._spread = torch.ones_like(self._mean)
+        self._start = _start(robot, config.batch, rng)
+
+    def ask(self) -> tuple[Tensor, Tensor]:
+        """Joint positions at the start (batch, n) and commands (batch, knots, n)."""
+        shape = self._count, *self._mean.shape
+        noise = torch.randn(shape, generator=self._rng, dtype=torch.float64)
+        self._knots = self._mean + self._spread * noise
+        return self._start, self._knots
+
+    def tell(self, speeds: Tensor) -> None:
+        """Largest speeds (batch) that the sequences reached."""
+        best = speeds.topk(max(2, int(_ELITE * self._count))).indices
+        elite = self._knots[best]
+        self._mean, self._spread = elite.mean(0), elite.std(0) + 0.1
+        # From the starts of the elite, each for several arms of the next round.
+        starts = self._start[best]
+        self._start = starts.repeat(self._count // len(best) + 1, 1)[: self._count]
+
+
+class _CMA:
+    """Commands and starts by CMA-ES; those that converged begin again elsewhere."""
+
+    def __init__(self, config: Search, robot: SerialChain, rng: torch.Generator):
+        self._shape = config.knots + 1, len(robot.joint_names)
+        self._lower, self._upper = robot.limits.lower + 0.03, robot.limits.upper - 0.03
+        self._seeds = itertools.count(1 + config.seed)
+        self._searches = [self._begun() for _ in range(config.batch // _POPULATION)]
+
+    def _begun(self) -> Any:
+        import cma  # pyright: ignore[reportMissingImports]
+
+        size, seed = math.prod(self._shape), next(self._seeds)
+        first = torch.randn(size, generator=torch.Generator().manual_seed(seed)).tolist()
+        options = {"popsize": _POPULATION, "seed": seed, "verbose": -9}
+        return cma.CMAEvolutionStrategy(first, 0.5, options)
+
+    def ask(self) -> tuple[Tensor, Tensor]:
+        """Joint positions at the start (batch, n) and commands (batch, knots, n)."""
+        self._asked = [search.ask() for search in self._searches]
+        drawn = torch.tensor(np.array(self._asked)).reshape(-1, *self._shape)
+        place = (0.5 + 0.5 * drawn[:, 0]).clamp(0, 1)
+        return torch.lerp(self._lower, self._upper, place), drawn[:, 1:]
+
+    def tell(self, speeds: Tensor) -> None:
+        """Largest speeds (batch) that the sequences reached."""
+        reached = speeds.reshape(len(self._searches), -1).tolist()
+        for k, search in enumerate(self._searches):
+            search.tell(self._asked[k], [-speed for speed in reached[k]])
+            if search.stop():
+                self._searches[k] = self._begun()
 
 
 def _start(robot: SerialChain, count: int, rng: torch.Generator) -> Tensor:
@@ -275,6 +336,10 @@ class Args:
     steps: int = 1_000_000
     """Steps of each large search. Those with the uncompiled filter arm by arm take a fiftieth,
     those with errors a quarter."""
+    cma: bool = False
+    """Search by CMA-ES, too; needs `pip install cma`."""
+    only: str = ""
+    """Search only with configurations whose name holds this text."""
     processes: int = 2
     """Searches that run at the same time."""
     json: Path | None = None
@@ -307,12 +372,16 @@ def searches(args: Args) -> Iterator[Search]:
         wrong = replace(one, dt=0.008, late=1, reserve=0.01, encoder_error=0.002)
         yield sized(wrong, args.steps // 4)
         yield sized(replace(one, reserve=0.025, model_error=0.02), args.steps // 4)
+        if args.cma:
+            yield sized(replace(one, method="CMA-ES"), args.steps)
+            yield sized(replace(one, method="CMA-ES", dtype=single), args.steps)
 
 
 def main(args: Args) -> int | None:
     table = Table("search", "steps", *KINDS, "fastest, of its cap", "reported")
     figures: dict[str, float] = {}
-    configs, console = list(searches(args)), Console()
+    configs = [config for config in searches(args) if args.only in config.name]
+    console = Console()
     pool = ProcessPoolExecutor(
         args.processes, get_context("spawn"), torch.set_num_threads, (1,)
     )

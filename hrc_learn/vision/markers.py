@@ -3,6 +3,7 @@
 Marker frame: origin in the middle, x right, y up, z out of the plate towards whoever reads it.
 """
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -101,7 +102,8 @@ class MarkerDetector:
     A marker is looked for round its last position first, where that fails in the whole image
     at half resolution, and only then at full resolution; corners are always refined at full
     resolution. That takes a fraction of the time of a plain search and is no less accurate.
-    While a marker stays unseen, full resolution is tried on every few images only.
+    While a marker stays unseen, full resolution is tried on every few images only. An id that
+    two markers carry is not reported, with a warning, unless one lies round its last position.
     """
 
     def __init__(self, ids: Iterable[int]):
@@ -178,12 +180,13 @@ class MarkerDetector:
 
     def _search(self, grey: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
         corners, found, _ = self._aruco.detectMarkers(np.ascontiguousarray(grey))
-        if found is None:
-            return {}
+        seen = [] if found is None else found.ravel().tolist()
+        for id in ids.intersection(id for id in seen if seen.count(id) > 1):
+            warnings.warn(f"marker {id} is in the image twice: neither is used", stacklevel=2)
         return {
-            int(id): square[0].astype(np.float64)
-            for id, square in zip(found.ravel(), corners, strict=True)
-            if int(id) in ids
+            id: square[0].astype(np.float64)
+            for id, square in zip(seen, corners, strict=True)
+            if id in ids and seen.count(id) == 1
         }
 
 
@@ -192,10 +195,8 @@ def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
 
     The mean of the corners is not it: perspective draws the farther half smaller.
     """
-    a, c = corners[0], corners[2]
-    b, d = corners[1], corners[3]
-    across, between = d - b, b - a
-    ca = c - a
+    a, b, c, d = corners
+    across, between, ca = d - b, b - a, c - a
     s = (between[0] * across[1] - between[1] * across[0]) / (
         ca[0] * across[1] - ca[1] * across[0]
     )

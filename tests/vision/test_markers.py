@@ -170,3 +170,21 @@ def test_a_marker_too_tilted_for_half_resolution_is_found_sooner_or_later():
     half = [detector.detect(camera.read()) for _ in range(6)]
     assert any(half)
     assert not half[0]
+
+
+def test_an_id_on_two_markers_is_reported_only_where_it_was_last():
+    def image(*places):
+        grey = np.full((480, 640), 90, np.uint8)
+        for u in places:
+            grey[200:280, u : u + 80] = marker_texture(7, 80)
+        return grey
+
+    detector = MarkerDetector([7, 8])
+    with pytest.warns(UserWarning, match="marker 7 is in the image twice: neither is used"):
+        assert not detector.detect(image(100, 450))
+    assert centre(detector.detect(image(450))[7])[0] == pytest.approx(489.5, abs=0.5)
+    # The one that was followed goes on, until it cannot be told from the other.
+    assert centre(detector.detect(image(100, 455))[7])[0] == pytest.approx(494.5, abs=0.5)
+    with pytest.warns(UserWarning, match="twice"):
+        assert not detector.detect(image(100, 300))
+    assert centre(detector.detect(image(100))[7])[0] == pytest.approx(139.5, abs=0.5)
