@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from commands import done
+from lerobot_folders import joint_path, write_folder
 
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.viz.report import read_report
@@ -54,6 +55,16 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     assert (tmp_path / "evaluation" / "pose.png").stat().st_size > 1000
     # The same demonstrations fail a demand that none can meet.
     done("evaluate", "--model", model, "--dataset", poses, "--most-nrmse", 1e-9, status=1)
+
+
+def test_an_episode_of_one_frame_is_left_out_of_a_fit_with_a_note(tmp_path):
+    lengths = (60, 1, 50, 1)
+    episodes = [{"observation.state": joint_path(n, seed=n)} for n in lengths]
+    root = write_folder(tmp_path / "set", episodes, {"observation.state": ["a", "b", "c"]})
+    fit = ("fit", "--dataset", root, "--units", "joint_position", "rad", "--n-basis", 10)
+    output = done(*fit, "--out", tmp_path / "model").output
+    assert "episodes of a single frame are left out: 1, 3" in " ".join(output.split())
+    assert "demonstrations │ 2" in " ".join(output.replace("│", " │ ").split())
 
 
 def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):

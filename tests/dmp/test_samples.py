@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.interpolate import BSpline, CubicHermiteSpline
 
+from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp import samples as recorded
 from hrc_learn.dmp.samples import check_samples, densified, padded, smoothed
 
@@ -234,3 +235,14 @@ def test_noise_of_less_than_the_accuracy_of_a_fit_stays(noise, kept):
 )
 def test_demonstrations_are_named_by_their_place_in_the_batch(index, batch, label):
     assert recorded.demo_label(index, batch) == label
+
+
+def test_by_default_a_short_demonstration_is_as_gentle_as_it_was(recwarn):
+    """Two seconds at 30 Hz: fewer samples than the default of basis functions asks for."""
+    s = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
+    reach = torch.tensor([0.5, -0.3, 1.2], dtype=torch.float64)
+    made = JointDMP.fit(2 * s[:, 0], s**3 * (10 - 15 * s + 6 * s**2) * reach).rollout(dt=0.001)
+    # The largest acceleration of a minimum-jerk motion: 10 / sqrt(3) D / T^2.
+    peak = 10 / 3**0.5 * reach.abs() / 2**2
+    assert (made.acceleration.abs().amax(0) < 1.05 * peak).all()
+    assert not recwarn

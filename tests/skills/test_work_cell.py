@@ -9,7 +9,7 @@ from obedient_arm import ObedientArm, cell_with, hindered
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_line
@@ -21,6 +21,25 @@ pytestmark = pytest.mark.simulation
 @pytest.fixture
 def cell():
     return cell_with(ObedientArm(panda.ready.numpy()))
+
+
+@pytest.mark.parametrize("name", ["ur5e", "so101"])
+def test_without_input_an_arm_of_any_number_of_joints_holds_its_pose(name):
+    class NoInput(Human):
+        def read(self, state):
+            return HumanInput()
+
+        def tell(self, feedback):
+            pass
+
+    chain = ArmChoice(name).work_arm().chain
+    q = chain.ready.numpy()
+    arm = ObedientArm(q)
+    cell = WorkCell(chain=chain, arm=arm, gripper=arm, human=NoInput(), advance=arm.advance)
+    cell.hold_pose(0.1)
+    assert cell.log["nullspace_input"].shape[1:] == q.shape
+    assert not cell.log["nullspace_input"].any()
+    np.testing.assert_allclose(arm.q, q, atol=1e-6)
 
 
 class CountingSensor:
