@@ -93,10 +93,10 @@ def _target(model: FittedModel, words: Sequence[str], option: str) -> Target:
         "orientation": demo.orientation,
     }
     values = {k: torch.from_numpy(x[row].copy()) for k, x in columns.items() if x is not None}
-    if model.joint is not None and "joints" in values:
+    if "joints" in values:
         names = [name.removesuffix(".pos") for name in demo.joint_names]
         values = {"joints": values["joints"][[names.index(n) for n in model.joint_names]]}
-    if not values or not ("joints" in values or "position" in values):
+    if "joints" not in values and "position" not in values:
         raise ValueError(f"{option}: episode {episode} has neither joints nor positions.")
     return Target(**values)
 
