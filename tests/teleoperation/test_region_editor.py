@@ -282,3 +282,46 @@ def test_a_click_marks_the_target_above_what_is_nearest(page, editor, aim, marke
     page.use("Clear the target")
     assert editor.target is None
     assert not mark.visible
+
+
+def test_controls_and_nodes_begin_as_they_are_described(page, editor):
+    for axis in "xyz":
+        slider = page.made[f"Size {axis}"]
+        assert (slider.low, slider.high) == (0.04, 1.0)
+    assert editor.drawn == DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.10))
+    assert shown(page) == ((0.35, 0.45, 0.22), (0.28, 0.28, 0.2))
+    gizmo, box, corner, mark = (
+        page.made[name] for name in ("/region", "/region/box", "/region/corner", "/target")
+    )
+    assert (gizmo.scale, gizmo.disable_rotations) == (0.16, True)
+    assert (box.opacity, box.side) == (0.12, "double")
+    assert (box.cast_shadow, box.receive_shadow) == (False, False)
+    assert (corner.radius, mark.radius) == (0.022, 0.02)
+    assert not page.made["Active"].value
+    assert not mark.visible
+    assert editor.target is None
+    page.made["Active"].value = True
+    page.use("Active")
+    assert box.opacity == 0.3
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_corner_is_dragged_in_the_plane_across_the_view(page, editor, axis):
+    start = DrawnRegion(centre=(0.1, 0.2, 0.3), half_size=(0.1, 0.1, 0.1))
+    editor.draw(start)
+    corner = np.array(start.centre) + 0.1
+    away = np.eye(3)[axis]
+    client = SimpleNamespace(camera=SimpleNamespace(position=corner + 2.0 * away))
+    aside = np.roll([0.0, 0.05, 0.12], axis)
+    # Half way to the corner a pointer is half as far aside as in its plane.
+    pointer = corner + 1.0 * away + aside / 2
+    page.use("/region/corner", SimpleNamespace(client=client, end_position=tuple(pointer)))
+    np.testing.assert_allclose(editor.drawn.half_size, 0.1 + aside, atol=1e-9)
+
+
+@pytest.mark.parametrize("half", [0.02, 0.03])
+def test_a_region_is_no_thinner_than_two_centimetres_to_either_side(half):
+    points = np.array([[0.1, 0.2, 0.0], [0.1, 0.3, 0.0]])
+    region = region_over(points, bottom=0.4, height=2 * half)
+    np.testing.assert_allclose(region.half_size, (0.02, 0.05, half))
+    np.testing.assert_allclose(region.centre, (0.1, 0.25, 0.4 + half))
