@@ -1,0 +1,336 @@
+"""Single steps of a grasp on stand-ins of the cell: paths, heights, attempts, refusals."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from unchecked import shapes_unchecked
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import UnreachableError, gripper_down, panda
+from hrc_learn.skills import grasping
+from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspJob, _reachable_probe
+from hrc_learn.skills.placing import BlockedPathError
+from hrc_learn.skills.work_cell import MissedGraspError
+
+pytestmark = pytest.mark.simulation
+
+HERE, HOME = torch.zeros(7).double(), torch.ones(7).double()
+POSTURES = [torch.full((7,), 2.0).double(), torch.full((7,), 3.0).double()]
+NAMES = {0.0: "here", 1.0: "home", 2.0: "a", 3.0: "b"}
+
+
+@pytest.fixture(autouse=True)
+def _unchecked():
+    """Stand-ins are not of the annotated types."""
+    with shapes_unchecked():
+        yield
+
+
+def name(q):
+    return NAMES[float(torch.as_tensor(q)[0])]
+
+
+class Cell:
+    """Keeps what it is asked to do."""
+
+    def __init__(self):
+        self.did: list[Any] = []
+        self.joints, self.time = HERE, 0.0
+        self.config = SimpleNamespace(dt=0.01, detect_every=3)
+        self.tracked_markers: Any = (1,)
+        self.load: Any = "load"
+        self.pose = Pose(torch.tensor([0.4, 0.3, 0.5], dtype=torch.float64), gripper_down())
+        self.contact: Any = None
+        self.gripper = SimpleNamespace(move=lambda width: self.did.append(("fingers", width)))
+
+    def begin_phase(self, phase):
+        self.did.append(phase)
+
+    def follow_path(self, path):
+        self.did.append(path)
+
+    def move_straight(self, goal, speed=None):
+        self.did.append(("straight", float(goal.position[2])))
+
+    def move_until_contact(self, goal):
+        self.did.append(("feel", float(goal.position[2])))
+        return self.contact
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """A grasp whose lines between postures are free or blocked, near objects or not."""
+    task: Any = object.__new__(Grasping)
+    task.blocked, task.near = set(), set()
+    task._cell, task._size, task._config = Cell(), 0.5, GraspingConfig()
+    task._workplace = SimpleNamespace(
+        home_joints=lambda: HOME,
+        hover_postures=lambda: POSTURES,
+        hover=lambda: Pose(torch.zeros(3).double(), gripper_down()),
+        hover_height=0.2,
+        fingertip=0.01,
+        palm=0.04,
+    )
+    task.servo = SimpleNamespace(orientation=lambda default: default)
+    task._table = (0.0, 0.025)
+
+    def plan(cell, start, goal):
+        line = (name(start), name(goal))
+        return SimpleNamespace(path=line)
+
+    def check(plan):
+        if plan.path in task.blocked:
+            raise BlockedPathError("the table is in the way.")
+
+    task._check = check
+    monkeypatch.setattr(grasping, "joint_plan", plan)
+
+    def free(start, goal, clearance=None):
+        line = (name(start), name(goal))
+        if clearance is not None:
+            assert clearance == pytest.approx(0.5 * 0.06)
+        return line not in task.blocked and (clearance is None or line not in task.near)
+
+    task._free = free
+    return task
+
+
+DIRECT, TO_A, TO_B = ("here", "home"), ("here", "a"), ("here", "b")
+
+
+@pytest.mark.parametrize(
+    ("blocked", "near", "via"),
+    [
+        ((), (), None),
+        ((), (DIRECT,), "a"),
+        ((), (DIRECT, TO_A), "b"),
+        ((), (DIRECT, TO_A, TO_B), None),  # near objects rather than not at all
+        ((DIRECT,), (TO_A, TO_B), "a"),
+        ((DIRECT, TO_A), (), "b"),
+        ((DIRECT, ("a", "home")), (), "b"),
+    ],
+)
+def test_the_way_home_keeps_away_from_objects_if_any_way_does(made, blocked, near, via):
+    made.blocked, made.near = set(blocked), set(near)
+    made.move_joints = lambda goal: made._cell.did.append(("on to", name(goal)))
+    made.go_home()
+    ways = [("here", via)] if via else []
+    assert made._cell.did == ["home", *ways, ("on to", "home")]
+
+
+def test_a_posture_above_the_table_is_free_both_ways_or_the_arm_goes_home_first(made):
+    went = []
+    made.go_home = lambda: went.append("home")
+    assert name(made._posture()) == "a"
+    made.blocked = {("a", "home")}
+    assert name(made._posture()) == "b"
+    made.blocked, made.near = set(), {TO_A, TO_B}
+    assert went == []
+    assert name(made._posture()) == "a"
+    assert went == ["home"]
+
+
+def test_a_blocked_line_is_not_followed(made):
+    made.move_joints(HOME)
+    assert made._cell.did == [DIRECT]
+    made.blocked = {DIRECT}
+    with pytest.raises(BlockedPathError):
+        made.move_joints(HOME)
+    assert made._cell.did == [DIRECT]
+
+
+@pytest.mark.parametrize(
+    ("distance", "blocked", "refused"),
+    [
+        (0.0301, False, ""),
+        (0.0299, False, "too close to objects on the table"),
+        (1.0, True, "on the path there, the table is in the way"),
+        (None, False, "the arm does not reach there with this orientation"),
+    ],
+)
+def test_a_pose_is_refused_with_its_reason(made, distance, blocked, refused):
+    def inverse(pose, *, near, samples):
+        if distance is None:
+            raise UnreachableError("too far")
+        return HOME
+
+    made._workplace.robot = SimpleNamespace(inverse=inverse)
+    made._to_objects = lambda q: torch.tensor(distance)
+    made.blocked = {DIRECT} if blocked else set()
+    assert made.refusal(made._cell.pose) == refused
+
+
+@pytest.mark.parametrize("clearance", [None, 0.05])
+@pytest.mark.parametrize(("distance", "free"), [(0.0501, True), (0.05, False)])
+def test_a_line_is_free_if_each_fifth_sample_is_clear(
+    made, monkeypatch, clearance, distance, free
+):
+    del made._free
+    path = np.arange(12.0)[:, None] * np.ones(7)
+    monkeypatch.setattr(grasping, "joint_plan", lambda *given: SimpleNamespace(path=path))
+    made._check = lambda plan: None
+    asked = []
+
+    def to_objects(q):
+        asked.append(q[:, 0].tolist())
+        return torch.tensor([1.0, distance, 1.0], dtype=torch.float64)
+
+    made._to_objects = to_objects
+    assert made._free(HERE, HOME, clearance) == (clearance is None or free)
+    assert asked == ([] if clearance is None else [[0.0, 5.0, 10.0]])
+
+    def check(plan):
+        raise BlockedPathError("blocked")
+
+    made._check = check
+    assert not made._free(HERE, HOME, clearance)
+
+
+@pytest.mark.parametrize(("half", "reach"), [(0.02, 0.01), (0.03, 0.02)])
+@pytest.mark.parametrize("touches", [True, False])
+def test_the_table_is_felt_for_about_where_it_is_expected(made, half, reach, touches):
+    """The fingers reach 1 cm below the tool; a tall object meets the palm before."""
+    item: Any = SimpleNamespace(half_size=(0.02, 0.03, half))
+    made._table = (0.1, 0.02)
+    met = Pose(torch.tensor([0.4, 0.3, 0.137], dtype=torch.float64), gripper_down())
+    made._cell.contact = met if touches else None
+    made._touch_table(item)
+    (_, above), (_, below) = made._cell.did
+    assert above == pytest.approx(0.1 + reach + 0.02)
+    assert below == pytest.approx(0.1 + reach - 0.02)
+    if touches:
+        assert made._table == pytest.approx((0.137 - reach, 0.5 * 0.015))
+    else:
+        assert made._table == (0.1, 0.02)
+
+
+def test_the_tool_descends_along_its_own_axis(made):
+    turn = torch.tensor([0.0, 0.98, 0.0, 0.199], dtype=torch.float64)
+    made.servo.orientation = lambda default: turn / turn.norm()
+    pose = made._at_height(0.1)
+    assert float(pose.position[2]) == pytest.approx(0.1)
+    axis = Rotation.from_quat((turn / turn.norm()).numpy(), scalar_first=True).apply([0, 0, 1])
+    way = (pose.position - made._cell.pose.position).numpy()
+    np.testing.assert_allclose(np.cross(way, axis), 0.0, atol=1e-12)
+    assert way @ axis > 0
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_fingers_that_close_on_nothing_forget_the_table(made, monkeypatch, held):
+    item: Any = SimpleNamespace(half_size=(0.02, 0.03, 0.025), name="box")
+    made._touch_table = lambda item: setattr(made, "_table", (0.3, 0.001))
+    monkeypatch.setattr(grasping, "move_fingers", lambda *given: made._cell.did.append("close"))
+    monkeypatch.setattr(grasping, "holds", lambda cell, item: held)
+    monkeypatch.setattr(grasping, "as_load", lambda item: f"load {item.name}")
+    if held:
+        made.close_on(item)
+        assert made._cell.load == "load box"
+        assert made._table == (0.3, 0.001)
+    else:
+        with pytest.raises(MissedGraspError, match=r"closed on nothing.*'box'"):
+            made.close_on(item)
+        assert made._table == pytest.approx((0.0, 0.5 * 0.05))
+    assert made._cell.did[0] == "grasp"
+    assert made._cell.did[1] == ("straight", pytest.approx(0.325))
+    assert made._cell.tracked_markers == ()
+
+
+@pytest.mark.parametrize(("height", "lifts"), [(0.19, True), (0.21, False)])
+def test_a_low_tool_is_lifted_before_it_goes_home(made, monkeypatch, height, lifts):
+    moved = []
+    monkeypatch.setattr(grasping, "move_fingers", lambda cell, *given: moved.append(given))
+    made._cell.pose.position[2] = height
+    made.go_home = lambda: made._cell.did.append("went home")
+    made.start_over()
+    assert made._cell.load is None
+    assert made._cell.tracked_markers == ()
+    expected = ["lift", ("straight", pytest.approx(height + 0.5 * 0.20))] if lifts else []
+    assert made._cell.did == [*expected, "went home"]
+    assert moved == [(grasping.OPEN, 0.3)]
+
+
+@pytest.mark.parametrize(("misses", "attempts"), [(0, 1), (1, 2), (2, 3), (3, None)])
+@pytest.mark.parametrize("wait", [0.3, 0.31])
+def test_a_grasp_is_tried_three_times_and_each_mishap_is_noted(made, misses, attempts, wait):
+    notes, left = [], [misses]
+
+    def locate(item):
+        made._cell.time += wait
+        return "target"
+
+    def close_on(item):
+        if left[0]:
+            left[0] -= 1
+            raise MissedGraspError("closed on nothing")
+
+    made.locate, made.close_on = locate, close_on
+    made._aim = lambda job, target: None
+    made.note = lambda job, mishap, what: notes.append(mishap)
+    made.start_over = lambda: made._cell.did.append("start over")
+    made.lift = lambda: made._cell.did.append("lift")
+    job: Any = GraspJob(item=SimpleNamespace(name="box"))
+    if attempts is None:
+        with pytest.raises(MissedGraspError):
+            made.grasp(job)
+        assert "lift" not in made._cell.did
+    else:
+        made.grasp(job)
+        assert job.attempts == attempts
+        assert job.picked_up is made._cell.pose
+        assert made._cell.did[-1] == "lift"
+    assert made._cell.did.count("start over") == min(misses, 2)
+    assert notes.count("missed grasp") == misses
+    tries = min(misses + 1, 3)
+    assert notes.count("object not detected") == (tries if wait > 0.3 else 0)
+
+
+@pytest.mark.parametrize(
+    ("reached", "expected"), [(1.0, 1.0), (0.8, 0.75), (0.5, 0.5), (0.3, 0.25), (0.1, 0.25)]
+)
+def test_a_probe_is_as_high_as_the_arm_reaches_over_all_objects(reached, expected):
+    """Up to a fraction of its height the arm reaches the four corners."""
+    hover = Pose(torch.tensor([0.4, 0.3, 0.2], dtype=torch.float64), gripper_down())
+    half = torch.tensor([0.1, 0.08, 0.0], dtype=torch.float64)
+    asked = []
+
+    def inverse(pose, near):
+        asked.append(pose.position)
+        if float(pose.position[0, 2]) > 0.2 + reached * 0.12 + 1e-9:
+            raise UnreachableError("too high")
+        return panda.ready.expand(4, 7)
+
+    workplace: Any = SimpleNamespace(
+        robot=SimpleNamespace(inverse=inverse, limits=panda.limits),
+        hover=lambda: hover,
+        hover_joints=lambda: panda.ready,
+        object_region=lambda: (None, half),
+    )
+    assert _reachable_probe(workplace, 0.12) == pytest.approx(0.12 * expected)
+    corners = asked[0][:, :2] - hover.position[:2]
+    assert {tuple(c) for c in (corners / half[:2]).round().int().tolist()} == {
+        (1, 1),
+        (1, -1),
+        (-1, 1),
+        (-1, -1),
+    }
+
+
+@pytest.mark.parametrize(("margin", "fits"), [(0.11, True), (0.09, False)])
+def test_a_probe_keeps_a_tenth_of_a_radian_from_joint_limits(margin, fits):
+    hover = Pose(torch.tensor([0.4, 0.3, 0.2], dtype=torch.float64), gripper_down())
+    for limit, side in ((panda.limits.upper, -1), (panda.limits.lower, 1)):
+        q = panda.ready.clone()
+        q[3] = limit[3] + side * margin
+        workplace: Any = SimpleNamespace(
+            robot=SimpleNamespace(
+                inverse=lambda pose, near, q=q: q.expand(4, 7), limits=panda.limits
+            ),
+            hover=lambda: hover,
+            hover_joints=lambda: panda.ready,
+            object_region=lambda: (None, torch.tensor([0.1, 0.08, 0.0], dtype=torch.float64)),
+        )
+        assert _reachable_probe(workplace, 1.0) == (1.0 if fits else 0.25)
