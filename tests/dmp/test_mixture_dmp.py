@@ -2,12 +2,20 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from demo_motions import minimum_jerk
+from scipy.special import logsumexp
+from scipy.stats import norm
 from torch.distributions import MultivariateNormal
 
 from hrc_learn.dmp import JointDMP, MixtureDMP, OrientationDMP, mean_primitive
+from hrc_learn.dmp.mixture_dmp import (
+    _expectation_maximisation,
+    _responsibilities,
+    principal_components,
+)
 from hrc_learn.geometry import quaternion
 
 S = torch.linspace(0, 1, 80, dtype=torch.float64)
@@ -169,3 +177,167 @@ def test_refuses_with_a_sentence(shown, mixture):
         MixtureDMP.fit(shown[0])
     with pytest.raises(ValueError, match="context must be"):
         mixture.at([math.pi])
+
+
+@pytest.mark.parametrize(
+    ("deviations", "count"),
+    [
+        ((2.0, 0.5, 0.1), 1),
+        ((1.0, 0.9, 0.3), 2),
+        ((1.0, 0.9, 0.8, 0.2), 3),
+        ((1.0, 0.9, 0.8, 0.7, 0.6), 3),
+    ],
+)
+def test_principal_components_explain_nine_tenths_of_the_variance(deviations, count):
+    """Coordinates in the directions of largest variance: eigenvectors of the covariance."""
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(40, len(deviations)))
+    white = np.linalg.qr(white - white.mean(0))[0]
+    directions = np.linalg.qr(rng.normal(size=(9, len(deviations))))[0]
+    paths = white * deviations @ directions.T + rng.normal(size=9)
+    found = principal_components(torch.from_numpy(paths)).numpy()
+    assert found.shape == (40, count)
+    expected = white[:, :count] * deviations[:count]
+    np.testing.assert_allclose(np.abs(found), np.abs(expected), atol=1e-9)
+    for a, b in zip(found.T, expected.T, strict=True):
+        np.testing.assert_allclose(np.abs(a @ b), b @ b)
+
+
+def test_equal_paths_have_no_components():
+    z = principal_components(torch.ones(4, 6).double())
+    assert (z == 0).all()
+
+
+def clusters(counts, middles, spread, seed=0):
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(
+        np.concatenate(
+            [rng.normal(m, spread, (n, len(m))) for n, m in zip(counts, middles, strict=True)]
+        )
+    )
+
+
+def log_density(z, r):
+    """Log of weight times density of each mode, from responsibilities of the modes."""
+    z, r = z.numpy(), r.numpy()
+    weight, K = r.sum(0), r.shape[1]
+    means = r.T @ z / weight[:, None]
+    variance = sum(r[:, k] @ (z - means[k]) ** 2 for k in range(K)) / max(len(z) - K, 1)
+    deviation = np.maximum(variance, (0.1 * z.std(0)) ** 2) ** 0.5
+    densities = [norm.logpdf(z, mean, deviation).sum(1) for mean in means]
+    return np.log(weight / len(z)) + np.stack(densities, 1)
+
+
+OVERLAPPING = clusters((9, 5, 6), ((0.0, 0.0), (2.5, 0.5), (0.5, 3.0)), 0.8)
+TIGHT = clusters((4, 3), ((0.0, 0.0), (1.0, 2.0)), 1e-3)
+
+
+@pytest.mark.parametrize("K", [1, 2, 3])
+@pytest.mark.parametrize("z", [OVERLAPPING, TIGHT], ids=["overlapping", "tight"])
+def test_responsibilities_are_a_fixed_point_of_bayes_rule(z, K):
+    r, log_likelihood = _expectation_maximisation(z, K)
+    joint = log_density(z, r)
+    total = logsumexp(joint, axis=1, keepdims=True)
+    np.testing.assert_allclose(r, np.exp(joint - total), atol=1e-5)
+    assert log_likelihood == pytest.approx(total.sum(), rel=1e-6, abs=1e-3)
+
+
+def test_expectation_maximisation_starts_far_apart():
+    """Three clusters on a line are found in any order of the samples."""
+    middles = ((0.0,), (10.0,), (-30.0,))
+    z = clusters((5, 4, 3), middles, 0.5)
+    order = torch.from_numpy(np.random.default_rng(1).permutation(12))
+    for samples in (z, z[order], z.flip(0)):
+        r, _ = _expectation_maximisation(samples, 3)
+        means = (r / r.sum(0)).mT @ samples
+        assert means.flatten().sort().values.round(decimals=-1).tolist() == [-30, 0, 10]
+        # The first is the farthest from the mean, the next the farthest from that.
+        assert means.round(decimals=-1).flatten().tolist() == [-30, 10, 0]
+
+
+def test_a_single_sample_a_mode_has_the_least_spread():
+    """As many modes as samples: no degree of freedom is left."""
+    z = torch.tensor([[0.0], [1.0], [5.0]]).double()
+    r, log_likelihood = _expectation_maximisation(z, 3)
+    np.testing.assert_allclose(r.sum(0), 1, atol=1e-4)
+    deviation = 0.1 * z.std(correction=0).item()
+    expected = 3 * (norm.logpdf(0, 0, deviation) - math.log(3))
+    assert log_likelihood == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("counts", "apart", "expected"),
+    [
+        ((8,), 0.0, 1),
+        ((6, 6), 1.0, 1),
+        ((6, 6), 12.0, 2),
+        ((5, 5, 5), 12.0, 3),
+        ((3, 2), 40.0, 2),
+        ((1, 1), 12.0, 1),
+        ((1, 1, 1, 1), 50.0, 1),
+    ],
+)
+def test_modes_are_as_few_as_the_evidence_allows(counts, apart, expected):
+    """Without strong evidence, 10 of the Bayesian criterion, against the smaller number."""
+    middles = [(apart * k, apart * k * (k - 1)) for k in range(len(counts))]
+    z = clusters(counts, middles, 1.0)
+    n, d = z.shape
+    criteria = []
+    for K in range(1, n // 2 + 1):
+        r, _ = _expectation_maximisation(z, K)
+        likelihood = logsumexp(log_density(z, r), axis=1).sum()
+        free = (K - 1) + K * d + d
+        criteria.append(free * math.log(n) - 2 * likelihood)
+    within = np.array(criteria) <= min(criteria) + 10
+    assert int(np.argmax(within)) + 1 == expected
+    r = _responsibilities(z, None)
+    assert r.shape == (n, expected)
+    assert torch.equal(r, _expectation_maximisation(z, expected)[0])
+    assert _responsibilities(z, n).shape == (n, n)
+
+
+def test_contexts_of_two_numbers_have_one_covariance_within_the_modes(shown):
+    """Its diagonal is at least 0.01 of the mean variance of the contexts."""
+    rng = np.random.default_rng(2)
+    for noise in (0.4, 1e-4):
+        context = noise * rng.normal(size=(9, 2)) + np.array([[1, 3]] * 9)
+        context[1::2] += (0.5, -1.0)
+        mixture = MixtureDMP.fit(shown, context, 2)
+        r = mixture.responsibilities.numpy()
+        means = np.stack([np.average(context, axis=0, weights=w) for w in r.T])
+        np.testing.assert_allclose(mixture.contexts, means)
+        within = sum(
+            np.einsum("n,ni,nj->ij", w, context - m, context - m)
+            for w, m in zip(r.T, means, strict=True)
+        ) / (9 - 2)
+        floor = 0.01 * context.var(0).mean() * np.eye(2)
+        np.testing.assert_allclose(mixture.precision, np.linalg.inv(within + floor), rtol=1e-6)
+        np.testing.assert_allclose(mixture.probability, r.mean(0))
+
+
+def test_as_many_modes_as_demonstrations_and_one_are_allowed(shown):
+    for K in (1, 9):
+        mixture = MixtureDMP.fit(shown, n_modes=K)
+        assert len(mixture.modes) == len(mixture.contexts) == K
+    pair = MixtureDMP.fit(shown[:2])
+    assert len(pair.modes) == 1
+    with pytest.raises(ValueError, match="9 primitives have 1 to 9 modes, not 0"):
+        MixtureDMP.fit(shown, n_modes=0)
+
+
+def test_values_are_nearly_exact_unless_noise_is_given(mixture):
+    time, value = [0.3, 0.5], torch.tensor([[0.2, 0.1], [0.4, 0.2]]).double()
+    rate = torch.tensor([[0.4, -0.1], [0.3, 0.0]]).double()
+    found = mixture.condition(time, value, rate)
+    densities = [mode.log_prob(time, value, noise=1e-6) for mode in mixture.modes]
+    joint = torch.stack(densities) + mixture.probability.log()
+    torch.testing.assert_close(found.probability, joint.softmax(0), rtol=0, atol=0)
+    for mode, before in zip(found.modes, mixture.modes, strict=True):
+        expected = before.condition(time, value, rate, noise=1e-6)
+        torch.testing.assert_close(mode.mean, expected.mean, rtol=0, atol=0)
+
+
+def test_slack_is_that_of_each_mode(shown):
+    tight, loose = (MixtureDMP.fit(shown, slack=slack) for slack in (0.0, 0.5))
+    for a, b in zip(tight.modes, loose.modes, strict=True):
+        assert (b.position([0.7])[1] > a.position([0.7])[1]).all()
