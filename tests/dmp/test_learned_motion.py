@@ -3,12 +3,23 @@
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from demo_motions import minimum_jerk
+from scipy.optimize import minimize_scalar
+from scipy.spatial.distance import cdist
 
-from hrc_learn.dmp import Frames, JointDMP, LearnedMotion, learn
-from hrc_learn.dmp.learned_motion import choose
+from hrc_learn.dmp import Frames, JointDMP, LearnedMotion, PoseDMP, learn
+from hrc_learn.dmp.learned_motion import (
+    Candidate,
+    _basis_count,
+    _candidates,
+    _samples,
+    _scale,
+    _weights,
+    choose,
+)
 from hrc_learn.geometry import Pose, quaternion
 
 S = torch.linspace(0, 1, 90, dtype=torch.float64)
@@ -215,3 +226,325 @@ def test_demonstrations_that_cannot_be_learned_from_are_refused():
         learn([(time, way), (time, bad)], n_basis=10)
     with pytest.raises(ValueError, match="context must be finite"):
         learn([(time, way)] * 2, n_basis=10, context=[[math.nan], [0.0]])
+
+
+def numpy_weights(family, strength, known, asked):
+    """Weights of demonstrations by the definitions, contexts in units of their deviation."""
+    deviation = known.std(0, ddof=1)
+    varies = deviation > 1e-9 * (1 + np.abs(known).max(0))
+    a, b = ((x - known.mean(0))[:, varies] / deviation[varies] for x in (asked, known))
+    n = len(known)
+    if family == "ridge":
+        A = np.c_[np.ones(n), b]
+        penalty = np.diag([0.0, *[n * strength] * b.shape[1]])
+        return np.c_[np.ones(len(a)), a] @ np.linalg.solve(A.T @ A + penalty, A.T)
+    distance = cdist(a, b) / varies.sum() ** 0.5
+    if strength == 0:
+        return np.eye(n)[distance.argmin(1)]
+    w = np.exp(-((distance / strength) ** 2) / 2)
+    return w / w.sum(1, keepdims=True)
+
+
+MODELS = [
+    *(("kernel", width) for width in (math.inf, 2.0, 0.5, 0.0)),
+    *(("ridge", penalty) for penalty in (1.0, 0.1, 1e-6)),
+]
+
+
+@pytest.mark.parametrize(("family", "strength"), MODELS)
+def test_weights_are_those_of_each_model(family, strength):
+    rng = np.random.default_rng(0)
+    known = rng.normal(size=(7, 4)) * (1.0, 100.0, 1e-3, 0.0) + (0.0, 50.0, 1.0, 3.0)
+    known[:, 3] += 1e-9 * rng.uniform(-1, 1, 7)  # all but constant
+    asked = known[:3] + (0.5, -20.0, 1e-3, 0.0)
+    found = _weights(family, strength, *map(torch.from_numpy, (known, asked)))
+    np.testing.assert_allclose(found, numpy_weights(family, strength, known, asked), rtol=1e-6)
+    np.testing.assert_allclose(found.sum(1), 1)
+
+
+@pytest.mark.parametrize(("family", "strength"), MODELS)
+def test_held_out_weights_leave_out_each_demonstration(family, strength):
+    """Units of the contexts, and the penalty, are those of all demonstrations."""
+    rng = np.random.default_rng(1)
+    known = rng.normal(size=(6, 2))
+    found = _weights(family, strength, torch.from_numpy(known)).numpy()
+    np.testing.assert_allclose(np.diag(found), 0, atol=1e-12)
+    np.testing.assert_allclose(found.sum(1), 1)
+    z = (known - known.mean(0)) / known.std(0, ddof=1)
+    for i in range(6):
+        rest = np.arange(6) != i
+        if family == "ridge":
+            A = np.c_[np.ones(5), z[rest]]
+            gram = A.T @ A + np.diag([0.0, 6 * strength, 6 * strength])
+            expected = np.r_[1.0, z[i]] @ np.linalg.solve(gram, A.T)
+        else:
+            apart = ((z[rest] - z[i]) ** 2).sum(1) / 2
+            width = max(strength, 1e-2)
+            expected = np.exp(-(apart - apart.min()) / (2 * width**2))
+            expected /= expected.sum()
+        np.testing.assert_allclose(found[i, rest], expected, atol=1e-9)
+
+
+def test_contexts_that_never_vary_weigh_all_alike():
+    known = torch.full((3, 2), 4.0).double()
+    for known, n in ((known, 3), (known[:1], 1)):
+        for asked in (known, known + 1):
+            found = _weights("kernel", 0.5, known, asked)
+            torch.testing.assert_close(found, torch.full((n, n), 1 / n).double())
+
+
+def test_every_model_is_shrunk_by_the_factor_of_least_error():
+    each = fit_each(unrelated)
+    x = each.coordinates().detach().numpy()
+    c = np.concatenate([x[..., -2], x[..., -1]], -1)
+    rows = each.response.evaluate(torch.linspace(0, 1, 101).double())[:, 0].numpy()
+    span = np.ptp(x @ rows.T, axis=-1).max(1)[:, None, None]
+    found = _candidates(each, torch.from_numpy(c), None)
+    widths, penalties = (2.0, 1.0, 0.5, 0.25), (1.0, 0.1, 1e-2, 1e-3, 1e-6)
+    models = [("kernel", width) for width in (math.inf, *widths, 0.0)]
+    models += [("ridge", penalty) for penalty in penalties]
+    assert [(c.family, c.strength) for c in found[::3]] == models
+    for k, (family, strength) in enumerate(models):
+        whole, shrunk, line = found[3 * k : 3 * k + 3]
+        assert (whole.shrinkage, line.shrinkage) == (1.0, 0.0)
+        assert {c.family for c in (whole, shrunk, line)} == {family}
+        assert {c.approach for c in (whole, shrunk, line)} == {1.0}
+        w = _weights(family, strength, torch.from_numpy(c)).numpy()
+        bent = np.einsum("in,ndm->idm", w, x)[..., :-2] @ rows.T[:-2] / span
+        wanted = x[..., :-2] @ rows.T[:-2] / span
+
+        def squares(factor, bent=bent, wanted=wanted):
+            return ((factor * bent - wanted) ** 2).mean((-2, -1))
+
+        best = minimize_scalar(lambda f: squares(f).sum(), bounds=(0, 1), method="bounded").x
+        assert shrunk.shrinkage == pytest.approx(best, abs=1e-4)
+        for candidate in (whole, shrunk, line):
+            expected = squares(candidate.shrinkage) ** 0.5
+            np.testing.assert_allclose(candidate.error, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "families"), [(3, {"kernel"}), (4, {"kernel", "ridge"})])
+def test_regressions_need_four_demonstrations(count, families):
+    model = learn(demonstrations(by_goal, count), n_basis=10)
+    assert {c.family for c in model.candidates} == families
+    fits = [model.each]
+    if "ridge" in families:
+        chosen = choose(fits, regression_only=True).chosen
+        assert (chosen.family, chosen.shrinkage) == ("ridge", 1.0)
+    else:
+        with pytest.raises(ValueError, match="a regression needs 4 demonstrations or more, got 3"):
+            choose(fits, regression_only=True)
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ([[1, 1, 1, 1], [0.981] * 4], 0),
+        ([[1, 1, 1, 1], [0.979] * 4], 1),
+        # Relative to the errors: of twice the size twice the decrease counts.
+        ([[2, 2, 2, 2], [1.961] * 4], 0),
+        ([[2, 2, 2, 2], [1.959] * 4], 1),
+        # The decrease 0.1 has a deviation of 0.24 or 0.26, of which 0.4 count for 4.
+        ([[1, 1, 1, 1], [0.9 + 0.866 * 0.24, 0.9 - 0.866 * 0.24] * 2], 1),
+        ([[1, 1, 1, 1], [0.9 + 0.866 * 0.26, 0.9 - 0.866 * 0.26] * 2], 0),
+        # Against the best so far, not the first.
+        ([[1, 1, 1, 1], [0.9] * 4, [0.89] * 4], 1),
+        ([[1, 1, 1, 1], [0.99] * 4, [0.97] * 4], 2),
+        ([[1], [0.5]], 0),
+    ],
+)
+def test_a_less_simple_model_is_clearly_better(monkeypatch, errors, chosen):
+    """By 2 % of the mean error, and by 0.8 standard errors of the decrease."""
+    each = fit_each(always)[: len(errors[0])]
+    listed = [
+        Candidate(
+            family="kernel",
+            strength=float(k),
+            approach=1.0,
+            shrinkage=1.0,
+            error=torch.tensor(error).double(),
+        )
+        for k, error in enumerate(errors)
+    ]
+    monkeypatch.setattr("hrc_learn.dmp.learned_motion._candidates", lambda *_: listed)
+    model = choose([each])
+    assert model.chosen.strength == chosen
+    assert model.candidates == tuple(listed)
+
+
+@pytest.mark.parametrize(
+    ("family", "strength", "shrinkage", "kind", "name"),
+    [
+        ("kernel", math.inf, 1.0, "mean", "mean, approach 0.6"),
+        ("kernel", 0.0, 1.0, "nearest", "nearest demonstration, approach 0.6"),
+        ("kernel", 0.25, 1.0, "kernel", "kernel of width 0.25, approach 0.6"),
+        ("kernel", 0.25, 0.5, "kernel", "kernel of width 0.25, shrunk to 0.50, approach 0.6"),
+        ("ridge", 1e-6, 1.0, "contextual", "regression with ridge 1e-06, approach 0.6"),
+        ("frames", 1.0, 1.0, "frames", "frames, approach 0.6"),
+        ("ridge", 1.0, 0.0, "line", "straight line"),
+    ],
+)
+def test_models_are_named(family, strength, shrinkage, kind, name):
+    model = Candidate(
+        family=family,
+        strength=strength,
+        approach=0.6,
+        shrinkage=shrinkage,
+        error=torch.zeros(2).double(),
+    )
+    assert (model.kind, model.name) == (kind, name)
+
+
+def test_each_kind_of_columns_has_its_largest_range_as_unit():
+    """Positions, orientation errors and bodies; those that do not move have the unit one."""
+    turn = torch.zeros(2, 90, 3).double()
+    turn[1] = 0.2 * M * torch.tensor([1.0, 0.0, 0.0])
+    position = torch.stack([M * torch.tensor([0.1, 0.4, 0.2]), M * torch.tensor([3.0, 0, 0])])
+    for body in (None, torch.stack([0.7 * M, 0 * M])):
+        each = PoseDMP.fit(S, position, quaternion.exp(turn), 10, body=body)
+        rows = each.motion.response.evaluate(torch.linspace(0, 1, 101).double())[:, 0]
+        shown = each.motion.coordinates().detach() @ rows.mT
+        expected = torch.tensor([[0.4] * 3 + [1.0] * 3 + [0.7], [3.0] * 3 + [0.2] * 3 + [1.0]])
+        found = _scale(each, shown)
+        assert found.shape == (2, 6 if body is None else 7, 1)
+        torch.testing.assert_close(
+            found[..., 0], expected[:, : found.shape[1]].double(), rtol=0.02, atol=0
+        )
+    joints = JointDMP.fit(S, position, 10)
+    shown = joints.coordinates().detach() @ rows.mT
+    torch.testing.assert_close(
+        _scale(joints, shown)[:, :, 0],
+        torch.tensor([[0.4] * 3, [3.0] * 3]).double(),
+        rtol=0.02,
+        atol=0,
+    )
+
+
+def test_a_basis_has_a_function_for_two_samples_at_most():
+    """A detail that ten functions do not show takes more, if there are samples for them."""
+    for frames, expected in ((39, 10), (40, 20)):
+        s = torch.linspace(0, 1, frames, dtype=torch.float64)
+        way = torch.sin(2 * torch.pi * 4 * s)[:, None] * s[:, None]
+        assert _basis_count([s, torch.linspace(0, 1, 90)], [way, 0 * S[:, None]]) == expected
+
+
+def test_columns_and_poses_are_samples():
+    time, values = _samples(([0.0, 1.0, 2.0], [1.0, 2.0, 4.0]))
+    assert time.tolist() == [0, 1, 2]
+    assert values.tolist() == [[1], [2], [4]]
+    time, values = _samples(([0.0, 1.0], [[1.0, 2.0], [3.0, 4.0]]))
+    assert values.tolist() == [[1, 2], [3, 4]]
+
+
+def test_options_and_approaches_are_those_of_the_fit():
+    """Two approaches by default, and smooth fits."""
+    rng = torch.Generator().manual_seed(0)
+    shown = [
+        (time, way + 1e-3 * torch.randn(way.shape, generator=rng).double())
+        for time, way in demonstrations(always, 3)
+    ]
+    times, ways = (list(x) for x in zip(*shown, strict=True))
+    model = learn(shown, n_basis=30)
+    assert {c.approach for c in model.candidates} == {1.0, 0.6}
+    one = learn(shown, n_basis=30, approach=0.8)
+    assert {c.approach for c in one.candidates} == {0.8}
+    assert one.each.motion.response.approach == 0.8
+    for smooth in (True, False):
+        options = {} if smooth else {"smooth": False}
+        found = learn(shown, n_basis=30, approach=0.8, **options).each.coordinates()
+        fitted = JointDMP.fit(times, ways, 30, approach=0.8, smooth=smooth)
+        torch.testing.assert_close(found, fitted.coordinates())
+
+
+@pytest.mark.parametrize(("family", "strength"), [("kernel", 0.5), ("ridge", 0.1)])
+@pytest.mark.parametrize("shrinkage", [1.0, 0.25])
+def test_coordinates_and_durations_are_weighted_means(family, strength, shrinkage):
+    """Durations in their logarithm; the deviation from the straight motion is shrunk."""
+    each = fit_each(by_goal)
+    x = each.coordinates().detach()
+    context = torch.cat([x[..., -2], x[..., -1]], -1)
+    chosen = Candidate(
+        family=family,
+        strength=strength,
+        approach=1.0,
+        shrinkage=shrinkage,
+        error=torch.zeros(12).double(),
+    )
+    parts = {"each": each, "context": context, "frames": None, "chosen": chosen}
+    model = LearnedMotion(by_ends=True, **parts)
+    asked = context[:2] + 0.1
+    w = torch.from_numpy(numpy_weights(family, strength, context.numpy(), asked.numpy()))
+    found = model.at_contexts(asked)
+    middle = torch.einsum("qn,ndm->qdm", w, x)
+    middle[..., :-2] *= shrinkage
+    torch.testing.assert_close(found.coordinates(), middle, rtol=1e-6, atol=1e-8)
+    lasting = (w @ each.duration.log()).exp()
+    torch.testing.assert_close(found.duration, lasting, rtol=1e-6, atol=0)
+    # By start and goal, as they are in the context.
+    start, goal = asked[1, :2], asked[1, 2:]
+    single = model.at(start, goal)
+    torch.testing.assert_close(single.weights, found[1].weights)
+    torch.testing.assert_close(single.duration, found[1].duration)
+    torch.testing.assert_close(torch.cat([single.start, single.goal]), asked[1])
+    assert model.at(start, goal, 3.5).duration.item() == 3.5
+    # By default those that the model predicts for the mean ones.
+    usual = model.at_contexts(context.mean(0, keepdim=True))[0]
+    torch.testing.assert_close(model.at().coordinates(), usual.coordinates())
+    by_context = LearnedMotion(by_ends=False, **parts).at(context=asked[1])
+    torch.testing.assert_close(by_context.coordinates(), middle[1], rtol=1e-6, atol=1e-8)
+
+
+def test_reasons_are_medians_and_percentiles_of_the_errors_in_percent():
+    model = learn(demonstrations(by_goal), n_basis=20)
+    first, *lines = model.reasons.splitlines()
+    assert first == (
+        f"{model.chosen.name}, 20 basis functions; held-out error relative to the range:"
+    )
+    names = ["chosen", "mean", "straight line", "nearest demonstration"]
+    assert [line.split(":")[0] for line in lines] == names
+    errors = {c.name: c.error for c in reversed(model.candidates)}
+    for line, error in zip(
+        lines,
+        (
+            model.chosen.error,
+            errors["mean, approach 1"],
+            errors["straight line"],
+            errors["nearest demonstration, approach 1"],
+        ),
+        strict=True,
+    ):
+        low, high = np.percentile(error, [50, 90])
+        # PyTorch's median of an even number is the lower of the two in the middle.
+        assert line.endswith(
+            f": {100 * error.median():.2f} % median, {100 * high:.2f} % at the 90th percentile"
+        )
+        assert error.median() <= low
+
+
+@pytest.mark.parametrize("strength", [math.inf, 0.0, 0.5])
+def test_files_keep_the_model(strength, tmp_path):
+    chosen = Candidate(
+        family="kernel",
+        strength=strength,
+        approach=1.0,
+        shrinkage=0.5,
+        error=torch.arange(12).double(),
+    )
+    each = fit_each(by_goal)
+    context = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)).double()
+    for by_ends in (False, True):
+        LearnedMotion(
+            each=each, context=context, by_ends=by_ends, frames=None, chosen=chosen
+        ).save(tmp_path / "model")
+        again = LearnedMotion.load(tmp_path / "model")
+        assert again.by_ends is by_ends
+        assert again.candidates == ()
+        assert {**vars(again.chosen), "error": 0} == {**vars(chosen), "error": 0}
+        assert torch.equal(again.chosen.error, chosen.error)
+        assert torch.equal(again.context, context)
+
+
+@pytest.mark.parametrize("context", [5.0, torch.zeros(2, 3)])
+def test_another_number_of_contexts_is_refused(context):
+    with pytest.raises(ValueError, match="one row for each of 3 demonstrations, got"):
+        learn(demonstrations(always, 3), n_basis=10, context=context)
