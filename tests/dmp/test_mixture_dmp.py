@@ -337,6 +337,15 @@ def test_values_are_nearly_exact_unless_noise_is_given(mixture):
         torch.testing.assert_close(mode.mean, expected.mean, rtol=0, atol=0)
 
 
+def test_parallel_ways_are_apart_by_their_positions():
+    """Their velocities are the same."""
+    offset = torch.tensor([1.0, 1.1, 0.9, -1.0, -1.1, -0.9]).double()
+    ways = minimum_jerk(S)[:, None] + offset[:, None, None]
+    mixture = MixtureDMP.fit(JointDMP.fit(2 * S, ways, 10))
+    assert mixture.probability.tolist() == pytest.approx([0.5, 0.5])
+    assert mixture.responsibilities[:3].argmax(1).unique().numel() == 1
+
+
 def test_slack_is_that_of_each_mode(shown):
     tight, loose = (MixtureDMP.fit(shown, slack=slack) for slack in (0.0, 0.5))
     for a, b in zip(tight.modes, loose.modes, strict=True):

@@ -1,8 +1,11 @@
 """Motions each at times of their own: any grid gives what any other gives."""
 
+import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion
+from numpy.polynomial.chebyshev import cheb2poly, poly2cheb
+from scipy.linalg import expm
 from torch.utils._python_dispatch import TorchDispatchMode
 from unchecked import shapes_unchecked
 
@@ -15,7 +18,17 @@ from hrc_learn.dmp import (
     SpringDamper,
     response_of,
 )
-from hrc_learn.dmp.ragged_times import CHUNK, LONG, motion, power_by_power
+from hrc_learn.dmp.ragged_times import (
+    CHUNK,
+    LONG,
+    _lowest_degree,
+    _table,
+    blocks,
+    chunks,
+    motion,
+    power_by_power,
+    spring_rows,
+)
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -240,3 +253,123 @@ def test_a_fit_takes_memory_in_proportion_to_its_samples():
         JointDMP.fit(time, position, 20, smooth=True)
     # Blocks of time have twenty functions and seven columns next to the samples.
     assert largest.size < 40 * len(time)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+@pytest.mark.parametrize("spring", SPRINGS, ids=str)
+def test_a_spring_alone_moves_by_the_exponential_of_its_matrix(spring, order):
+    response = response_of(spring, GaussianBasis(count=12), 0.0)
+    A = np.array([[0, 1], [-spring.alpha * spring.beta, -spring.alpha]])
+    s = np.array([[0.0, 0.1], [0.5, 1.3]])
+    found = spring_rows(response, torch.from_numpy(s), order)
+    for k in np.ndindex(2, 2):
+        expected = (expm(A * s[k]) @ np.linalg.matrix_power(A, order))[0]
+        np.testing.assert_allclose(found[k], expected, atol=1e-9 * abs(A).max() ** order)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-7, 1e-11])
+def test_polynomials_have_the_lowest_degree_within_the_tolerance(tolerance):
+    """Sums of the last Chebyshev coefficients bound the error, relative to those of all."""
+    rng = np.random.default_rng(0)
+    decay = np.array([1.0, 0.3, 100.0]) * np.array([0.02, 0.1, 0.04]) ** np.arange(13)[:, None]
+    cheb = rng.uniform(0.5, 1, (4, 13, 3)) * rng.choice([-1, 1], (4, 13, 3)) * decay
+    powers = np.zeros_like(cheb)
+    for piece, column in np.ndindex(4, 3):
+        powers[piece, :, column] = cheb2poly(cheb[piece, :, column])
+    found = _lowest_degree(torch.from_numpy(powers), tolerance).numpy()
+    tail = np.abs(cheb)[:, ::-1].cumsum(1)[:, ::-1].max(0)
+    needed = int((tail > tolerance * tail[0]).any(1).sum())
+    assert found.shape == (4, needed, 3)
+    assert 3 < needed < 13
+    for piece, column in np.ndindex(4, 3):
+        kept = poly2cheb(found[piece, :, column])
+        size = np.abs(cheb[:, 0, column]).max()
+        np.testing.assert_allclose(kept, cheb[piece, :needed, column], atol=1e-12 * size)
+
+
+def test_a_straight_line_keeps_three_coefficients():
+    line = torch.zeros(2, 13, 1).double()
+    line[:, 1] = 1.0
+    assert _lowest_degree(line, 1e-12).shape == (2, 3, 1)
+
+
+@pytest.mark.parametrize("most", [1, 7, 8, 16, 20, 100])
+def test_blocks_cover_all_samples_once(most):
+    s = torch.zeros(5, 8)
+    seen = torch.zeros(5, 8)
+    for part, steps in blocks(s, most):
+        assert 0 < seen[part, steps].numel() <= most
+        seen[part, steps] += 1
+    assert (seen == 1).all()
+    sizes = [len(s[part]) for part in chunks(s, most)]
+    size = max(1, most // 8)
+    assert sizes == [size] * (5 // size) + [5 % size] * (5 % size > 0)
+
+
+def test_a_batch_is_one_chunk_unless_it_is_long(monkeypatch):
+    assert list(chunks(torch.zeros(5, 8))) == [slice(0, 2**16 // 8)]
+    assert list(chunks(torch.zeros(5, 0))) == [slice(0, 2**16)]
+    monkeypatch.setitem(CHUNK, "cpu", 16)
+    assert list(chunks(torch.zeros(5, 8))) == [slice(0, 2), slice(2, 4), slice(4, 6)]
+    assert list(chunks(torch.zeros(5, 8, device="meta"))) == list(chunks(torch.zeros(5, 8)))
+
+
+@pytest.mark.parametrize("rising", [False, True])
+@pytest.mark.parametrize(("basis", "approach"), BASES.values(), ids=BASES)
+def test_chunks_of_a_batch_are_what_it_is_at_once(basis, approach, rising, monkeypatch):
+    response = response_of(SpringDamper(), basis, approach)
+    s, x = random_motions(basis, batch=5)
+    s = s.sort(-1).values if rising else s
+    results = []
+    for most in (1000, 60, 1):
+        monkeypatch.setitem(CHUNK, "cpu", most)
+        values = x.clone().requires_grad_()
+        y = motion(response, s, values, 0)
+        (gradient,) = torch.autograd.grad((y * y.detach().sin()).sum(), values)
+        results.append((y, gradient))
+    # Gradients as of the product with the dense matrix.
+    dense = torch.einsum("btd,btm->bdm", y.detach().sin(), response.evaluate(s)[..., 0, :])
+    size = dense.abs().max()
+    torch.testing.assert_close(results[0][1] / size, dense / size, rtol=0, atol=1e-9)
+    for found in results[1:]:
+        torch.testing.assert_close(found, results[0], rtol=1e-10, atol=1e-10 * size.item())
+
+
+@pytest.mark.parametrize("order", [0, 1, 3])
+@pytest.mark.parametrize(("basis", "approach"), BASES.values(), ids=BASES)
+def test_pieces_meet_at_their_knots(basis, approach, order):
+    """Exactly at the ends of pieces, around them, and where one period follows another."""
+    response = response_of(SpringDamper(), basis, approach)
+    interval, end = response.forced.interval, response.forced.end
+    knots = interval * torch.arange(len(response.forced.coefficients) + 2).double()
+    s = torch.cat([knots, torch.tensor([end, 2 * end, 7 * end]).double()])[None]
+    _, x = random_motions(basis, batch=1)
+    y, before, after = (
+        motion(response, (s + h).clamp(min=0), x, order) for h in (0.0, -1e-9, 1e-9)
+    )
+    size = y.abs().max().item()
+    for near in (before, after) if order < 2 else ():
+        torch.testing.assert_close(near, y, rtol=0, atol=1e-4 * size)
+    rates = (motion(response, s + h, x, order - 1) for h in (1e-5, 2e-5)) if order else ()
+    if order:
+        one, two = rates
+        middle = motion(response, s + 1.5e-5, x, order)
+        slope = (two - one) / 1e-5
+        torch.testing.assert_close(slope, middle, rtol=0, atol=1e-4 * middle.abs().max().item())
+
+
+def test_tables_are_kept_and_shorter_in_single_precision():
+    response = response_of(SpringDamper(), GaussianBasis(count=12), 1.0)
+    double, single = (torch.zeros(1, dtype=dtype) for dtype in (torch.float64, torch.float32))
+    table = _table(response, 0, double)
+    assert _table(response, 0, double) is table
+    assert _table(response, 0, single).size < table.size <= 14
+    assert _table(response, 1, double) is not table
+    assert _table(response, 1, double).order == 1
+    # One more piece is after the forcing, unless it is periodic.
+    pieces = len(response.forced.coefficients)
+    assert table.pieces == pieces + 1
+    assert (table.others, table.matrix.shape) == (1, (15, (pieces + 1) * table.size))
+    periodic = response_of(SpringDamper(), PeriodicBasis(count=9), 0.0)
+    assert _table(periodic, 0, double).pieces == len(periodic.forced.coefficients)
+    assert _table(periodic, 0, double).others == 2
