@@ -323,16 +323,19 @@ def test_every_model_is_shrunk_by_the_factor_of_least_error():
             np.testing.assert_allclose(candidate.error, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("count", "families"), [(3, {"kernel"}), (4, {"kernel", "ridge"})])
+@pytest.mark.parametrize(
+    ("count", "families"), [(2, {"kernel"}), (3, {"kernel"}), (4, {"kernel", "ridge"})]
+)
 def test_regressions_need_four_demonstrations(count, families):
     model = learn(demonstrations(by_goal, count), n_basis=10)
     assert {c.family for c in model.candidates} == families
+    assert len(model.candidates) == 2 * 3 * (6 if count < 4 else 11)
     fits = [model.each]
     if "ridge" in families:
         chosen = choose(fits, regression_only=True).chosen
         assert (chosen.family, chosen.shrinkage) == ("ridge", 1.0)
     else:
-        with pytest.raises(ValueError, match="needs 4 demonstrations or more, got 3"):
+        with pytest.raises(ValueError, match=f"needs 4 demonstrations or more, got {count}"):
             choose(fits, regression_only=True)
 
 

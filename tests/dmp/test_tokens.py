@@ -1,7 +1,7 @@
 """Tokens of motions against what encodes, bounds and joins them in other ways."""
 
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -9,8 +9,16 @@ import torch
 from scipy.interpolate import BSpline
 
 from hrc_learn.dmp.motion_components import spline
-from hrc_learn.dmp.token_code import TokenCode
-from hrc_learn.dmp.tokens import ActionProcessor, MotionTokenizer
+from hrc_learn.dmp.samples import check_samples
+from hrc_learn.dmp.token_code import Interval, TokenCode
+from hrc_learn.dmp.tokens import (
+    ActionProcessor,
+    MotionTokenizer,
+    _levels,
+    _rounded,
+    _switches,
+    _units,
+)
 
 TIME = torch.linspace(0, 1, 21, dtype=torch.float64)
 VOCABULARY = 64
@@ -323,6 +331,24 @@ def test_processors_keep_fasts_interface(processor, tmp_path):
     assert np.array_equal(loaded.decode(tokens), made)
 
 
+def test_a_processor_has_the_accuracy_of_fasts_scale():
+    """Tolerance 0.07 / scale, with encoded starts and time in frames; 1024 tokens."""
+    chunks = motions(60)[0].numpy()
+    for options, scale, vocabulary in (({}, 10, 1024), ({"scale": 2.0}, 2, 1024)):
+        made = ActionProcessor.fit(list(chunks), **options)
+        expected = MotionTokenizer.fit(
+            np.arange(21), chunks, vocabulary, start_known=False, tolerance=0.07 / scale
+        )
+        assert made.vocab_size == vocabulary
+        assert made.tokenizer.config == expected.config
+        assert made.tokenizer.components.known == 0
+    tokens = made(chunks[:2])
+    assert [row[: made.tokenizer.length(row)] for row in tokens] == tokens
+    assert made.decode(tokens).shape == (2, 21, 3)
+    assert made.decode(tokens, time_horizon=7).shape == (2, 7, 3)
+    np.testing.assert_allclose(made.decode(tokens, time_horizon=7), made.decode(tokens)[:, :7])
+
+
 @pytest.mark.slow
 def test_lerobot_measures_a_processor(processor):
     from lerobot.scripts.lerobot_train_tokenizer import compute_compression_stats
@@ -332,6 +358,177 @@ def test_lerobot_measures_a_processor(processor):
     counts = [len(row) for row in processor(chunks)]
     assert statistics["mean_token_length"] == pytest.approx(np.mean(counts))
     assert statistics["compression_ratio"] > 3
+
+
+def test_units_of_columns_are_quantiles_and_limits_a_tenth_beyond():
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(500, 4)) * (1.0, 30.0, 0.0, 0.0) + (0.0, 5.0, 2.0, 0.0)
+    seen[0, 3] = 4.0  # within its quantiles it never moves
+    found = {name: value.numpy() for name, value in _units(seen).items()}
+    bottom, top = np.quantile(seen, 0.01, axis=0), np.quantile(seen, 0.99, axis=0)
+    np.testing.assert_allclose(found["centre"], (bottom + top) / 2)
+    np.testing.assert_allclose(found["scale"], [*(top - bottom)[:2], 1.0, 4.0])
+    low, high = seen.min(0), seen.max(0)
+    np.testing.assert_allclose(found["low"], low - 0.1 * (high - low))
+    np.testing.assert_allclose(found["high"], high + 0.1 * (high - low))
+    # Rounding never leads beyond the tenth.
+    assert (found["low"] >= low - 0.1 * (high - low)).all()
+    assert (found["high"] <= high + 0.1 * (high - low)).all()
+
+
+def test_columns_of_two_to_four_values_are_steps():
+    values = [[0], [1, 2], [1, 2, 3, 4], [1, 2, 3, 4, 5]]
+    seen = np.stack([np.resize(v, 40)[::-1] for v in values], 1).astype(float)
+    chosen, levels = _levels(seen, None)
+    assert chosen == [1, 2]
+    assert levels.tolist() == [[1, 2, 2, 2], [1, 2, 3, 4]]
+    chosen, levels = _levels(seen, [1, 0, 1])
+    assert chosen == [0, 1]
+    assert levels.tolist() == [[0, 0], [1, 2]]
+    chosen, levels = _levels(seen, [])
+    assert (chosen, levels.shape) == ([], (0, 1))
+    with pytest.raises(ValueError, match="steps must be columns of 4 values or fewer"):
+        _levels(seen, [3])
+
+
+def test_switches_are_slots_with_the_sign_of_their_direction():
+    """Slot k is (k - 1) / slots of the duration; of a jump over two values there are two."""
+    time = torch.linspace(0, 2, 11).double()
+    first = [0, 0, 1, 1, 2, 0, 0, 0, 0, 0, 0]
+    second = [5, 0, 5, 0, 5, 0, 5, 0, 5, 0, 5]
+    smooth = list(range(11))
+    motion = torch.tensor([first, smooth, second]).double().T[None]
+    levels = torch.tensor([[0.0, 1.0, 2.0], [0.0, 5.0, 5.0]]).double()
+    samples = check_samples(time, motion)
+    start = torch.tensor([[0.0, 0.0]]).double()
+    found = _switches(samples, start, [0, 2], levels, 10)
+    assert found.tolist() == [[3, 5, -6, -6, 1, -2, 3, -4]]
+    # Twice as many slots, and a start at another value.
+    start = torch.tensor([[1.0, 5.0]]).double()
+    found = _switches(samples, start, [0, 2], levels, 20)
+    assert found.tolist() == [[-1, 5, 9, -11, -3, 5, -7, 9]]
+    # Samples that do not count switch nothing.
+    mask = torch.ones(1, 11).bool()
+    mask[0, 2:5] = False
+    samples = check_samples(time, motion, mask=mask)
+    found = _switches(samples, torch.tensor([[0.0, 5.0]]).double(), [0, 2], levels, 10)
+    assert found.tolist()[0][0] == -6
+
+
+def test_numbers_are_rounded_to_the_least_error_and_price():
+    """Of zero and both neighbours, never above the largest magnitude."""
+    rng = np.random.default_rng(0)
+    table = np.array([[0.5, 0.3, 0.1, 0.1, 0.0], [0.97, 0.01, 0.01, 0.005, 0.005]])
+    bits = TokenCode(16, table).bits()
+    x = rng.uniform(-5, 5, (300, 2))
+    x[:2] = [[0.0, 0.0], [3.0, -4.0]]
+    found = _rounded(torch.from_numpy(x), bits).numpy()
+    price = (np.log(4) / 12) * bits.numpy()
+    for value, result in zip(x, found, strict=True):
+        for k, largest in enumerate((3, 4)):
+            size = abs(value[k])
+            choices = {min(m, largest) for m in (0, int(np.floor(size)), int(np.ceil(size)))}
+            cost = {m: (m - size) ** 2 + price[k, m] for m in choices}
+            assert cost[abs(int(result[k]))] == pytest.approx(min(cost.values()), abs=1e-3)
+            assert result[k] * value[k] >= 0
+    assert (np.abs(found) > 0).any(0).all()
+    whole = _rounded(torch.from_numpy(x), None)
+    np.testing.assert_array_equal(whole, np.round(x))
+
+
+@pytest.fixture(scope="module")
+def stepping() -> tuple[MotionTokenizer, torch.Tensor]:
+    """Tokenizer of a column, and of two of steps: of three values and of two."""
+    position, _ = motions(120, columns=1)
+    rng = torch.Generator().manual_seed(1)
+    at = torch.randint(1, 21, (120, 2), generator=rng).sort(1).values
+    frames = torch.arange(21)
+    up = (frames >= at[:, :1]).double() + (frames >= at[:, 1:])
+    whole = torch.stack([up - 1, position[..., 0], 0.5 * (frames < at[:, 1:])], -1)
+    return MotionTokenizer.fit(TIME, whole, VOCABULARY), whole
+
+
+def test_steps_of_several_values_are_restored(stepping):
+    tokenizer, whole = stepping
+    assert tokenizer.steps == [0, 2]
+    assert tokenizer.levels.tolist() == [[-1, 0, 1], [0, 0.5, 0.5]]
+    assert tokenizer.config["slots"] == 20
+    ids = tokenizer.encode(TIME, whole)
+    made = tokenizer.decode(ids, TIME, whole[:, 0])
+    assert torch.equal(made[..., [0, 2]], whole[..., [0, 2]])
+    # A switch is at its time, not before.
+    for shift, same in ((-1e-6, False), (1e-6, True)):
+        times = TIME[1:-1] + shift
+        late = tokenizer.decode(ids, times, whole[:, 0])[..., [0, 2]]
+        expected = whole[:, 1:-1] if same else whole[:, :-2]
+        assert torch.equal(late, expected[..., [0, 2]])
+    # From another start each value is as many steps further.
+    lower = whole[:, 0].clone()
+    lower[:, 0], lower[:, 2] = -1.0, 0.0
+    made = tokenizer.decode(ids, TIME, lower)[..., 0]
+    switched = (whole[..., 0] - whole[:, :1, 0]).clamp(max=2)
+    assert torch.equal(made, switched - 1)
+    # By default the first value, and zero in every derivative.
+    made = tokenizer.decode([[]], TIME)
+    assert (made[..., 0] == -1).all()
+    assert (made[..., 2] == 0).all()
+    for order in (1, 2):
+        rates = tokenizer.decode(ids, TIME, whole[:, 0], order=order)
+        assert not rates[..., [0, 2]].any()
+        assert rates[..., 1].any()
+
+
+def test_a_start_between_two_values_stays_until_a_switch(stepping):
+    tokenizer, whole = stepping
+    start = torch.tensor([-0.8, 0.0, 0.4], dtype=torch.float64)
+    made = tokenizer.decode([[]], TIME, start)
+    torch.testing.assert_close(made[0, :, [0, 2]], start[[0, 2]].expand(21, -1))
+    ids = tokenizer.encode(TIME, whole[:1])
+    made = tokenizer.decode(ids, TIME, start)[0, :, 0]
+    switched = whole[0, :, 0] > whole[0, 0, 0]
+    assert switched.any()
+    assert (made[~switched] == -0.8).all()
+    assert torch.equal(made[switched], (whole[0, :, 0] - whole[0, 0, 0])[switched] - 1)
+
+
+@pytest.mark.parametrize(("frames", "slots"), [(64, 63), (65, 64), (66, 64)])
+def test_there_are_64_slots_at_most(frames, slots):
+    time = torch.linspace(0, 1, frames).double()
+    gripper = (time > torch.tensor([[0.3], [0.5], [0.7]])).double()
+    whole = torch.stack([time.sin().expand(3, -1) + gripper / 9, gripper], -1)
+    assert MotionTokenizer.fit(time, whole, 16).config["slots"] == slots
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        ({"vocabulary_size": 16}, False),
+        ({"vocabulary_size": 15}, True),
+        ({"vocabulary_size": 32768}, False),
+        ({"vocabulary_size": 32769}, True),
+        ({"tolerance": 0.999}, False),
+        ({"tolerance": 1.0}, True),
+    ],
+)
+def test_limits_of_arguments_are_those_of_the_message(change, refused):
+    arguments = {"time": TIME, "motions": motions(2)[0]} | change
+    if refused:
+        with pytest.raises(ValueError, match=next(iter(change))):
+            MotionTokenizer.fit(**arguments)
+    else:
+        made = MotionTokenizer.fit(**arguments)
+        assert made.vocabulary_size == change.get("vocabulary_size", 1024)
+
+
+@pytest.mark.parametrize("columns", [1, 4])
+def test_the_tolerance_is_the_error_of_each_column(columns):
+    position, _ = motions(120, columns=columns)
+    tokenizer = MotionTokenizer.fit(TIME, position, VOCABULARY, tolerance=0.02)
+    made = tokenizer.decode(tokenizer.encode(TIME, position), TIME, position[:, 0])
+    seen = position.reshape(-1, columns)
+    scale = seen.quantile(0.99, dim=0) - seen.quantile(0.01, dim=0)
+    error = ((made - position) / scale).square().mean().sqrt().item()
+    assert 0.017 < error < 0.023
 
 
 class TestCode:
@@ -383,3 +580,126 @@ class TestCode:
         """Questions halve what is left: 127 values are told apart by two or three of 15."""
         code = TokenCode(16, np.full((1, 64), 1 / 64))
         assert max(len(code.encode([value])) for value in range(-63, 64)) <= 3
+
+    def test_tables_are_counts_and_a_laplace_distribution(self):
+        """Of 20 vectors, with the mean magnitude and 0.02, up to twice the largest one."""
+        values = np.array([[0, 3, 0], [-1, 0, 0], [2, -3, 0], [0, 1, 0], [-2, 2, 0]])
+        table = TokenCode.fit(values, 16).table
+        for k, largest in enumerate((4, 6, 2)):
+            size = np.abs(values[:, k])
+            laplace = np.exp(-np.arange(7) / (size.mean() + 0.02)) + 1e-12
+            laplace[largest + 1 :] = 0
+            expected = 20 * laplace / laplace.sum() + [(size == m).sum() for m in range(7)]
+            np.testing.assert_allclose(table[k], expected / expected.sum())
+        assert TokenCode.fit(np.zeros((4, 0), int), 16).size == 0
+
+    def test_bits_are_those_of_a_magnitude_and_its_sign(self):
+        table = np.array([[0.5, 0.25, 0.25], [0.75, 0.25, 0.0]])
+        bits = TokenCode(16, table).bits()
+        assert bits.tolist() == [[1, 3, 3], [-np.log2(0.75), 3, np.inf]]
+
+    TABLE = np.array([[0.4, 0.3, 0.2, 0.1], [0.7, 0.3, 0.0, 0.0], [0.25, 0.25, 0.25, 0.25]])
+
+    @pytest.mark.parametrize("vocabulary", [16, 20, 64, 500])
+    def test_every_vector_is_restored_from_tokens_of_its_own(self, vocabulary):
+        code = TokenCode(vocabulary, self.TABLE)
+        ranges = [range(-m, m + 1) for m in (3, 1, 3)]
+        seen = set()
+        for vector in product(*ranges):
+            ids = code.encode(vector)
+            assert all(0 <= i < vocabulary for i in ids)
+            seen.add(tuple(ids))
+            # Tokens after the end, or after a whole vector, change nothing.
+            for more in ([], [0, 3], [7]) if ids[-1] == 0 or code.decode(ids)[1] else ([],):
+                found, complete = code.decode(ids + more)
+                assert complete
+                restored = [0, 0, 0]
+                for index, sign, low, high in found:
+                    assert low == high
+                    restored[index] = sign * low
+                assert tuple(restored) == vector
+        assert len(seen) == 7 * 3 * 7
+        assert code.encode([9, -9, 9]) == code.encode([3, -1, 3])
+
+    def test_a_prefix_is_what_is_known_so_far(self):
+        code, values = self.code(16)
+        for row in values[:20].tolist():
+            ids = code.encode(row)
+            for k in range(len(ids)):
+                found, complete = code.decode(ids[:k])
+                assert not complete
+                for index, sign, low, high in found:
+                    assert sign * row[index] > 0
+                    assert low <= abs(row[index]) <= high
+                assert [f.index for f in found] == sorted({f.index for f in found})
+        assert code.decode([]) == ([], False)
+
+    @pytest.mark.parametrize("vocabulary", [16, 64])
+    def test_trees_split_the_most_probable_leaf(self, vocabulary):
+        """Tunstall's code: no leaf is more probable than a node that was split."""
+        code, _ = self.code(vocabulary)
+        roots = [
+            Interval(0, 0, 0, code._largest[0]),
+            Interval(3, -1, 2, code._largest[3]),
+            Interval(5, 0, 1, 3),
+        ]
+        for root in roots:
+            tree = code._tree(root)
+            assert len(tree.after) == len(tree.decided) == vocabulary - 1
+            leaves = []
+            for after, decided in zip(tree.after, tree.decided, strict=True):
+                known = {part.index: part for part in (*decided, after)}
+                probability = 1.0
+                for k in range(root.index, after.index + 1):
+                    if k == code.size:
+                        break
+                    part = known.get(k, Interval(k, 0, 0, 0))
+                    chance = code.table[k, part.low : part.high + 1].sum()
+                    probability *= chance / 2 if part.sign else chance
+                whole = code.table[root.index, root.low : root.high + 1].sum()
+                leaves.append(probability / (whole / 2 if root.sign else whole))
+            assert sum(leaves) == pytest.approx(1)
+            splits = []
+
+            def total(node, tree=tree, leaves=leaves, splits=splits):
+                if node < 0:
+                    return leaves[-1 - node]
+                found = sum(total(tree.branches[2 * node + i]) for i in (0, 1))
+                splits.append(found)
+                return found
+
+            assert total(0) == pytest.approx(1)
+            assert len(splits) == vocabulary - 2
+            assert max(leaves) <= min(splits) * (1 + 1e-9)
+            # Leaves are numbered in the order of the questions.
+            met = [-1 - node for node in tree.branches if node < 0]
+            assert met == sorted(met)
+
+    def test_a_question_halves_what_is_left_as_nearly_as_it_can(self):
+        code = TokenCode(16, np.array([[0.1, 0.2, 0.05, 0.3, 0.25, 0.1]]))
+        for low, high in ((0, 5), (1, 5), (1, 4), (2, 5), (2, 3), (3, 4), (4, 5)):
+            for sign in (1, -1) if low else (0,):
+                threshold, probability, first, second = code._split(
+                    Interval(0, sign, low, high)
+                )
+                row = code.table[0]
+                total = row[low : high + 1].sum()
+                if low:
+                    # The first magnitude up to which more than a half lies.
+                    below = [row[low : t + 1].sum() / total for t in range(low, high)]
+                    more = [t for t, p in enumerate(below, low) if p > 0.5]
+                    assert threshold == min(more, default=high - 1)
+                else:
+                    assert threshold == 0  # the first question is whether it is zero
+                expected = row[low : threshold + 1].sum() / total
+                assert probability == pytest.approx(expected)
+                assert (first, second) == (
+                    Interval(0, sign, low, threshold),
+                    Interval(0, sign, threshold + 1, high),
+                )
+        assert code._split(Interval(0, 0, 1, 5)) == (
+            -1,
+            0.5,
+            Interval(0, 1, 1, 5),
+            Interval(0, -1, 1, 5),
+        )
