@@ -4,11 +4,12 @@ import torch
 from demo_motions import minimum_jerk
 from scipy.spatial.transform import Rotation
 
-from hrc_learn.dmp import JointDMP
+from hrc_learn.dmp import JointDMP, SpringDamper
 from hrc_learn.dmp.coupling import (
     phase_stopping,
     repulsion,
     steering,
+    velocity_coupling,
 )
 
 pytestmark = pytest.mark.simulation
@@ -139,3 +140,45 @@ def test_a_held_robot_is_waited_for():
                 on_path = dmp.rollout(time=3 * state.s[None]).position[0]
                 torch.testing.assert_close(state.position, on_path, rtol=0, atol=1e-9)
     torch.testing.assert_close(state.position, dmp.goal, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("distance", [2e-3, 1e-3, 1e-4])
+def test_repulsion_is_constant_within_a_millimetre(distance):
+    """It is gain (1 / d - 1 / reach) / d^2, with d at least 1 mm, along the direction."""
+    direction = np.array([0.6, 0.0, -0.8])
+    found = repulsion(torch.from_numpy(distance * direction), torch.zeros(1, 3), reach=0.1)
+    d = max(distance, 1e-3)
+    strength = 1e-3 * (1 / d - 1 / 0.1) / d**2
+    np.testing.assert_allclose(found, strength * direction * distance / d, rtol=1e-6)
+
+
+def test_repulsion_of_several_obstacles_adds_up_and_ends_at_the_reach():
+    rng = np.random.default_rng(0)
+    position = torch.from_numpy(rng.uniform(-1, 1, (2, 5, 3)))
+    obstacles = torch.from_numpy(rng.uniform(-1, 1, (2, 1, 3, 3)))
+    whole = repulsion(position, obstacles, reach=0.8)
+    single = sum(repulsion(position, obstacles[..., k : k + 1, :], reach=0.8) for k in range(3))
+    torch.testing.assert_close(whole, single)
+    away = torch.tensor([[0.0, 0.0, 0.7999], [0.0, 0.0, 0.8], [0.0, 0.0, 3.0]]).double()
+    acting = repulsion(away, torch.zeros(1, 3), reach=0.8).norm(dim=-1) > 0
+    assert acting.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("given", [{}, {"lead": 0.0}, {"lead": 0.7}])
+def test_a_velocity_acts_as_a_term_added_to_the_printed_system(given):
+    """tau z' = alpha (beta (g - y) - z) + lead tau C' and tau y' = z + C."""
+    alpha, beta, tau = 20.0, 4.0, torch.tensor([1.5, 0.8]).double()
+    y, z, g, t, h = 0.3, -0.2, 1.0, 0.4, 1e-5
+
+    def C(t):
+        return tau * np.sin(2.0 * t)
+
+    rate_of_C = (C(t + h) - C(t - h)) / (2 * h)
+    z_rate = (alpha * (beta * (g - y) - z) + given.get("lead", 0.0) * tau * rate_of_C) / tau
+    printed = (z_rate + rate_of_C) / tau
+    # The same state without C: y' = z / tau, so z there is z + C.
+    plain = alpha * (beta * (g - y) - (z + C(t))) / tau**2
+    velocity, acceleration = (C(t) / tau)[:, None], (rate_of_C / tau)[:, None]
+    spring = SpringDamper(alpha=alpha, beta=beta)
+    found = velocity_coupling(velocity, acceleration, spring=spring, duration=tau, **given)
+    torch.testing.assert_close(plain + found[:, 0], printed, rtol=1e-6, atol=1e-8)
