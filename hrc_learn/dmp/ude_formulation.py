@@ -155,8 +155,9 @@ class UdeMotion(Trajectory):
         z = self._state - torch.stack([linear.position, linear.velocity], dim=-2)
         free = self._response.spring.acceleration(z[..., 0, :], z[..., 1, :])
         slope = linear.acceleration + free
-        drift = torch.func.jvp(axis_drift, (e, v), (rate, slope))[1]
-        return (slope + drift) / tau**2
+        # v' is linear in e'', with the map that turns e' to v; `axis_drift` inverts that.
+        rest = slope - drift_free_slope(e, rate, torch.zeros_like(rate))
+        return (rest + axis_drift(e, rest)) / tau**2
 
     @cached_property
     def _state(self) -> Float[Tensor, "*batch T 2 3"]:

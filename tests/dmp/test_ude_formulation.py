@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hrc_learn.dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import angular_velocity
-from hrc_learn.dmp.ude_formulation import UdePrimitive
+from hrc_learn.dmp.ude_formulation import UdePrimitive, _state_operator
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate
 
@@ -188,3 +188,92 @@ def test_a_coupling_pushes_the_angular_velocity_as_it_does_in_the_other_formulat
 def test_jerk_is_refused(dmp):
     with pytest.raises(ValueError, match="'ude' has no jerk"):
         _ = dmp.motion.rollout().jerk
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Three turns of one duration each, with wandering axes."""
+    time, q = turning_motion()
+    turned = [quaternion.exp(k * quaternion.log(q)) for k in (1.0, 0.6, 1.3)]
+    return OrientationDMP.fit(
+        torch.stack([k * time for k in (1.0, 1.5, 0.7)]),
+        torch.stack(turned),
+        n_basis=12,
+        formulation="ude",
+    )
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["one grid", "times of their own"])
+def test_a_batch_is_a_loop(batch, own):
+    time = torch.linspace(0, 0.2, 5, dtype=torch.float64)
+    times = torch.stack([time, time.flip(0), 0.8 * time]) if own else time
+    together = batch.rollout(times, duration=torch.tensor([1.0, 1.4, 0.6]).double())
+    for i, one in enumerate(batch):
+        alone = one.rollout(times[i] if own else time, duration=(1.0, 1.4, 0.6)[i])
+        for name in ("orientation", "angular_velocity", "angular_acceleration"):
+            made, expected = getattr(together, name)[i], getattr(alone, name)
+            torch.testing.assert_close(made, expected, rtol=1e-6, atol=1e-6, msg=name)
+
+
+def test_rates_are_per_second_at_any_duration(dmp):
+    """By central differences, with a start that turns."""
+    h = 1e-4
+    t = torch.tensor([0.3, 1.1, 2.4], dtype=torch.float64)
+    grid = (t[:, None] + torch.tensor([-h, 0.0, h])).flatten()
+    with torch.no_grad():
+        made = dmp.motion.rollout(grid, duration=2.5)
+    y, rate, second = (
+        x.unflatten(0, (3, 3)) for x in (made.position, made.velocity, made.acceleration)
+    )
+    central = (y[:, 2] - y[:, 0]) / (2 * h)
+    torch.testing.assert_close(rate[:, 1], central, rtol=1e-5, atol=1e-6)
+    central = (rate[:, 2] - rate[:, 0]) / (2 * h)
+    torch.testing.assert_close(second[:, 1], central, rtol=1e-4, atol=1e-5)
+
+
+def test_reports_are_of_the_errors_that_were_fitted():
+    time, q = turning_motion()
+    motion = OrientationDMP.fit(time, q, n_basis=8, formulation="ude").motion
+    log = OrientationDMP.fit(time, q, n_basis=8)
+    # The other formulation follows the same path, whose samples it was fitted to.
+    shown = log.motion.rollout().position
+    torch.testing.assert_close(motion.rollout().position, shown, rtol=0, atol=1e-3)
+    report, other = motion.fit_report, log.motion.fit_report
+    assert ((report.rmse - other.rmse).abs() < 0.3 * other.rmse).all()
+
+
+@pytest.mark.parametrize(("turn", "refused"), [(6.27, False), (6.3, True)])
+def test_the_end_of_a_whole_turn_is_the_limit(turn, refused):
+    s = torch.linspace(0, 1, 150, dtype=torch.float64)
+    axis = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
+    q = quaternion.exp(turn * minimum_jerk(s)[:, None] * axis)
+    if refused:
+        with pytest.raises(ValueError, match="use 'log'"):
+            OrientationDMP.fit(s, q, formulation="ude")
+    else:
+        dmp = OrientationDMP.fit(s, q, formulation="ude")
+        assert quaternion.angle(dmp.rollout().orientation, q).max() < 1e-3
+
+
+@pytest.mark.gradients
+def test_compilers_call_what_runs_otherwise_with_its_gradients(batch):
+    """The operators that stand for the integration."""
+    motion = batch.motion
+    s = torch.tensor([[0.0, 0.012, 0.03, 0.2]] * 3, dtype=torch.float64)
+    made = motion.rollout(s * motion.duration[:, None])
+    x = made._coordinates.detach()
+    found = _state_operator(x, s, motion.response.name)
+    torch.testing.assert_close(found, made.integrate())
+    small, times = x[:1].clone().requires_grad_(), s[:1, 1:3].clone().requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x, s: _state_operator(x, s, motion.response.name),
+        (small, times),
+        atol=1e-5,
+        fast_mode=True,
+    )
+
+
+def test_coordinates_of_a_motion_that_is_not_linear_are_refused(dmp):
+    for call in (dmp.motion.coordinates, dmp.motion.with_coordinates):
+        with pytest.raises(ValueError, match="'ude' is not linear: fit with 'log'"):
+            call()
