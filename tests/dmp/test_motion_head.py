@@ -1,5 +1,6 @@
 """Heads of networks: what parameters mean, from which state, and how likely."""
 
+import math
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ from torch.distributions import MultivariateNormal, kl_divergence
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, MotionHead
+from hrc_learn.dmp.motion_head import _modes
 
 HEADS = {
     "fixed": {"duration": 1.5},
@@ -356,3 +358,150 @@ for options in ({}, {"duration": (1.0, 2.0), "delay": 0.3}):
 def test_compiles_without_a_break():
     """In a process of its own: a compiler cannot follow the shape checks of these tests."""
     subprocess.run([sys.executable, "-c", COMPILED], check=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "linear", "timing"),
+    [
+        ({}, 22, 0),
+        ({"n_basis": 6}, 14, 0),
+        ({"duration": (2.0, 2.0)}, 22, 0),
+        ({"duration": (1.0, 2.0)}, 22, 1),
+        ({"delay": 0.1}, 22, 1),
+        ({"duration": (1.0, 2.0), "delay": 0.1}, 22, 2),
+    ],
+)
+def test_parameters_are_weights_goals_and_what_has_a_range(options, linear, timing):
+    head = MotionHead(2, **options)
+    counts = head.n_linear, head.n_timing, head.n_parameters
+    assert counts == (linear, timing, linear + timing)
+    assert head.amplitude.tolist() == [1.0, 1.0]
+    motion = head(torch.zeros(head.n_parameters), [0.0, 1.0], [0.0, 0.0])
+    low, high = options.get("duration", (1.0, 1.0))
+    assert motion.duration.item() == pytest.approx((low * high) ** 0.5)
+    assert motion.delay.item() == pytest.approx(options.get("delay", 0.0) / 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "refused"),
+    [
+        ({"duration": 0.0}, True),
+        ({"duration": (0.0, 1.0)}, True),
+        ({"duration": math.inf}, True),
+        ({"duration": (1.0, math.inf)}, True),
+        ({"duration": 1e-6}, False),
+        ({"delay": -1e-9}, True),
+        ({"delay": math.inf}, True),
+        ({"delay": 0.0}, False),
+        ({"amplitude": 0.0}, True),
+        ({"amplitude": -1.0}, True),
+    ],
+)
+def test_numbers_of_a_head_have_the_right_sign(options, refused):
+    if refused:
+        with pytest.raises(ValueError, match=next(iter(options))):
+            MotionHead(2, **options)
+    else:
+        assert MotionHead(2, **options).n_timing == 0
+
+
+def test_modes_have_positive_means_and_unit_power_together():
+    head = MotionHead(1, 12).double()
+    s = torch.linspace(0, 1, 2001).double()
+    y = head.response.evaluate(s)[:, 0, :12] @ _modes(head.response)
+    assert (y.mean(0) >= -1e-9).all()
+    assert y[:, :3].mean(0).max() > 0.1
+    assert y.square().mean(0).sum().item() == pytest.approx(1, rel=1e-2)
+    # The mean square of the finest is as small as white forcing makes it.
+    assert y[:, -1].square().mean() < 1e-3 * y[:, 0].square().mean()
+
+
+@pytest.mark.parametrize("noise", [{}, {"noise": 0.05}])
+def test_encoded_parameters_are_the_most_likely_ones(head, noise):
+    """By Bayes' rule with a unit normal prior, and noise relative to the amplitude."""
+    z = random(head.n_parameters)
+    start, velocity = random(2, seed=1), random(2, seed=2)
+    time = TIME[::4]
+    L = head.n_linear
+    shown = head(z, time, start, velocity).position + 0.02 * random(len(time), 2, seed=4)
+    shown[0] = start
+
+    def path(linear):
+        motion = head(torch.cat([linear, z[L:]]), time, start, velocity)
+        return (motion.position / head.amplitude).flatten()
+
+    zero = torch.zeros(L).double()
+    J = torch.autograd.functional.jacobian(path, zero)
+    deviation = noise.get("noise", 1e-4)
+    missing = (shown / head.amplitude).flatten() - path(zero)
+    normal = J.mT @ J + deviation**2 * torch.eye(L).double()
+    expected = torch.linalg.solve(normal, J.mT @ missing)
+    found = head.encode(time, shown, velocity, timing=z[L:], **noise)
+    torch.testing.assert_close(found[:L], expected, rtol=1e-4, atol=1e-4)
+    assert torch.equal(found[L:], z[L:])
+    # Of timing that is not given, the parameters are zero.
+    assert not head.encode(time, shown, velocity, **noise)[L:].any()
+    with pytest.raises(ValueError, match="noise"):
+        head.encode(time, shown, noise=0.0)
+
+
+def test_divergence_is_by_default_of_positions_known_to_a_thousandth(head, factor):
+    z, start = random(3, head.n_parameters), torch.zeros(3, 2).double()
+    p, q = (head.distribution(z, k * factor, start) for k in (1.0, 1.2))
+    time = TIME[::8]
+    torch.testing.assert_close(p.kl(q, time), p.kl(q, time, noise=1e-3), rtol=0, atol=0)
+    assert (p.kl(q, time) - p.kl(q, time, noise=1.5e-3)).abs().min() > 0
+
+
+def test_times_of_a_motion_are_those_asked_but_during_its_delay(head):
+    z, start = random(3, head.n_parameters), random(3, 2, seed=1)
+    motion = head(z, TIME, start)
+    expected = torch.maximum(TIME.expand(3, -1), motion.delay[..., None].expand(3, 1))
+    torch.testing.assert_close(motion.time, expected)
+    assert motion.time.dtype == torch.float64
+
+
+def test_timing_is_geometric_in_durations_and_linear_in_delays():
+    head = MotionHead(2, 6, duration=(0.5, 8.0), delay=0.8).double()
+    timing = head.timing([2.0, 1.0, 4.0], [0.4, 0.2, 0.6])
+    expected = torch.tensor([[0.5, 0.5], [0.25, 0.25], [0.75, 0.75]]).double().logit()
+    torch.testing.assert_close(timing, expected, rtol=1e-6, atol=1e-6)
+    # One value for several of the other.
+    assert head.timing([2.0, 1.0, 4.0], 0.4).shape == (3, 2)
+    late = MotionHead(2, 6, delay=0.8)
+    torch.testing.assert_close(late.timing(delay=0.2), torch.tensor([0.25]).logit())
+
+
+@pytest.mark.parametrize(("before", "refused"), [(0.0, False), (1e-10, False), (1e-8, True)])
+def test_a_motion_continues_from_its_time_on(before, refused):
+    state = {"z": torch.zeros(22).double(), "start": (0.0, 0.0), "since": 0.5}
+    time = torch.tensor([0.5 - before, 0.6], dtype=torch.float64)
+    if refused:
+        with pytest.raises(ValueError, match="no time may be before it"):
+            head_of(2)(state["z"], time, state["start"], since=0.5)
+    else:
+        assert head_of(2)(state["z"], time, state["start"], since=0.5).position.shape == (2, 2)
+
+
+def test_samples_of_a_batch_of_factors_have_its_shape(head):
+    L, start = head.n_linear, torch.zeros(2).double()
+    z = random(head.n_parameters)
+    factors = torch.stack([torch.zeros(L, L), torch.eye(L)]).double()
+    motions = head.distribution(z, factors, start)
+    drawn = motions.rsample((4, 5), torch.Generator().manual_seed(0))
+    assert drawn.shape == (4, 5, 2, head.n_parameters)
+    assert torch.equal(drawn[:, :, 0], z.expand(4, 5, -1))
+    assert (drawn[:, :, 1, :L] != z[:L]).all()
+    alone = motions.rsample()
+    assert alone.shape == (2, head.n_parameters)
+    mean = head.distribution(z, factors[1], start).mean(TIME)
+    torch.testing.assert_close(mean.position, head(z, TIME, start).position)
+
+
+def test_half_precision_of_a_network_is_planned_in_that_of_the_head():
+    head = MotionHead(2, 6)
+    z = random(14).to(torch.bfloat16)
+    made = head(z, [0.0, 0.5, 1.0], [0.1, 0.2])
+    assert made.position.dtype == torch.float32
+    expected = head(z.float(), [0.0, 0.5, 1.0], [0.1, 0.2])
+    torch.testing.assert_close(made.position, expected.position)
