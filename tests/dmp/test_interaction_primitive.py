@@ -82,11 +82,12 @@ def test_probabilities_are_those_of_gaussians(model):
     known = ~values.isnan().flatten()
     # Much noise, so that several kinds and durations are likely.
     noise = 0.3
-    score = torch.empty(2, 31, dtype=torch.float64)
+    score, logarithm = torch.empty(2, 2, 31, dtype=torch.float64)
     for k, gaussian in enumerate(model.models):
         middle, spread = model.log_duration[k]
         for j, step in enumerate(torch.linspace(-3, 3, 31, dtype=torch.float64)):
-            tau = (middle + spread * step).exp()
+            logarithm[k, j] = middle + spread * step
+            tau = logarithm[k, j].exp()
             rows = gaussian.primitive.response.evaluate(time / tau)[:, 0]
             design = torch.zeros(len(time), 2, *gaussian.mean.shape, dtype=torch.float64)
             for column in range(2):
@@ -102,6 +103,13 @@ def test_probabilities_are_those_of_gaussians(model):
     estimate = model.observe(time, values, noise)
     torch.testing.assert_close(estimate.probability, posterior.sum(-1))
     assert 0.01 < estimate.probability.min() < 0.5
+    # Of the likeliest kind, the mean of the logarithm.
+    likely = int(posterior.sum(-1).argmax())
+    within = posterior[likely] / posterior[likely].sum()
+    expected = (within * logarithm[likely]).sum().exp()
+    assert estimate.duration == pytest.approx(expected.item())
+    assert estimate.phase == pytest.approx(float(time[-1] / expected))
+    assert model.observe(time + 9.0, values, noise).phase == 1.0
 
 
 def test_kinds_have_the_fractions_and_durations_of_their_demonstrations():

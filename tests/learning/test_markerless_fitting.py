@@ -106,6 +106,15 @@ def test_the_tool_is_where_its_pose_says(fit):
         assert np.quantile(off, 0.9) < 2.5
 
 
+def test_figures_are_those_of_the_frames(fit):
+    visible = np.concatenate([demo.feature_visible for demo in fit.demos])
+    assert fit.seen == pytest.approx(visible.mean())  # of so few, each is looked at
+    assert 0.02 < fit.deviation < 1.0
+    figures = fit.figures()
+    assert figures["objects_found"] == EPISODES
+    assert figures["tool_points"] == len(fit.landmarks.tool.points)
+
+
 def test_the_picture_marks_the_tool_where_its_own_image_shows_it(fit):
     assert fit.picture.shape == (3 * HEIGHT, 2 * WIDTH, 3)
     red = (fit.picture == (255, 40, 40)).all(axis=-1)
