@@ -358,6 +358,14 @@ def test_pieces_meet_at_their_knots(basis, approach, order):
         torch.testing.assert_close(slope, middle, rtol=0, atol=1e-4 * middle.abs().max().item())
 
 
+def test_a_time_that_rounds_up_to_a_period_is_its_beginning():
+    response = response_of(SpringDamper(), PeriodicBasis(count=9), 0.0)
+    _, x = random_motions(PeriodicBasis(count=9), batch=1)
+    # The remainder of a negative number this small is the divisor.
+    found = motion(response, torch.tensor([[-1e-20, 0.0]]).double(), x, 0)
+    torch.testing.assert_close(found[:, 0], found[:, 1])
+
+
 def test_tables_are_kept_and_shorter_in_single_precision():
     response = response_of(SpringDamper(), GaussianBasis(count=12), 1.0)
     double, single = (torch.zeros(1, dtype=dtype) for dtype in (torch.float64, torch.float32))

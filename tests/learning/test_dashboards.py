@@ -26,6 +26,7 @@ from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.learning import fit_dashboards, fit_primitives
 from hrc_learn.learning.demonstration_dashboard import (
     ShownDataset,
+    _episode_tab,
     record_demonstrations,
 )
 from hrc_learn.learning.fit_dashboards import (
@@ -176,6 +177,17 @@ def test_without_an_arm_there_is_no_scene(tmp_path):
     assert {e for e in rrd.entities if e.startswith("world")} == {"world"}
     assert "episode/joint_0" in rrd.entities
     assert "episode/joint_0/limits" not in rrd.entities
+
+
+@pytest.mark.parametrize(("joints", "columns"), [(3, 1), (4, 2)])
+def test_more_than_three_plots_stand_in_two_columns(joints, columns):
+    bare = dict.fromkeys(("feature", "feature_visible", "human_effort", "gripper"))
+    names = tuple(f"arm_{i}" for i in range(joints))
+    values = {"joint_names": names, "joint_position": np.ones((20, joints))}
+    one = demonstration(0, 20, **(values | bare))
+    tab = _episode_tab(ShownDataset(title="", demos=DemonstrationSet([one])), one)
+    assert (len(tab.plots), tab.columns) == (joints, columns)
+    assert not any(plot.legend for plot in tab.plots)
 
 
 def sample_fit(**changes) -> ShownFit:

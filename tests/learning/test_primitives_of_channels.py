@@ -169,7 +169,7 @@ def test_errors_are_of_valid_samples_relative_to_the_largest_range(demos):
     mask = motions.demos.mask
     shown, turn = motions.column("position"), motions.column("orientation")
     rng = np.random.default_rng(5)
-    off = torch.from_numpy(rng.normal(0, 0.01, shown.shape))
+    off = torch.from_numpy(rng.normal(-0.01, 0.01, shown.shape))  # the largest is negative
     tilt = rng.normal(0, 0.02, turn[..., 1:].shape)
     turned = [
         Rotation.from_rotvec(t) * Rotation.from_quat(q, scalar_first=True)
