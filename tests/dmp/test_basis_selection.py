@@ -78,3 +78,9 @@ def test_no_candidates_or_folds_are_refused():
         select_basis_count(time, position, ())
     with pytest.raises(ValueError, match="2 folds"):
         select_basis_count(time, position, n_folds=1)
+
+
+def test_eight_numbers_up_to_a_hundred_are_compared_by_default():
+    chosen = select_basis_count(*arm_motion(n_samples=210, n_joints=1), n_folds=2)
+    assert chosen.candidates == (10, 15, 20, 30, 40, 50, 70, 100)
+    assert len(chosen.error) == 8

@@ -54,6 +54,14 @@ def test_derivatives_by_time_are_exact():
     assert torch.autograd.gradgradcheck(lambda s: response.evaluate(s)[..., 0, :], (s,))
 
 
+@pytest.mark.parametrize("spring", SPRINGS.values(), ids=SPRINGS)
+def test_an_unforced_motion_is_smooth_over_the_time_of_its_fastest_mode(spring):
+    A = np.array([[0, 1], [-spring.alpha * spring.beta, -spring.alpha]])
+    assert spring.stiffness == spring.alpha * spring.beta
+    expected = 1 / np.abs(np.linalg.eigvals(A)).max()
+    assert spring.smooth_interval == pytest.approx(expected, rel=1e-3)
+
+
 def test_propagator_composes():
     s = torch.tensor(0.3, dtype=torch.float64)
     for spring in SPRINGS.values():

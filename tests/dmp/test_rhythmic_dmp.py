@@ -6,6 +6,7 @@ from dmp_contract import DMPContract
 from scipy.integrate import solve_ivp
 
 from hrc_learn.dmp import PeriodicBasis, Response, SpringDamper, Stepper, fit_rhythmic
+from hrc_learn.dmp.rhythmic_dmp import _mean_of_whole_cycles
 
 
 class TestRhythmic(DMPContract):
@@ -159,3 +160,15 @@ def test_what_cannot_be_a_rhythm_is_refused():
         fit_rhythmic(time, y, period=9.0)
     with pytest.raises(ValueError, match="no period found"):
         fit_rhythmic(time, torch.zeros(500, 2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("last", "first"), [(2.7, 0.7), (3.0, 0.0), (1.2, 0.2), (0.8, 0.0)])
+def test_the_centre_is_the_mean_of_whole_cycles_counted_from_the_end(last, first):
+    """Of few samples at any times, by the rule of trapezoids."""
+    s = np.linspace(0, last, 28)
+    s[1:-1] += 0.02 * np.random.default_rng(0).uniform(-1, 1, 26)
+    y = np.stack([np.sin(2 * np.pi * s), s**2], -1)
+    inside = s >= first - 1e-12
+    expected = np.trapezoid(y[inside], s[inside], axis=0) / (last - s[inside][0])
+    found = _mean_of_whole_cycles(torch.from_numpy(s), torch.from_numpy(y))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

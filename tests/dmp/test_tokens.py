@@ -132,6 +132,24 @@ def test_a_start_beyond_the_range_moves_the_limit(tokenizer):
     assert (made <= start + (high - low) / 10).all()
 
 
+@pytest.mark.parametrize("off", [-3.0, 0.0, 3.0])
+def test_control_points_reach_the_limits_or_a_tenth_beyond_the_start(tokenizer, off):
+    """Whatever the parameters; a start out of the range moves the limit on its side."""
+    parts = tokenizer.components
+    span = (parts.high - parts.low) / 1.2
+    start = parts.start + off * span
+    rng = torch.Generator().manual_seed(0)
+    z = 1e6 * torch.randn(200, len(parts.spread), generator=rng).double()
+    points, _ = parts.polygon(z, start, torch.zeros(3))
+    free = (points * parts.scale + parts.centre)[:, 2:].flatten(0, 1)
+    low, high = (
+        torch.minimum(parts.low, start - span / 10),
+        torch.maximum(parts.high, start + span / 10),
+    )
+    torch.testing.assert_close(free.amin(0), low)
+    torch.testing.assert_close(free.amax(0), high)
+
+
 def test_motions_continue_what_is_executed(tokenizer):
     position, velocity = motions(50, seed=2)
     rng = torch.Generator().manual_seed(6)
