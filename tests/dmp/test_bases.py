@@ -21,6 +21,13 @@ from hrc_learn.dmp import (
     SpringDamper,
     Stepper,
 )
+from hrc_learn.dmp.dynamics import (
+    approach_curve,
+    approach_state,
+    balanced_units,
+    basis_config,
+    restored_basis,
+)
 
 BASES = {
     "gaussian": GaussianBasis(count=12),
@@ -186,3 +193,82 @@ def test_files_with_another_phase_or_basis_are_refused(tmp_path):
 def test_impossible_parts_are_refused(make, complaint):
     with pytest.raises(ValueError, match=complaint):
         make()
+
+
+FAST = ExponentialPhase(decay=100.0)
+
+
+@pytest.mark.parametrize(
+    ("basis", "interval", "horizon"),
+    [
+        (GaussianBasis(count=11, width=0.5), 0.035, 1 + (0.5 + 39 * 0.25) / 10),
+        (GaussianBasis(count=21, width=1.0), 0.5 / 20, 1 + 39.5 / 20),
+        (GaussianBasis(count=3, phase=FAST), 0.01, FAST.horizon),
+        (PeriodicBasis(count=10, width=0.5), 0.035, 1.0),
+        (PeriodicBasis(count=10, width=1.0), 0.05, 1.0),
+        (SplineBasis(count=11), 0.1, 1.1),
+        (SplineBasis(count=5), 0.25, 1.25),
+        (SplineBasis(count=11, phase=FAST), 0.01, 1.1),
+    ],
+)
+def test_forcing_is_smooth_over_part_of_a_spacing_or_of_the_fading(basis, interval, horizon):
+    assert basis.smooth_interval == pytest.approx(interval)
+    assert basis.horizon == pytest.approx(horizon)
+    # After this time the phase is below the rounding of one.
+    assert np.exp(-FAST.decay * FAST.horizon) < 2.3e-16
+    assert np.exp(-FAST.decay * 0.9 * FAST.horizon) > 1e-18
+
+
+def test_kernels_are_as_printed():
+    s = np.linspace(-0.1, 1.2, 27)
+    gaussian, bells = GaussianBasis(count=6, width=0.7), PeriodicBasis(count=6, width=0.7)
+    x = s[:, None] - np.linspace(0, 1, 6)
+    expected = np.exp(-(x**2) / (2 * (0.7 / 5) ** 2))
+    np.testing.assert_allclose(gaussian.kernels(torch.from_numpy(s)), expected, atol=1e-12)
+    h = (6 / (2 * np.pi * 0.7)) ** 2
+    x = s[:, None] - np.arange(6) / 6
+    expected = np.exp(h * (np.cos(2 * np.pi * x) - 1))
+    np.testing.assert_allclose(bells.kernels(torch.from_numpy(s)), expected, rtol=1e-9)
+    phased = GaussianBasis(count=6, width=0.7, domain="phase")
+    centres = np.exp(-4 * np.linspace(0, 1, 6))
+    gaps = -np.diff(centres)
+    x = np.exp(-4 * s)[:, None] - centres
+    expected = np.exp(-(x**2) / (2 * (0.7 * np.append(gaps, gaps[-1])) ** 2))
+    np.testing.assert_allclose(phased.kernels(torch.from_numpy(s)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+@pytest.mark.parametrize("fraction", [1.0, 0.6])
+def test_an_approach_is_a_minimum_jerk_curve_over_its_fraction(fraction, order):
+    s = np.linspace(0, 1.5, 31)
+    curve = np.polynomial.Polynomial([-1, 0, 0, 10, -15, 6]).deriv(order)
+    expected = np.where(s < fraction, curve(s / fraction) / fraction**order, 0)
+    found = approach_curve(torch.from_numpy(s), fraction, order)
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+    if order == 0:
+        state = approach_state(torch.from_numpy(s), fraction)
+        np.testing.assert_allclose(state[:, 0], expected, atol=1e-12)
+        rate = approach_curve(torch.from_numpy(s), fraction, 1)
+        np.testing.assert_array_equal(state[:, 1], rate)
+
+
+@pytest.mark.parametrize("basis", [*BASES.values(), PeriodicBasis(count=5)], ids=str)
+def test_units_undo_the_fading_and_make_other_columns_as_large(basis):
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(40, basis.count + 3))
+    unit = 1 / basis.phase(basis.centre_times()).numpy()
+    norm = np.linalg.norm(A, axis=0)
+    largest = (norm[: basis.count] * unit).max()
+    for others in (0, 1, 3):
+        found = balanced_units(basis, torch.from_numpy(A), others)
+        last = largest / norm[basis.count : basis.count + others]
+        np.testing.assert_allclose(found, np.append(unit, last))
+
+
+def test_descriptions_of_bases_make_them_again():
+    for basis in (*BASES.values(), PeriodicBasis(count=7, width=0.4)):
+        config = json.loads(json.dumps(basis_config(basis)))
+        assert restored_basis(config) == basis
+        assert config["type"] == type(basis).__name__
+    with pytest.raises(ValueError, match="unknown type 'Fourier'; choose from GaussianBasis"):
+        restored_basis({"type": "Fourier"})
