@@ -26,11 +26,22 @@ from hrc_learn.jacobian.perspective import (
     FOCAL,
     SHIFT,
     CameraFit,
+    _cube_rotations,
+    _inflation,
+    _prior,
+    _sampled,
+    _shifts,
+    _starts,
     adjust_bundle,
     camera_jacobian,
     eye_of,
     marker_pixels,
+    marker_points,
+    on_plane,
+    pixels_and_depth,
+    rays,
     stepped,
+    unexplained,
 )
 from hrc_learn.kinematics import panda
 
@@ -359,3 +370,190 @@ def test_a_fit_says_where_the_camera_is():
         noise=1.0,
     )
     assert "its view 0 degrees from straight down" in str(down)
+
+
+def test_a_fit_is_the_most_probable_camera_and_its_noise_that_of_the_images():
+    """Errors that neighbours share and outliers: gradient and curvature of the robust cost."""
+    rng = np.random.default_rng(8)
+    rotation, shift = camera(rng)
+    demos = [
+        demonstration(rng, rotation, shift, 1300.0, np.array([0, 0.1, 0.03])) for _ in range(4)
+    ]
+    for k, demo in enumerate(demos):
+        drift = rng.normal(0, 0.5, (8, 2)).repeat(25, axis=0)
+        demo.feature[:] += torch.from_numpy(drift)
+        demo.feature[20 * k : 20 * k + 5] += 30.0
+    found = fit_camera(demos, IMAGE)
+    seen = [demo.seen() for demo in demos]
+    pose = Pose(*(torch.cat([getattr(p, n) for p, _ in seen]) for n in Pose.__annotations__))
+    pixel = torch.cat([f for _, f in seen])
+    assert 600 < len(pixel) < 800  # all frames count
+    error = (pixel - marker_pixels(found.camera, pose)[0]).numpy()
+    size = np.linalg.norm(error, axis=-1)
+    # The median of a Rayleigh distribution is its scale times sqrt(2 ln 2).
+    assert found.noise == pytest.approx(np.median(size) / np.sqrt(2 * np.log(2)), rel=5e-3)
+    weight = np.minimum(1, 2.5 * found.noise / size)
+    blocks = (weight[:, None] * error)[: len(error) // 25 * 25].reshape(-1, 25, 2)
+    shared = (blocks.sum(1) ** 2).mean() / (25 * found.noise**2)
+    assert 2 < shared < 25
+    weight = torch.from_numpy(weight / (found.noise**2 * shared))
+    spread = torch.tensor([0.5, 28.8, 28.8, 0.2, *[10.0] * 6, *[0.2] * 3]).double()
+    mean = torch.tensor([np.log(1440), 720, 540, *[0.0] * 10]).double()
+
+    def residuals(step):
+        near = stepped(found.camera, step)
+        off = (marker_pixels(near, pose)[0] - pixel) * weight.sqrt()[:, None]
+        away = torch.cat([(near - mean)[:4], 0 * step[4:7], (near - mean)[7:]]) / spread
+        return torch.cat([off.flatten(), away])
+
+    zero = torch.zeros(13, dtype=torch.float64)
+    with shapes_unchecked():
+        slope = torch.func.jacfwd(residuals)(zero)
+    # The prior of the rotation is flat about any place, yet counts in the curvature.
+    gram = slope.mT @ slope + torch.diag(torch.tensor([*[0.0] * 4, *[0.01] * 3, *[0.0] * 6]))
+    left = torch.linalg.solve(gram, slope.mT @ residuals(zero))
+    deviation = found.covariance.diagonal().sqrt()
+    assert float((left / deviation).abs().max()) < 0.02
+    scale = deviation[:, None] * deviation
+    torch.testing.assert_close(
+        torch.linalg.inv(gram) / scale, found.covariance / scale, rtol=0, atol=0.02
+    )
+
+
+def test_exact_images_count_as_two_hundredths_of_a_pixel():
+    rng = np.random.default_rng(9)
+    rotation, shift = camera(rng)
+    exact = [demonstration(rng, rotation, shift, 1300.0, np.zeros(3), 60, 0.0) for _ in "ab"]
+    found = fit_camera(exact, IMAGE)
+    assert found.noise == 0.02
+    assert float(found.camera[0].exp()) == pytest.approx(1300.0, rel=2e-3)
+
+
+def test_errors_that_neighbours_share_count_by_blocks_of_25():
+    noise = torch.tensor([0.5, 1.0]).double()
+    for frames, factor in ((24, 1.0), (25, 5.0), (49, 5.0), (50, 5.0)):
+        alike = torch.full((2, frames, 2), 0.2**0.5).double() * noise[:, None, None]
+        alike[:, frames // 25 * 25 :] = 100.0
+        torch.testing.assert_close(_inflation(alike, noise), factor * torch.ones(2).double())
+    alternating = torch.ones(2, 50, 2).double()
+    alternating[:, ::2] = -1.0
+    torch.testing.assert_close(_inflation(alternating, noise), torch.ones(2).double())
+    wild = torch.full((2, 50, 2), 30.0).double()
+    torch.testing.assert_close(_inflation(wild, noise), 25 * torch.ones(2).double())
+    # A mean over blocks and both coordinates.
+    some = torch.zeros(2, 100, 2).double()
+    some[:, :25, 0] = 1.0
+    torch.testing.assert_close(_inflation(some, noise), 25 / 8 / noise.square())
+
+
+def test_the_search_starts_from_all_rotations_of_a_cube():
+    found = Rotation.from_matrix(_cube_rotations().numpy())
+    group = Rotation.create_group("O")
+    nearest = [(group.inv() * rotation).magnitude().min() for rotation in found]
+    assert len(found) == 24
+    assert max(nearest) < 1e-6
+    assert len({tuple(m.round().ravel()) for m in found.as_matrix()}) == 24
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.7])
+def test_a_start_is_the_camera_itself_if_its_axes_are_along_those_of_the_base(factor):
+    rng = generator(1)
+    place = torch.rand(40, 3, generator=rng).double() - 0.5
+    still = torch.tensor([1.0, 0, 0, 0]).double().expand(40, 4)
+    pose = Pose(place, still)
+    prior, _ = _prior(IMAGE)
+    own = prior.clone()
+    own[0] = np.log(factor * IMAGE[0])
+    own[4:7] = torch.tensor([0.0, np.pi / 2, 0.0])
+    own[7:10] = torch.tensor([0.1, -0.2, 1.3])
+    starts = _starts(pose, marker_pixels(own, pose)[0], prior, IMAGE[0])
+    assert starts.shape == (72, 13)
+    off = (marker_pixels(starts, pose)[0] - marker_pixels(own, pose)[0]).abs().amax((-2, -1))
+    best = starts[off.argmin()]
+    torch.testing.assert_close(best, own, rtol=0, atol=2e-5)
+    # All of them have every frame in front.
+    assert float(marker_points(starts, pose)[..., 2].min()) > 0.2 - 1e-9
+    assert bool((starts[:, 10:] == 0).all())
+
+
+def test_shifts_are_those_of_least_squares_in_front_of_all_frames():
+    rng = np.random.default_rng(2)
+    point, xi = rng.normal(0, 0.1, (3, 30, 3)), rng.normal(0, 0.2, (30, 2))
+    point[2, :, 2] += 3.0  # far along the axis, where least squares ends behind the camera
+    found = _shifts(torch.from_numpy(point), torch.from_numpy(xi)).numpy()
+    rows = np.concatenate([np.tile(np.eye(2), (30, 1, 1)), -xi[..., None]], -1).reshape(-1, 3)
+    weak = 1e-3 * np.sqrt(30)
+    for x, t in zip(point, found, strict=True):
+        right = (xi * x[:, 2:] - x[:, :2]).ravel()
+        best = np.linalg.lstsq(
+            np.vstack([rows, [0, 0, weak]]), np.append(right, weak * (1 - x[:, 2].mean()))
+        )[0]
+        np.testing.assert_allclose(t[:2], best[:2], atol=1e-9)
+        assert t[2] == pytest.approx(max(best[2], 0.2 - x[:, 2].min()))
+    # Points on one ray tell no depth: they are a metre away.
+    same = torch.zeros(1, 30, 3).double()
+    assert float(_shifts(same, torch.zeros(30, 2).double())[0, 2]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("demonstrations", "frames", "expected"),
+    [
+        (1, 1999, 1999),
+        (1, 5000, 2500),
+        (3, 700, 2100),
+        (3, 1400, 2100),
+        (2000, 1, 2000),
+        (2001, 1, 1001),
+        (4001, 1, 1334),
+        (999, 10, 3996),
+    ],
+)
+def test_frames_are_drawn_evenly_until_two_thousand_are_together(
+    demonstrations, frames, expected
+):
+    place = torch.arange(frames).double()[:, None].expand(-1, 3)
+    turn = torch.tensor([1.0, 0, 0, 0]).double().expand(frames, 4)
+    demo = ImageDemonstration(
+        pose=Pose(place, turn), feature=place[:, :2], visible=torch.ones(frames).bool()
+    )
+    with shapes_unchecked():
+        pose, pixel = _sampled([demo] * demonstrations)
+    assert len(pixel) == len(pose.position) == len(pose.orientation) == expected
+    assert torch.equal(pose.position[:, :2], pixel)
+    steps = pixel[:, 0].diff()
+    assert len(steps[steps > 0].unique()) <= 1
+
+
+def test_a_pixel_of_a_plane_leads_back_to_its_point():
+    rng = np.random.default_rng(7)
+    rotation, shift = camera(rng)
+    lens, height = -0.15, 0.1
+    points = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.full(20, height)])
+    matrix = np.array([[1400.0, 0, 731], [0, 1400, 528], [0, 0, 1]])
+    pixels = cv2.projectPoints(points, rotation, shift, matrix, np.array([lens, 0, 0, 0]))[0]
+    values = [np.log(1400.0), 731, 528, lens, *rotation, *shift, 0, 0, 0]
+    view, pixel = torch.tensor(values).double().expand(20, 13), torch.from_numpy(pixels[:, 0])
+    np.testing.assert_allclose(on_plane(view, pixel, height), points, atol=1e-9)
+    np.testing.assert_allclose(on_plane(view[0], pixel[0], height), points[0], atol=1e-9)
+    turn = cv2.Rodrigues(rotation)[0]
+    np.testing.assert_allclose(eye_of(view[0]), -turn.T @ shift, atol=1e-12)
+    ray = rays(view, pixel).numpy() @ turn.T
+    there = points @ turn.T + shift
+    np.testing.assert_allclose(ray, there / there[:, 2:], atol=1e-9)
+
+
+def test_points_behind_a_camera_have_finite_pixels_far_off():
+    view = torch.tensor([7.0, 700, 500, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]).double()
+    points = torch.tensor([[0.1, 0.2, -1.0], [0.1, 0.2, 0.0], [0.1, 0.2, 1e-3]]).double()
+    pixel, slope = pixels_and_depth(view, points)
+    far = np.exp(7.0) * np.array([100.0, 200.0]) + [700, 500]
+    np.testing.assert_allclose(pixel, np.tile(far, (3, 1)))
+    assert bool(slope.isfinite().all())
+
+
+def test_a_camera_is_left_out_of_a_feature():
+    demo = guided(np.random.default_rng(1), frames=5)[0]
+    view = random_camera(generator(4))
+    (left,) = unexplained([demo], view)
+    torch.testing.assert_close(left.feature + marker_pixels(view, demo.pose)[0], demo.feature)
+    assert left.feature.dtype == torch.float64
