@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 from torch.utils import _pytree
 from unchecked import shapes_unchecked
@@ -22,6 +23,7 @@ from hrc_learn.jacobian import (
     fit_camera,
     paper_grid,
 )
+from hrc_learn.jacobian.camera_estimator import _shortened
 from hrc_learn.jacobian.perspective import ROTATION, marker_pixels, stepped
 
 IMAGE, LEVER = (1440, 1080), np.array([-0.008, 0.145, -0.083])
@@ -303,3 +305,213 @@ def test_it_is_exported(network):
             expected = estimator.update(state, frame)
             state = exported(state, frame)
             assert_close(state.best, expected.best, rtol=1e-7, atol=1e-7)
+
+
+@pytest.fixture(scope="module")
+@torch.inference_mode(False)
+def searching(network):
+    """An estimator before a search: 11 frames in a window of 16, one of them far off."""
+    config = CameraConfig(frames=16, hypotheses=2, residual=200.0)
+    estimator, rng = CameraEstimator(network, config), np.random.default_rng(7)
+    position, orientation = path(rng, 0.2, 12)
+    position[6:] += [0.0, 0.12, 0.0]  # too far from the frame before to follow the residual
+    view = moved(rng, 3, 0.03, 0.1)
+    feature = seen(view, position, orientation, rng)
+    feature[4] += 8.0
+    frames = measurements(position, orientation, feature)
+    before = estimator.initial_state()
+    with shapes_unchecked():
+        for frame in frames[:11]:
+            before, _ = estimator._with_key_frame(before, frame, torch.tensor(True))
+    return estimator, frames[:11], before, estimator._searched(before)
+
+
+def whitened(estimator, frames, state, camera):
+    """Errors of frames, camera and residual in deviations, by step and weights, both zero.
+
+    The weights of the residual stay unknowns, so there is nothing to integrate out.
+    """
+    network, config = estimator.network, estimator.config
+    scale = np.array([1, 1, 1, 0.15, 0.15, 0.15])
+    regressors, place = [], np.zeros(6 * len(network.centers))
+    for old, new in zip([None, *frames], frames, strict=False):
+        if old is not None:
+            turn = Rotation.from_quat(new.pose.orientation, scalar_first=True)
+            turn = turn * Rotation.from_quat(old.pose.orientation, scalar_first=True).inv()
+            twist = np.append(new.pose.position - old.pose.position, turn.as_rotvec())
+            theta = (network.basis(old.pose) + network.basis(new.pose)).detach().numpy() / 2
+            if np.linalg.norm(twist * scale) <= config.max_step:
+                place = place + np.outer(twist * scale, theta).ravel()
+        regressors.append(place)
+    phi = torch.from_numpy(np.array(regressors))
+    first = network.weight.detach().unflatten(0, (2, 6)) / torch.from_numpy(scale)[:, None]
+    target = torch.stack([frame.feature for frame in frames]) - phi @ first.flatten(1).mT
+    poses = Pose(
+        *(
+            torch.stack([getattr(f.pose, n) for f in frames])
+            for n in ("position", "orientation")
+        )
+    )
+    off = (target - marker_pixels(state.best, poses)[0]).norm(dim=-1)
+    most = 3 * max(float(off.sort().values[(len(off) - 1) // 2]), config.pixel_noise)
+    noise = config.pixel_noise * (off / most).clamp_min(1.0)
+    prior = torch.linalg.cholesky(
+        estimator.precision[estimator.precision.diagonal() > 0][
+            :, estimator.precision.diagonal() > 0
+        ]
+    ).mT
+    known = [0, 1, 2, 3, 10, 11, 12]
+    home = Rotation.from_rotvec(estimator.reference[4:7]).as_matrix()
+    eye = -home.T @ estimator.reference[7:10].numpy()
+    root = torch.linalg.cholesky(estimator.residual).mT
+
+    def errors(step, change):
+        near = stepped(camera, step)
+        images = (target - marker_pixels(near, poses)[0] - phi @ change) / noise[:, None]
+        R = quaternion.to_matrix(quaternion.exp(near[ROTATION]))
+        # The axis of view among the camera's axes in the demonstrations.
+        tilt = (torch.from_numpy(home) @ R[2])[:2] / config.tilt
+        shift = (-R.mT @ near[7:10] - torch.from_numpy(eye)) / config.place
+        optics = prior @ (near - estimator.reference)[known]
+        weights = torch.linalg.solve_triangular(root.mT, change, upper=False)
+        return torch.cat([images.flatten(), tilt, shift, optics, 0.1 * step, weights.flatten()])
+
+    return errors, 2 * len(frames), phi.shape[1]
+
+
+def test_a_search_step_is_that_of_camera_and_residual_together(searching):
+    estimator, frames, before, after = searching
+    best = int(after.cost.argmin())
+    for k, camera in enumerate(before.cameras):
+        errors, images, size = whitened(estimator, frames, before, camera)
+        zero = torch.zeros(13).double(), torch.zeros(size, 2).double()
+        with shapes_unchecked():
+            slopes = torch.func.jacfwd(errors, argnums=(0, 1))(*zero)
+        slope = torch.cat([slopes[0], slopes[1].flatten(1)], dim=-1)
+        start = errors(*zero)
+        solution = -torch.linalg.lstsq(slope, start[:, None]).solution[:, 0]
+        step = solution[:13]
+        long = max(float(step[4:7].norm()) / 0.4, float(step[7:10].norm()) / 0.15, 1.0)
+        expected = stepped(camera, step / long)
+        torch.testing.assert_close(after.cameras[k], expected, rtol=1e-5, atol=1e-6)
+        # Of all weights of the residual, the best ones for this camera.
+        by_weight = slope[:, 13:]
+        fitted = -torch.linalg.lstsq(by_weight, start[:, None]).solution[:, 0]
+        least = (start + by_weight @ fitted).square().sum() / 2
+        turn = Rotation.from_rotvec(camera[4:7])
+        roll = turn * Rotation.from_rotvec(estimator.reference[4:7]).inv()
+        assert float(after.cost[k]) == pytest.approx(float(least) + 0.05 * roll.magnitude())
+        if k != best:
+            continue
+        hessian = slope.mT @ slope
+        errors, *_ = whitened(estimator, frames, before, after.cameras[k])
+        left = errors(*zero)
+        # Rows of errors by the weights do not depend on the camera.
+        fitted = -torch.linalg.lstsq(by_weight, left[:, None]).solution[:, 0]
+        own = fitted.reshape(size, 2).mT.unflatten(-1, (6, -1))
+        own = own * torch.tensor([1, 1, 1, 0.15, 0.15, 0.15]).double()[:, None]
+        change = after.weight - estimator.initial_weight()
+        assert change.abs().max() > 1
+        torch.testing.assert_close(change, own.flatten(0, 1), rtol=1e-5, atol=1e-4)
+        rest = left + by_weight @ fitted
+        # Images explain; the prior of the weights is part of what is left of them.
+        misfit = rest[:images].square().sum() + rest[images + 25 :].square().sum()
+        factor = max(float(misfit) / (images - 13 + 7), 1.0)
+        assert factor > 1
+        expected = torch.linalg.inv(hessian)[:13, :13] * factor
+        size_ = expected.diagonal().sqrt()
+        torch.testing.assert_close(
+            after.covariance / size_ / size_[:, None],
+            expected / size_ / size_[:, None],
+            rtol=1e-4,
+            atol=1e-4,
+        )
+
+
+def test_key_frames_are_apart_and_none_is_taken_while_images_surprise(network):
+    config = CameraConfig(frames=4, hypotheses=1)
+    estimator = CameraEstimator(network, config)
+    still = torch.tensor([0.0, 1.0, 0.0, 0.0]).double()
+    start, along = torch.tensor([[0.25, 0.5, 0.25], [1, 0, 0]]).double()
+
+    def frame(shift=0.0, turn=0.0):
+        spin = quaternion.exp(torch.tensor([0.0, 0.0, turn]).double())
+        return Measurement(
+            pose=Pose(start + shift * along, quaternion.multiply(spin, still)),
+            feature=700 + shift * along[:2],
+            valid=torch.tensor(True),
+            dt=0.04,
+            xi_x=torch.zeros(2).double(),
+            xi_r=torch.zeros(6).double(),
+        )
+
+    def add(state, *new):
+        return estimator._with_key_frame(state, frame(*new), torch.tensor(True))
+
+    state, calm = add(estimator.initial_state())
+    assert calm
+    assert state.known.tolist() == [False, False, False, True]
+    # 6 mm, or a turn of 40 mrad.
+    for new, count in (((0.0059,), 1), ((0.0061,), 2), ((0.0, 0.039), 1), ((0.0, 0.041), 2)):
+        assert int(add(state, *new)[0].known.sum()) == count
+    surprised = replace(state, surprises=torch.tensor(1.0).double())
+    after, calm = add(surprised, 0.05)
+    assert not calm
+    assert int(after.known.sum()) == 1
+    for k in range(1, 6):
+        state, _ = add(state, 0.01 * k)
+    assert bool(state.known.all())
+    shifts = 0.01 * torch.arange(2, 6).double()
+    assert_close(state.pixel[:, 0], 700 + shifts)
+    assert_close(state.position[:, 0], 0.25 + shifts)
+
+
+def test_turns_about_the_optical_axis_turn_the_image_about_its_middle(network):
+    estimator = CameraEstimator(network, CameraConfig(hypotheses=4, frames=4))
+    state = estimator.initial_state()
+    position, orientation = path(np.random.default_rng(0), 0.1, 6)
+    pose = Pose(torch.from_numpy(position), orientation)
+    middle = network.camera[1:3]
+    off = marker_pixels(state.cameras, pose)[0] - middle
+    for k in range(4):
+        turn = Rotation.from_euler("z", np.pi / 2 * k).as_matrix()[:2, :2]
+        assert_close(off[k], off[0] @ torch.from_numpy(turn).mT, rtol=0, atol=1e-4)
+    angles = torch.tensor([0, np.pi / 2, np.pi, np.pi / 2]).double()
+    assert_close(state.cost, 0.05 * angles, rtol=1e-6, atol=1e-6)
+    assert_close(state.best, network.camera)
+    batch = estimator.initial_state(2)
+    assert_close(batch.cameras, state.cameras.expand(2, 4, 13))
+
+
+def test_before_any_image_the_camera_is_as_uncertain_as_its_prior(network):
+    config = CameraConfig(hypotheses=2, frames=4, tilt=0.2, place=0.05, marker=2e-3)
+    estimator = CameraEstimator(network, config)
+    covariance = estimator.initial_state().covariance
+    camera, optics = estimator.reference, network.camera_covariance
+    known = [0, 1, 2, 3, 10, 11, 12]
+    wider = optics[known][:, known] + torch.diag(torch.tensor([0.0] * 4 + [4e-6] * 3)).double()
+    assert_close(estimator.precision[known][:, known] @ wider, torch.eye(7).double())
+    assert int((estimator.precision != 0).sum()) == 49
+
+    def prior(step):
+        near = stepped(camera, step)
+        R, home = (quaternion.to_matrix(quaternion.exp(c[ROTATION])) for c in (near, camera))
+        tilt = (home @ R[2])[:2] / 0.2
+        eyes = [-r.mT @ c[7:10] for r, c in ((R, near), (home, camera))]
+        return torch.cat([tilt, (eyes[0] - eyes[1]) / 0.05, 0.1 * step])
+
+    with shapes_unchecked():
+        slope = torch.func.jacfwd(prior)(torch.zeros(13).double())
+    precision = slope.mT @ slope + estimator.precision
+    assert_close(covariance @ precision, torch.eye(13).double(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("turn", "move", "factor"), [(0.3, 0.1, 1), (0.8, 0.1, 2), (0.2, 0.45, 3), (0.8, 0.6, 4)]
+)
+def test_a_long_step_is_shortened_as_a_whole(turn, move, factor):
+    step = torch.full((13,), 0.01).double()
+    step[4:7] = turn * torch.tensor([2.0, -1.0, 2.0]) / 3
+    step[7:10] = move * torch.tensor([-2.0, 1.0, 2.0]) / 3
+    assert_close(_shortened(step), step / factor)
+    assert_close(_shortened(torch.stack([step, 0 * step]))[1], 0 * step)
