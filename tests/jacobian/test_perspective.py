@@ -9,6 +9,7 @@ import pytest
 import torch
 from pinhole import wander
 from sampling import generator
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from unchecked import shapes_unchecked
 
@@ -27,9 +28,11 @@ from hrc_learn.jacobian.perspective import (
     SHIFT,
     CameraFit,
     _cube_rotations,
+    _from_prior,
     _inflation,
     _prior,
     _sampled,
+    _searched,
     _shifts,
     _starts,
     adjust_bundle,
@@ -557,3 +560,59 @@ def test_a_camera_is_left_out_of_a_feature():
     (left,) = unexplained([demo], view)
     torch.testing.assert_close(left.feature + marker_pixels(view, demo.pose)[0], demo.feature)
     assert left.feature.dtype == torch.float64
+
+
+def test_a_search_ends_at_the_weighted_least_squares_of_scipy():
+    """One start near the camera, one at the prior's mean of optics, one without any frames."""
+    rng = np.random.default_rng(5)
+    rotation, shift = camera(rng)
+    demo = demonstration(rng, rotation, shift, 1300.0, np.array([0, 0.1, 0.03]), 40)
+    pose, pixel = demo.seen()
+    prior, spread = _prior(IMAGE)
+    true = torch.tensor([np.log(1300.0), *CENTER, 0, *rotation, *shift, 0, 0.1, 0.03]).double()
+    starts = torch.stack([stepped(true, _OFF), stepped(true, -_OFF), stepped(true, 4 * _OFF)])
+    weight = torch.from_numpy(rng.uniform(0, 4, (3, len(pixel))))
+    weight[2] = 0.0
+
+    def residuals(step, start, weight):
+        near = stepped(start, torch.from_numpy(step))
+        off = (marker_pixels(near, pose)[0] - pixel) * weight.sqrt()[:, None]
+        away = torch.cat([near[:4] - prior[:4], near[7:] - prior[7:]])
+        away = away / torch.cat([spread[:4], spread[7:]])
+        return torch.cat([off.flatten(), away]).numpy()
+
+    def cost(cameras):
+        zero = np.zeros(13)
+        pairs = zip(cameras, weight, strict=True)
+        return np.array([np.square(residuals(zero, c, w)).sum() for c, w in pairs])
+
+    found, damping, before = starts, torch.full((3,), 1e-2).double(), cost(starts)
+    for _ in range(13):
+        found, damping, gram = _searched(found, damping, pose, pixel, weight, prior, spread)
+        now = cost(found)
+        assert (now <= before * (1 + 1e-12)).all()
+        before = now
+    for k in range(3):
+        best = least_squares(residuals, np.zeros(13), args=(found[k], weight[k]), x_scale="jac")
+        assert before[k] == pytest.approx(2 * best.cost, rel=1e-6, abs=1e-9)
+        slope = _columns_by_steps(lambda d, k=k: residuals(d, found[k], weight[k]))
+        # The prior of the rotation is flat about any place, yet counts in the information.
+        expected = slope.T @ slope + np.diag([0.0] * 4 + [0.01] * 3 + [0.0] * 6)
+        scale = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(
+            gram[k].numpy() / scale / scale[:, None],
+            expected / scale / scale[:, None],
+            atol=1e-4,
+        )
+    parts = [*range(4), *range(7, 13)]
+    torch.testing.assert_close(found[2][parts], prior[parts], rtol=0, atol=1e-6)
+    assert bool((damping <= 1e6).all())
+    away = _from_prior(found, prior)
+    torch.testing.assert_close(away[:, parts], (found - prior)[:, parts])
+    assert bool((away[:, 4:7] == 0).all())
+
+
+def _columns_by_steps(function):
+    """Central differences along all 13 steps."""
+    steps = 1e-6 * np.eye(13)
+    return np.stack([(function(d) - function(-d)) / 2e-6 for d in steps], axis=-1)
