@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
@@ -19,10 +20,17 @@ from hrc_learn.jacobian import (
     fit_camera,
     object_height,
 )
-from hrc_learn.jacobian.camera_motion import from_moved, refined_twist
+from hrc_learn.jacobian.camera_motion import (
+    CameraMotion,
+    _displacement,
+    _explained,
+    from_moved,
+    refined_twist,
+)
 from hrc_learn.jacobian.perspective import (
     FOCAL,
     RADIAL,
+    from_base,
     marker_pixels,
     marker_points,
     motion_jacobian,
@@ -403,3 +411,203 @@ def test_an_objects_plane_says_what_it_takes(reference):
         object_height(reference, taken[:3], pixels[:3])
     with pytest.raises(ValueError, match="disagree"):
         object_height(reference, taken, pixels.flip(0))
+
+
+# A camera that sees exactly as the model has it, one metre above the tool.
+EXACT = torch.tensor(
+    [np.log(1700.0), 731.0, 530.0, -0.06, *ROTATION, *SHIFT, *MARKER], dtype=torch.float64
+)
+
+
+def exact_reference(threshold=1.0):
+    return CameraReference(
+        camera=tuple(EXACT.tolist()), threshold=threshold, lower=(-9,) * 3, upper=(9,) * 3
+    )
+
+
+def scattered(rng, count=12):
+    """Points before the camera, in its frame [m]."""
+    return torch.from_numpy(rng.uniform([-0.2, -0.2, 0.8], [0.2, 0.2, 1.2], (count, 3)))
+
+
+@pytest.mark.parametrize("already", [None, (0.02, -0.05, 0.01, 0.03, 0.0, -0.04)])
+def test_a_motion_is_the_most_plausible_one_for_its_errors(already):
+    """Least squares by NumPy, with a prior of 0.1 rad and 0.1 m."""
+    points = scattered(np.random.default_rng(0))
+    slope = motion_jacobian(EXACT, points).flatten(0, 1).numpy()
+    truth = np.array([3e-3, -2e-3, 4e-3, 1e-3, 2e-3, -5e-3])
+    pixels = pixels_and_depth(EXACT, points)[0] + torch.from_numpy(slope @ truth).reshape(-1, 2)
+    errors = (pixels - pixels_and_depth(EXACT, points)[0]).flatten().numpy()
+    moved_by = None if already is None else torch.tensor(already).double()
+    twist, displacement = _explained(EXACT, points, pixels, moved_by)
+    pull = np.zeros(6) if already is None else -np.array(already)
+    rows, right = np.vstack([slope, 10 * np.eye(6)]), np.append(errors, 10 * pull)
+    expected = np.linalg.lstsq(rows, right)[0]
+    np.testing.assert_allclose(twist, expected, atol=1e-9)
+    explained = (slope @ expected).reshape(-1, 2)
+    assert displacement == pytest.approx(np.sqrt((explained**2).sum(1).mean()))
+
+
+@pytest.mark.parametrize(("size", "counts"), [(2.0, 6.0), (0.01, 0.1)])
+def test_an_error_counts_up_to_three_times_the_median_or_a_tenth_of_a_pixel(size, counts):
+    rng = np.random.default_rng(1)
+    points = scattered(rng)
+    turns = rng.uniform(0, 2 * np.pi, 12)
+    directions = torch.from_numpy(np.stack([np.cos(turns), np.sin(turns)], -1))
+    sizes = torch.full((12, 1), size).double()
+    sizes[3] = 100.0
+    clipped = sizes.clone()
+    clipped[3] = counts
+    there = pixels_and_depth(EXACT, points)[0]
+    found, expected = (
+        _explained(EXACT, points, there + s * directions) for s in (sizes, clipped)
+    )
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-9, atol=1e-12)
+
+
+def test_a_motion_says_its_angle_distance_and_displacement():
+    points = scattered(np.random.default_rng(2))
+    twist = torch.tensor([0.03, 0.0, -0.04, 0.0, 0.012, 0.005]).double()
+    motion = CameraMotion.of(EXACT, twist, points)
+    assert motion.angle == pytest.approx(0.05)
+    assert motion.distance == pytest.approx(0.013)
+    shift = (motion_jacobian(EXACT, points) @ twist).numpy()
+    assert motion.displacement == pytest.approx(np.sqrt((shift**2).sum(1).mean()))
+    assert str(motion) == (
+        f"camera moved by {np.rad2deg(0.05):.1f} degrees and 13 mm "
+        f"({motion.displacement:.1f} px in the image)"
+    )
+
+
+def wandering(count, place=EXACT, seed=3):
+    """Poses of the tool, and its exact pixels by a camera of the model."""
+    pose = demonstration(np.random.default_rng(seed), frames=count).pose
+    return pose, marker_pixels(place, pose)[0]
+
+
+@pytest.mark.parametrize(("interval", "most"), [(1 / 16, 17), (7 / 64, 10), (1 / 8, 9)])
+def test_a_watch_compares_the_last_second_once_it_has_ten_frames(interval, most):
+    pose, pixels = wandering(24, moved_camera(EXACT, torch.full((6,), 1e-3).double()))
+    watch = CameraWatch(exact_reference(np.inf))
+    for k in range(24):
+        assert watch.update(k * interval, pose[k], pixels[k]) is None
+        window = slice(max(0, k - int(1 / interval)), k + 1)
+        frames = window.stop - window.start
+        assert frames <= most
+        if frames < 10:
+            assert watch.displacement == 0
+            continue
+        points = marker_points(EXACT, pose[window])
+        expected = _explained(EXACT, points, pixels[window])[1]
+        assert watch.displacement == pytest.approx(expected, rel=1e-9)
+    assert (watch.displacement > 0) == (most >= 10)
+    watch.clear()
+    assert watch.displacement == 0
+    watch.update(0.0, pose[0], pixels[0])  # the clock may begin again
+
+
+@pytest.mark.parametrize(("factor", "noticed"), [(0.999, False), (1.001, True)])
+def test_a_motion_is_told_above_the_threshold(factor, noticed):
+    twist = torch.tensor([2e-3, 1e-3, 0, 0, 0, 3e-3]).double()
+    pose, pixels = wandering(12, moved_camera(EXACT, twist))
+    points = marker_points(EXACT, pose)
+    displacement = _explained(EXACT, points, pixels)[1]
+    watch = CameraWatch(exact_reference(displacement / factor))
+    found = [watch.update(0.01 * k, pose[k], pixels[k]) for k in range(12)]
+    assert (found[-1] is not None) == noticed
+    if noticed:
+        # Exact pixels leave the prior alone to pull it from the truth.
+        torch.testing.assert_close(found[-1].twist, twist, rtol=0, atol=1e-3)
+        there = marker_pixels(moved_camera(EXACT, found[-1].twist), pose)[0]
+        assert (there - pixels).abs().max() < 0.05
+
+
+def test_points_and_pixels_move_as_those_of_the_moved_camera():
+    points = scattered(np.random.default_rng(4))
+    twist = torch.tensor([0.1, -0.2, 0.3, 0.02, -0.03, 0.04]).double()
+    turn = Rotation.from_rotvec(twist[:3])
+    expected = turn.inv().apply(points - twist[3:])
+    np.testing.assert_allclose(from_moved(points, twist), expected, atol=1e-12)
+    change = _displacement(EXACT, points, twist)
+    after = pixels_and_depth(EXACT, torch.from_numpy(expected))[0]
+    np.testing.assert_allclose(change, after - pixels_and_depth(EXACT, points)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_steps_to_a_motion_compose_in_the_frame_of_the_camera_as_moved(steps):
+    points = scattered(np.random.default_rng(5), 40)
+    truth = torch.tensor([0.1, -0.08, 0.15, 0.05, -0.04, 0.06]).double()
+    pixels = pixels_and_depth(EXACT, from_moved(points, truth))[0]
+    start = torch.tensor([0.05, 0.0, 0.1, 0.0, -0.05, 0.0]).double()
+    found = refined_twist(EXACT, points, pixels, start, steps=steps)
+    if steps == 1:
+        seen = from_moved(points, start)
+        step = _explained(EXACT, seen, pixels, start)[0].numpy()
+        turn = Rotation.from_rotvec(start[:3])
+        both = turn * Rotation.from_rotvec(step[:3])
+        expected = np.append(both.as_rotvec(), start[3:] + turn.apply(step[3:]))
+        np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
+    else:
+        torch.testing.assert_close(found, truth, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize(("noise", "agree"), [(9.5, True), (10.5, False)])
+def test_the_plane_of_objects_is_that_on_which_they_lie(noise, agree):
+    """With the same offset of all grasps, which alone tells the height of the tool."""
+    rng = np.random.default_rng(6)
+    there = np.array([0.45, 0.0, 0.07]) + rng.uniform(-0.1, 0.1, (9, 3)) * [1, 1, 0]
+    taken = torch.from_numpy(there + np.array([0.02, -0.03, 0.05]))
+    pixels = pixels_and_depth(EXACT, from_base(EXACT, torch.from_numpy(there)))[0]
+    assert object_height(exact_reference(), taken, pixels) == pytest.approx(0.07, abs=1e-6)
+    assert object_height(exact_reference(), taken[:4], pixels[:4]) == pytest.approx(0.07)
+    # Errors that no offset explains: their part along the derivatives is taken out.
+    slope = pixels_and_depth(EXACT, from_base(EXACT, torch.from_numpy(there)))[1]
+    slope = (slope @ torch.from_numpy(cv2.Rodrigues(ROTATION)[0])).flatten(0, 1)
+    error = torch.from_numpy(rng.normal(0, 1, 18))
+    error = error - slope @ torch.linalg.lstsq(slope, error[:, None]).solution[:, 0]
+    error = error.reshape(9, 2)
+    error = noise * error / error.square().sum(-1).mean().sqrt()
+    if agree:
+        object_height(exact_reference(), taken, pixels + error)
+    else:
+        with pytest.raises(ValueError, match=r"disagree by 1[01] px"):
+            object_height(exact_reference(), taken, pixels + error)
+
+
+def test_a_correction_keeps_what_it_knows_for_the_next_episode():
+    """Exact pixels: what it corrects them to is what the camera saw before."""
+    twist = torch.tensor([0.05, -0.03, 0.08, 0.02, 0.03, -0.04]).double()
+    moved_to = moved_camera(EXACT, twist)
+    pose, pixels = wandering(50, moved_to)
+    before = marker_pixels(EXACT, pose)[0]
+    correction = CameraCorrection(exact_reference())
+    assert torch.equal(correction.marker(pose[0], pixels[0]), pixels[0])
+    for k in range(25):
+        correction.update(k / FPS, pose[k], pixels[k])
+    for start in (25, 40):
+        correction.clear()
+        for k in range(start, start + 10):
+            assert correction.update(k / FPS - 1, pose[k], pixels[k]) is None
+    off = torch.stack([correction.marker(p, x) for p, x in zip(pose, pixels, strict=True)])
+    assert (off - before).abs().max() < 0.3
+    assert correction.motion is not None
+    torch.testing.assert_close(correction.motion.twist, twist, rtol=0, atol=5e-3)
+    # Points of a plane, seen by both.
+    place = torch.tensor([[0.45, 0.05, 0.1]]).double()
+    seen, expected = (
+        pixels_and_depth(view, from_base(view, place))[0][0] for view in (moved_to, EXACT)
+    )
+    torch.testing.assert_close(correction.object(0.1, seen), expected, rtol=0, atol=1.0)
+
+
+def test_a_correction_without_a_motion_forgets_frames_before_its_last_second():
+    pose, pixels = wandering(40)
+    correction = CameraCorrection(exact_reference())
+    for k in range(40):
+        correction.update(k / 16, pose[k], pixels[k])
+        times = [frame[0] for frame in correction._frames]
+        assert times[0] >= k / 16 - 1.0
+        assert len(times) == min(k + 1, 17)
+    correction.clear()
+    assert not correction._frames
+    assert correction.motion is None
