@@ -13,7 +13,15 @@ from hrc_learn.vision import (
     MarkerDetector,
     SyntheticCamera,
 )
-from hrc_learn.vision.imaging import pixel_rays, table_top
+from hrc_learn.vision.imaging import (
+    _octave,
+    _octaves,
+    carton,
+    pixel_rays,
+    table_top,
+    wood_grain,
+)
+from hrc_learn.vision.markers import marker_texture
 
 GREY = np.full((90, 120, 3), 128, dtype=np.uint8)
 
@@ -211,3 +219,137 @@ def test_markers_of_one_id_are_refused():
         SyntheticCamera(
             overhead(), [MARKER, Marker(7, 0.03)], dict, rng=np.random.default_rng(0)
         )
+
+
+def test_rows_of_a_large_noisy_image_differ_and_their_noise_has_its_size():
+    """Of one pool of samples at random shifts; small images have samples of their own."""
+    large = np.full((300, 400, 3), 128, dtype=np.uint8)
+    error = ImageNoise(blur=0.0, noise=3.0).degrade(large, np.random.default_rng(0)) - 128.0
+    assert error.std() == pytest.approx(np.sqrt(9 + 1 / 12), rel=0.02)
+    assert abs(error.mean()) < 0.1
+    rows = error.reshape(300, -1)
+    assert len(np.unique(rows, axis=0)) > 290
+    # No two neighbours are shifted by one pixel, and colours are independent.
+    assert abs(np.corrcoef(rows[:-1, 3:].ravel(), rows[1:, :-3].ravel())[0, 1]) < 0.02
+    assert abs(np.corrcoef(error[..., 0].ravel(), error[..., 1].ravel())[0, 1]) < 0.02
+    small = ImageNoise(blur=0.0, noise=3.0).degrade(large[:80, :90], np.random.default_rng(0))
+    samples = small.astype(int).ravel() - 128
+    repeated = np.lib.stride_tricks.sliding_window_view(samples, 12)
+    assert len(np.unique(repeated, axis=0)) > 0.999 * len(repeated)
+
+
+def test_a_pinhole_for_a_lens_is_as_large_as_its_widest_ray():
+    model = CameraModel(
+        width=320,
+        height=240,
+        focal=(260.0, 250.0),
+        principal=(150.0, 125.0),
+        distortion=(-0.2, 0.02, 1e-3, 0.0, 0.0),
+    )
+    pinhole = Lens(model).pinhole
+    assert pinhole.focal == (260.0, 260.0)
+    assert pinhole.principal == ((pinhole.width - 1) / 2, (pinhole.height - 1) / 2)
+    assert not any(pinhole.distortion)
+    assert pinhole.width % 2 == pinhole.height % 2 == 0
+    u, v = np.meshgrid(np.arange(-0.5, 320, 1), np.arange(-0.5, 240, 1))
+    rays = model.to_normalised(np.stack([u, v], axis=-1).reshape(-1, 2))
+    widest = 260.0 * np.abs(rays).max(axis=0)
+    spare = np.array([pinhole.width, pinhole.height]) / 2 - widest
+    # Two pixels for the interpolation, rounded up to whole ones.
+    assert (spare >= 1.99).all()
+    assert (spare < 3.01).all()
+
+
+def test_the_table_is_lit_from_its_upper_left():
+    image = table_top(201, 101).astype(float)
+    colour = np.array([168.0, 148.0, 124.0])
+    for (v, u), light in {
+        (0, 0): 1.0,
+        (0, 200): 0.76,
+        (100, 0): 0.84,
+        (100, 200): 0.6,
+        (50, 100): 1.0,
+        (50, 0): 1.02,
+        (50, 150): 0.915,
+        (25, 100): 1.015,
+    }.items():
+        np.testing.assert_allclose(image[v, u], light * colour, atol=0.51)
+
+
+def test_grain_runs_along_the_wood():
+    image = wood_grain(np.random.default_rng(0)).astype(float)
+    np.testing.assert_allclose(image.mean(axis=(0, 1)), (205, 185, 160), rtol=0.01)
+    np.testing.assert_allclose(
+        image.std(axis=(0, 1)) / image.mean(axis=(0, 1)), 0.06, atol=3e-3
+    )
+    grey = image[..., 0] - image[..., 0].mean()
+    along = (grey[:, :-20] * grey[:, 20:]).mean() / grey.var()
+    across = (grey[:-3] * grey[3:]).mean() / grey.var()
+    # Blurred by s, noise a distance d apart correlates by exp(-d^2 / 4 s^2).
+    assert along == pytest.approx(np.exp(-(20**2) / (4 * 40**2)), abs=0.03)
+    assert across == pytest.approx(np.exp(-(3**2) / (4 * 1.5**2)), abs=0.05)
+
+
+def test_a_carton_has_its_colour_and_print_by_its_name():
+    red = (0.8, 0.2, 0.1, 1.0)
+    one, again, other = carton("a", red), carton("a", red), carton("b", red)
+    assert one.shape == (512, 256, 3)
+    np.testing.assert_array_equal(one, again)
+    assert (one != other).any(axis=-1).mean() > 0.2
+    base = np.array([204, 51, 25])
+    for image in (one, other):
+        assert 0.2 < (image == base).all(axis=-1).mean() < 0.9
+    # All is printed on the base colour: another one shows in the same places.
+    blue = carton("a", (0.1, 0.2, 0.8, 1.0))
+    np.testing.assert_array_equal((one != blue).any(axis=-1), (one == base).all(axis=-1))
+    # Words in white and black, in five rows of the height.
+    for ink in ((250, 250, 245), (20, 20, 25)):
+        rows = np.flatnonzero((one == ink).all(axis=-1).any(axis=1))
+        assert np.ptp(rows) > 100
+
+
+@pytest.mark.parametrize(
+    ("edge", "module"),
+    [(3.0, 1), (8.0, 1), (11.0, 1), (11.6, 2), (60.0, 8), (130.0, 16), (4000.0, 64)],
+)
+def test_a_plates_texture_is_the_octave_of_its_size_in_the_image(edge, module):
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    for angle in (0.0, 0.5):
+        c, s = np.cos(angle), np.sin(angle)
+        pixels = 100 + edge * square @ np.array([[c, s], [-s, c]])
+        assert 2 ** _octave(pixels) == module
+    # The mean of all edges counts.
+    wide = pixels + 0.2 * (pixels - pixels[0]) * [1, 0]
+    assert 2 ** _octave(wide) >= module
+
+
+def test_textures_of_a_plate_have_a_clear_border_and_grey_between_ink_and_paper():
+    for k, texture in enumerate(_octaves(7)):
+        size = 8 * 2**k + 2
+        assert texture.shape == (size, size, 2)
+        alpha = np.zeros((size, size))
+        alpha[1:-1, 1:-1] = 1
+        np.testing.assert_array_equal(texture[..., 1], alpha)
+        np.testing.assert_array_equal(texture[..., 0][alpha == 0], 0)
+        inner = texture[1:-1, 1:-1, 0]
+        np.testing.assert_allclose(inner, 25 + 210 * (marker_texture(7, size - 2) / 255.0))
+        assert inner[0, 0] == 235  # paper
+        assert inner.min() == 25  # ink
+
+
+def test_a_plates_region_has_room_for_the_blur_of_its_edge():
+    pixels = np.array([[100.4, 50.6], [140.2, 52.0], [139.0, 90.9], [101.0, 88.0]])
+    small = CameraModel(width=64, height=48)
+    for blur, room in ((0.0, 2), (0.7, 5), (2.0, 8)):
+        noise = ImageNoise(blur=blur, noise=0.0)
+        rows, columns = camera_on(small, {}, MARKER, noise=noise)._around(pixels)
+        assert (rows.start, rows.stop) == (50 - room, 91 + room + 1)
+        assert (columns.start, columns.stop) == (100 - room, 141 + room + 1)
+        cut = camera_on(small, {}, MARKER, noise=noise)._around(pixels - [139, 200])
+        assert (cut[1].start, cut[0].start, cut[0].stop) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("height", "drawn"), [(1.27, True), (1.285, False)])
+def test_a_plate_two_centimetres_before_the_lens_is_no_longer_drawn(height, drawn):
+    camera = camera_on(overhead(), {7: facing([0.5, 0.0, height])}, Marker(7, 0.001))
+    assert len(camera._visible()) == drawn
