@@ -1,5 +1,6 @@
 """Cameras on the workplace: rendered images, occluded markers, cameras that are moved."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -24,7 +25,7 @@ from hrc_learn.sim import (
 from hrc_learn.sim.cameras import EGLCamera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
-from hrc_learn.vision import MarkerDetector, SyntheticCamera, centre
+from hrc_learn.vision import CameraModel, MarkerDetector, SyntheticCamera, centre
 
 WORKPLACE = Workplace()
 
@@ -232,3 +233,86 @@ def test_a_recorded_run_has_its_bodies_where_they_were():
         np.testing.assert_allclose(
             world.data.geom_xpos[drawn], middles @ R.T + place[step], atol=1e-9
         )
+
+
+def test_opengls_frustum_shows_every_point_at_its_pixel():
+    """By the definition of glFrustum, with the image's edges half a pixel outside."""
+    model = CameraModel(
+        width=320, height=200, focal=(260.0, 240.0), principal=(150.0, 110.0)
+    ).look_at(np.array([0.9, 0.4, 1.2]), np.array([0.5, 0.0, 0.1]), roll=0.3)
+    view = mujoco.MjvGLCamera()
+    view.frustum_near = 0.05
+    cameras._set_view(view, model)
+    right = np.cross(view.forward, view.up)
+    points = np.random.default_rng(0).uniform([0.2, -0.4, 0], [0.9, 0.4, 0.4], (20, 3))
+    away = points - view.pos
+    depth = away @ view.forward
+    x, y = (view.frustum_near * (away @ axis) / depth for axis in (right, view.up))
+    u = (x - view.frustum_center + view.frustum_width) / (2 * view.frustum_width) * 320
+    height = view.frustum_top - view.frustum_bottom
+    v = (view.frustum_top - y) / height * 200
+    pixels = np.stack([u, v], axis=-1) - 0.5
+    np.testing.assert_allclose(pixels, model.project(points), atol=1e-3)  # single precision
+    assert view.orthographic == 0
+
+
+def test_a_marker_is_hidden_if_a_corner_or_its_middle_is(world):
+    model = world.config.camera
+    markers = [item.marker for item in world.config.objects]
+    markers.append(world.config.arm.marker.marker)
+    assert cameras.hidden_markers(world, model, markers) == set()
+    marker = markers[0]
+    pose, eye = world.marker_poses()[marker.id], model.pose[:3, 3]
+    half = np.array([0.07, 0.09, 0.004])
+    corners = marker.corners @ pose[:3, :3].T + pose[:3, 3]
+    for point in (pose[:3, 3], *corners):
+        # The board's corner comes just up to the ray to that point, or falls short of it.
+        at = point + 0.3 * (eye - point) / np.linalg.norm(eye - point)
+        out = np.sign((point - pose[:3, 3])[:2])
+        out[out == 0] = 1
+        for gap, hidden in ((-2e-3, True), (2e-3, False)):
+            if not hidden and np.allclose(point, pose[:3, 3]):
+                continue
+            centre = at + np.append(out * (half[:2] + gap), 0.0)
+            world.move_obstacle("occluder", centre)
+            assert (marker.id in cameras.hidden_markers(world, model, markers)) == hidden
+    world.move_obstacle("occluder", NOWHERE)
+
+
+@pytest.mark.parametrize("change", [CameraChange(), CameraChange(distance=0.02, angle=0.05)])
+def test_a_changed_camera_is_as_far_and_as_much_turned_as_asked(change):
+    model, rng = WORKPLACE.scene.camera, np.random.default_rng(0)
+    middle = np.array([[*WORKPLACE.table_centre, 0.0]])
+    for _ in range(5):
+        changed = change.applied(model, middle, rng)
+        shift = changed.pose[:3, 3] - model.pose[:3, 3]
+        assert np.linalg.norm(shift) == pytest.approx(change.distance)
+        turn = changed.pose[:3, :3] @ model.pose[:3, :3].T
+        assert np.arccos((np.trace(turn) - 1) / 2) == pytest.approx(change.angle)
+        assert changed.in_view(middle).all()
+        assert changed.focal == model.focal
+    closer = CameraChange(distance=0.0, angle=0.0, focus=1.2).applied(model, middle, rng)
+    np.testing.assert_allclose(closer.focal, np.multiply(1.2, model.focal))
+    np.testing.assert_allclose(closer.pose, model.pose, atol=1e-12)
+    with pytest.raises(
+        ValueError, match=r"moved by 3 m, turned by 90 degrees and refocused by 2"
+    ):
+        CameraChange(distance=3.0, angle=np.pi / 2, focus=2.0).applied(
+            model, np.array([[9.0, 9.0, 0.0]]), rng, attempts=2
+        )
+
+
+def test_a_board_is_held_ten_centimetres_before_a_marker_for_its_interval(world):
+    interval = OcclusionInterval(start=0.5, duration=0.25)
+    occlusion, eye = ScriptedOcclusion(world, [interval]), world.config.camera.pose[:3, 3]
+    for time, there in ((0.0, False), (0.5, True), (0.7, True), (0.75, False), (0.4, False)):
+        world.data.time = time
+        occlusion.update()
+        board = world.data.body("occluder").xpos
+        if there:
+            marker = world.marker_poses()[HAND_MARKER][:3, 3]
+            assert np.linalg.norm(board - marker) == pytest.approx(0.1)
+            towards = (eye - marker) / np.linalg.norm(eye - marker)
+            np.testing.assert_allclose(board, marker + 0.1 * towards)
+        else:
+            np.testing.assert_allclose(board, NOWHERE)

@@ -7,6 +7,7 @@ import pytest
 
 from hrc_learn.sim import Worker, WorkerConfig
 from hrc_learn.sim.hand_over import BACK, BENCH, HAND_OVER, HELD_OUT, RIGHT, random_hand_over
+from hrc_learn.sim.worker_visit import in_worker_frame
 from hrc_learn.sim.workplace import Workplace
 
 TABLE = Workplace().scene.table
@@ -86,3 +87,89 @@ def test_nobody_holds_a_thing_out_over_a_bench_above_their_head():
         random_hand_over(
             Worker(WorkerConfig()), np.random.default_rng(0), bench=high, thickness=0.03
         )
+
+
+def fills(values, low, high, part=0.15):
+    """True if values are within a range and come near both of its ends."""
+    values, slack = np.asarray(values), part * (high - low)
+    inside = (values >= low - 1e-9) & (values <= high + 1e-9)
+    return inside.all() and values.min() < low + slack and values.max() > high - slack
+
+
+def test_handovers_vary_as_much_as_they_may():
+    worker, h = Worker(WorkerConfig(stature=1.75)), 1.75
+    plans = [
+        random_hand_over(worker, np.random.default_rng(k), bench=TABLE, thickness=THICKNESS)
+        for k in range(50)
+    ]
+    assert fills([plan.visit.begin for plan in plans], 1.0, 3.0)
+    stand = np.array([plan.visit.poses[1, :2] for plan in plans])
+    assert fills(stand[:, 0], 0.15, 0.45)
+    facing = np.array([plan.visit.poses[2, 2] for plan in plans])
+    assert fills(facing, -np.pi / 2 - 0.1, -np.pi / 2 + 0.1)
+    place = np.array([plan.place for plan in plans])
+    assert fills(EDGE - place[:, 1], 0.26, 0.42)
+    assert fills(place[:, 2] - TOP, 0.24, 0.36)
+    aside = place[:, 0] - stand[:, 0]
+    assert (aside >= -0.22).all()
+    assert (aside[place[:, 0] > 0.081] <= 0.04).all()
+    assert ((place[:, 0] >= 0.08) & (place[:, 0] <= 0.42)).all()
+    laid = np.array([plan.thing_at(plan.carried[0][1]) for plan in plans])
+    assert fills(laid[:, 0] - stand[:, 0], -0.25, 0.0)
+    assert fills(EDGE - laid[:, 1], 0.10, 0.16)
+    np.testing.assert_allclose(laid[:, 2], TOP + THICKNESS)
+    rests, holds, leans = [], [], []
+    for plan in plans:
+        for before, after in zip(plan.reaches[::2], plan.reaches[1::2], strict=True):
+            rests.append(after.begin - before.end)
+        for down, up in zip(plan.reaches[1::2], plan.reaches[2::2], strict=False):
+            holds.append(up.begin - down.end)
+        (_, first), (second, last) = plan.carried
+        # It is laid down and taken up as the hand leaves again.
+        assert (first, second) == (plan.reaches[2].begin, plan.reaches[4].begin)
+        assert last == np.inf
+        leans.append(plan.visit.poses[-1, 3])
+        assert plan.visit.poses[6, 3] == 0.05
+        target = in_worker_frame(
+            worker, plan.visit.poses[1, :2], plan.visit.poses[2, 2], plan.place - HELD_OUT
+        )
+        np.testing.assert_allclose(plan.visit.poses[-1, 7:], target, atol=1e-9)
+        assert leans[-1] == worker.lean_to(target, RIGHT)
+    assert fills(rests, 0.6, 1.5)
+    assert fills(holds, 0.2, 0.5)
+    assert max(leans) <= 0.45
+    assert plans[0].visit.step == pytest.approx(0.4 * h)
+
+
+def test_the_last_way_to_the_gripper_is_a_third_as_fast_and_leans_no_further_than_it_may():
+    plan = drawn(2)
+    now = plan.visit.end + 1.0
+    near = plan.brought_to(plan.place + np.array([0.0, -0.05, 0.0]), now)
+    begin, end = near.visit.time[-2:]
+    assert begin == now
+    hands = near.visit.poses[-2:, 7:]
+    way = np.linalg.norm(hands[1] - hands[0])
+    # A minimum-jerk motion peaks at 15/8 of its mean speed; the trunk may take longer.
+    assert end - begin >= 15 / 8 * way / (0.3 * plan.speeds.reaching) - 1e-9
+    assert end - begin == pytest.approx(
+        max(
+            15 / 8 * way / (0.3 * plan.speeds.reaching),
+            15
+            / 8
+            * 0.47
+            * plan.visit.worker.config.stature
+            * abs(near.visit.poses[-1, 3] - near.visit.poses[-2, 3])
+            / plan.speeds.walking,
+            0.3,
+        )
+    )
+    far = plan.brought_to(plan.place + np.array([0.0, -2.0, 0.0]), now)
+    assert far.visit.poses[-1, 3] == 0.45
+    gone = near.left(near.visit.end + 1.0)
+    assert gone.carried[-1] == (plan.carried[-1][0], near.visit.end + 1.0)
+    rows = gone.visit.poses[-3:]
+    np.testing.assert_allclose(rows[0, 4:], plan.visit.worker.hanging_hands().ravel())
+    assert not rows[:, 3].any()
+    x, y = plan.leaving - rows[0, :2]
+    assert np.cos(rows[1, 2] - np.arctan2(y, x)) == pytest.approx(1)
+    assert abs(rows[1, 2] - rows[0, 2]) <= np.pi
