@@ -6,6 +6,7 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
+from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim import World
@@ -84,6 +85,12 @@ def test_an_arm_that_was_held_up_goes_on_from_where_it_is(world):
     assert any(touch.second == "cabinet_door" for touch in world.cabinet_contacts.touches)
     assert abs(stuck.joint_velocity[0]) < 0.05
     assert any("touched cabinet_door" in met for met in world.touched_since(world.time - 0.02))
+    touches = [t for t in world.cabinet_contacts.touches if t.second == "cabinet_door"]
+    last = max(touch.end for touch in touches)
+    met = world.touched_since(last)
+    assert {f"{t.first} touched {t.second}" for t in touches if t.end >= last} <= set(met)
+    assert len(set(met)) == len(met)
+    assert world.touched_since(last + 1e-6) == ()
     world.arm.command(-swing)
     world.advance(0.5)
     assert world.touched_since(world.time - 0.02) == ()
@@ -91,6 +98,9 @@ def test_an_arm_that_was_held_up_goes_on_from_where_it_is(world):
     # Two seconds of it were spent at the door: they are not made up for on the way back.
     assert back.joint_position[0] - stuck.joint_position[0] == pytest.approx(0.25, abs=0.05)
     np.testing.assert_allclose(back.joint_velocity, -swing, atol=0.02)
+    world.reset(_OUT_OF_THE_WAY)
+    assert world.touched_since(0.0) == ()
+    assert world.time == 0.0
 
 
 def test_a_held_object_stays_in_the_hand_while_the_arm_swings(world, workplace):
@@ -190,3 +200,62 @@ def test_an_arm_that_is_controlled_elsewhere_is_shown_with_what_it_carries(world
     assert world.arm.read().gripper_width == pytest.approx(0.0, abs=1e-9)
     world.follow(replace(state, joint_position=workplace.home_joints().numpy()))
     np.testing.assert_allclose(world.object_pose("box"), tool @ grip, atol=1e-9)
+
+
+def test_time_passes_in_whole_steps_one_at_least(world):
+    dt = world.model.opt.timestep
+    for duration, steps in ((0.0, 1), (1.4 * dt, 1), (1.6 * dt, 2), (0.02, 10)):
+        before = world.time
+        world.advance(duration)
+        assert world.time - before == pytest.approx(steps * dt)
+
+
+def test_things_are_put_in_the_hand_or_anywhere_at_rest(world):
+    world.put_in_hand("box")
+    tool = world.arm.tcp_pose()
+    in_hand = np.linalg.inv(tool) @ world.object_pose("box")
+    np.testing.assert_allclose(in_hand[:3, 3], 0, atol=1e-9)
+    # The gripper closes along y of the tool, on the faces across x of the box.
+    np.testing.assert_allclose(np.abs(in_hand[1, 0]), 1, atol=1e-9)
+    np.testing.assert_allclose(in_hand[2, 2], -1, atol=1e-9)
+    world.data.joint("box").qvel[:] = 3.0
+    pose = np.eye(4)
+    pose[:3, 3] = (0.3, 0.5, 0.4)
+    world.carry("box", pose)
+    np.testing.assert_allclose(world.object_pose("box"), pose, atol=1e-9)
+    assert not world.data.joint("box").qvel.any()
+    with pytest.raises(KeyError, match="there are: box"):
+        world.carry("bottle", pose)
+    assert world.held() == ()
+
+
+def test_table_and_markers_are_where_the_scene_has_them(world):
+    table = world.config.table
+    assert world.table_top == pytest.approx(table.centre[2] + table.half_size[2])
+    poses, plate = world.marker_poses(), world.config.arm.marker
+    item = world.config.objects[0]
+    assert set(poses) == {7, item.marker.id}
+    box = world.object_pose("box")
+    above = box @ [0, 0, item.half_size[2] + 5e-4, 1]
+    np.testing.assert_allclose(poses[item.marker.id][:3, 3], above[:3], atol=1e-9)
+    offset = np.subtract(plate.position, (0, 0, 0.1034))
+    np.testing.assert_allclose(world.hand_marker_offset(), offset, atol=1e-9)
+    bare = World(replace(world.config, arm=replace(world.config.arm, marker=None)))
+    assert set(bare.marker_poses()) == {item.marker.id}
+    with pytest.raises(ValueError, match="carries no marker"):
+        bare.hand_marker_offset()
+
+
+def test_a_path_is_looked_along_with_obstacles_and_times_are_samples(world, workplace):
+    obstacle = Box(name="wall", centre=(0, 0, -5), half_size=(0.05, 0.05, 0.05))
+    made = World(replace(workplace.scene, obstacles=(obstacle,)))
+    home = workplace.home_joints()
+    made.reset(home.numpy())
+    path = np.linspace(home.numpy(), home.numpy() + 0.3, 5)
+    assert made.collisions_along(path) == []
+    there = panda.forward(torch.from_numpy(path[3])).position.numpy()
+    made.move_obstacle("wall", there)
+    touches = made.collisions_along(path)
+    assert {touch.second for touch in touches} == {"wall"}
+    assert min(touch.start for touch in touches) in (1.0, 2.0, 3.0)
+    assert all(touch.start <= 3.0 <= touch.end for touch in touches[:1])
