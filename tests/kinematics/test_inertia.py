@@ -103,3 +103,33 @@ def test_masses_without_inertia_are_spread_over_the_capsules(tmp_path):
     # A thin rod of 1 m and 3 kg, its middle 0.7 m from the axis: m (l^2/12 + 0.7^2).
     M = MassMatrix(arm(bare))(torch.zeros(2, 1, dtype=torch.float64))
     assert M.flatten().tolist() == pytest.approx(2 * [3 * (1 / 12 + 0.49)], rel=0.02)
+
+
+def test_bodies_that_move_together_add_up_and_their_inertia_is_mujocos(tmp_path):
+    """In frames of the joints, and zero for a flange and a tool that carry nothing."""
+    path = tmp_path / "heron.xml"
+    path.write_text(MODEL)
+    described = arm(path, tip="tcp")
+    assert described.shape.masses == pytest.approx((1.0, 2.0, 1.5, 0.9, 0.0, 0.0))
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    frames = described.link_poses([0.0, 0.0, 0.0]).matrix().numpy()
+    moving = {"a": 0, "b": 1, "c": 2, "plate": 2}
+    expected = np.zeros((3, 4, 4))
+    for name, number in moving.items():
+        body = model.body(name).id
+        R, mass = data.ximat[body].reshape(3, 3), model.body_mass[body]
+        moments = model.body_inertia[body]
+        # Second moments about the axes from moments of inertia about them.
+        second = np.diag(moments.sum() / 2 - moments)
+        inner = np.zeros((4, 4))
+        inner[:3, :3], inner[3, 3] = second, mass
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, data.xipos[body]
+        T = np.linalg.inv(frames[number]) @ T
+        expected[number] += T @ inner @ T.T
+    for found, wanted in zip(described.shape.inertia[1:4], expected, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+    for empty in described.shape.inertia[4:]:
+        np.testing.assert_array_equal(empty, np.zeros((4, 4)))
