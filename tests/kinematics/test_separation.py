@@ -7,7 +7,14 @@ import sampling
 import torch
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import TOOL_LINK, GraspedBox, panda, separation
+from hrc_learn.kinematics import (
+    TOOL_LINK,
+    CapsuleArm,
+    GraspedBox,
+    LinkCapsule,
+    panda,
+    separation,
+)
 from hrc_learn.kinematics.collision import nearest_on_segment_and_box, segment_distance
 
 BOX = GraspedBox(half_size=(0.04, 0.022, 0.03), centre=(0.0, 0.005, 0.01))
@@ -250,3 +257,14 @@ def test_single_precision_is_near_double():
     single = separation(ARM, q.float(), ends.float(), radius.float(), BOX)
     assert single.distance.dtype == torch.float32
     np.testing.assert_allclose(single.distance, double.distance, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_link_that_is_a_ball_has_its_distance_from_boxes_too(dtype):
+    """It is its own bound, from which no rounding may leave it out."""
+    ball = LinkCapsule(link=4, start=(0.01, 0.02, 0.0), end=(0.01, 0.02, 0.0), radius=0.05)
+    arm, q = CapsuleArm(panda, [ball]), postures(30, seed=2).to(dtype)
+    centre, half = torch.tensor([[0.5, 0.2, 0.3], [0.1, 0.3, 0.1]]).to(dtype)
+    place = panda.link_poses(q)[:, 3].apply(torch.tensor(ball.start).to(dtype))
+    outside = ((place - centre).abs() - half).clamp_min(0).norm(dim=-1)
+    torch.testing.assert_close(arm.box_distance(q, centre, half), outside - 0.05)
