@@ -515,3 +515,23 @@ def test_a_long_step_is_shortened_as_a_whole(turn, move, factor):
     step[7:10] = move * torch.tensor([-2.0, 1.0, 2.0]) / 3
     assert_close(_shortened(step), step / factor)
     assert_close(_shortened(torch.stack([step, 0 * step]))[1], 0 * step)
+
+
+def test_of_a_batch_only_those_that_see_the_marker_and_are_not_surprised_learn(network):
+    estimator, rng = CameraEstimator(network, CameraConfig(frames=8)), np.random.default_rng(6)
+    position, orientation = path(rng, 0.08, 8)
+    feature = seen(VIEW, position, orientation, rng)
+    many = [torch.stack([x] * 3) for x in (torch.from_numpy(position), orientation, feature)]
+    frames = measurements(many[0].numpy(), *many[1:])
+    state = run(estimator, estimator.initial_state(3), frames[:-1])
+    far = torch.tensor([[0.0, 0.0], [0.0, 0.0], [200.0, 0.0]]).double()
+    last = replace(
+        frames[-1],
+        valid=torch.tensor([True, False, True]),
+        feature=frames[-1].feature + far,
+    )
+    after = run(estimator, state, [last])
+    changed = (after.cameras != state.cameras).flatten(1).any(-1)
+    assert changed.tolist() == [True, False, False]
+    assert after.surprises.tolist() == [0, 0, 1]
+    assert_close(after.position[1:], state.position[1:], rtol=0, atol=0)

@@ -5,10 +5,18 @@ import numpy as np
 import pytest
 import torch
 from bare_arm import bare
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import ArmChoice, JointLimits, UnreachableError, panda
+from hrc_learn.kinematics import (
+    ArmChoice,
+    JointLimits,
+    LinkCapsule,
+    UnreachableError,
+    panda,
+)
 from hrc_learn.kinematics import arm as registered
+from hrc_learn.kinematics.arm import _behind
 from hrc_learn.kinematics.drawing import arm_meshes
 from hrc_learn.kinematics.inverse import follow_poses, solutions_from
 
@@ -308,3 +316,27 @@ def test_a_small_hand_is_drawn_small():
     meshes = arm_meshes(ArmChoice("viperx").work_arm(), "hand")
     assert all(mesh.scale == pytest.approx((0.7, 0.7, 0.7)) for mesh in meshes)
     assert all(mesh.scale == (1.0, 1.0, 1.0) for mesh in arm_meshes(panda, "hand"))
+
+
+def test_a_capsule_ends_where_a_hand_begins():
+    """Ends before the hand's base plane go back until the round end is behind it."""
+    hand = torch.eye(4, dtype=torch.float64)
+    hand[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix())
+    hand[:3, 3] = torch.tensor([0.1, 0.2, 0.3])
+    place = hand[:3, 3].numpy(), hand[:3, :3].numpy()
+
+    def capsule(start, end):
+        ends = [place[0] + place[1] @ np.array(x) for x in (start, end)]
+        first, last = (tuple(x.tolist()) for x in ends)
+        return LinkCapsule(link=3, start=first, end=last, radius=0.04)
+
+    behind = capsule((0.0, 0.0, -0.2), (0.05, 0.0, -0.01))
+    assert _behind(behind, hand) == behind
+    cut = _behind(capsule((0.02, 0.0, -0.2), (0.0, 0.03, 0.1)), hand)
+    expected = capsule((0.02, 0.0, -0.2), (0.0, 0.03, -0.04))
+    np.testing.assert_allclose(cut.start, expected.start, atol=1e-12)
+    np.testing.assert_allclose(cut.end, expected.end, atol=1e-12)
+    assert (cut.link, cut.radius) == (3, 0.04)
+    assert _behind(capsule((0.0, 0.0, 0.01), (0.0, 0.0, 0.1)), hand) is None
+    other = _behind(capsule((0.0, 0.0, 0.1), (0.0, 0.0, -0.2)), hand)
+    np.testing.assert_allclose(other.start, capsule((0, 0, -0.04), (0, 0, 0)).start, atol=1e-12)
