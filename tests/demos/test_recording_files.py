@@ -352,6 +352,7 @@ def test_ends_split_the_arrays_that_reach_the_last_one(name):
     np.testing.assert_array_equal(parts[0].fields["q"].numbers(), Q[:3])
     np.testing.assert_array_equal(parts[1].fields["q"].numbers(), Q[3:8])
     assert len(split({"q": Q, name: [12]})) == 1
+    assert [part.fields["q"].frames for part in split({"q": Q, name: [1, 12]})] == [1, 11]
 
 
 @pytest.mark.parametrize("ends", [[0, 5], [5, 5], [5, 4], [5, 13]])
