@@ -342,3 +342,24 @@ def test_a_joint_that_rests_or_does_not_follow():
     assert [*track_quantities(given, 50)] == ["command_position"]
     state[:, 1] = motion(200, 17.3)[:, 1]
     assert [*track_quantities(given, 50)] == ["command_position", "rates"]
+
+
+@pytest.mark.parametrize(("fps", "window"), [(10, 2), (20, 4), (50, 10), (5, 2)])
+def test_rates_are_means_over_a_fifth_of_a_second(fps, window):
+    """Noise of the commanded velocity is averaged over as many frames as the joints' rate."""
+    rng = np.random.default_rng(fps)
+    joints = motion(300)[:, :1]
+    velocity = np.diff(joints, axis=0, append=joints[-1:]) * fps
+    velocity += 2 * velocity.std() * rng.normal(size=velocity.shape)
+    rate = (joints[window:] - joints[:-window])[:, 0] * fps / window
+    mean = np.convolve(velocity[:, 0], np.full(window, 1 / window), "valid")[: len(rate)]
+    given = {"joint_position": joints, "command_velocity": velocity}
+    found = track_quantities(given, fps)["command_velocity"]
+    late = found.delay
+    pairs = (
+        mean[max(-late, 0) : len(mean) - max(late, 0)],
+        rate[max(late, 0) :][: len(mean) + late],
+    )
+    expected = linregress(pairs[0], pairs[1][: len(pairs[0])])
+    np.testing.assert_allclose(found.slope, expected.slope)
+    np.testing.assert_allclose(found.fit, expected.rvalue**2)

@@ -161,6 +161,96 @@ def test_a_file_whose_writer_was_killed_gets_a_footer(tmp_path):
     assert not files.is_unfinished(Path(__file__))
 
 
+def test_a_new_footer_states_what_the_old_one_did():
+    """Sizes and offsets of every column of pages of both versions, several to a column."""
+    rng = np.random.default_rng(1)
+    count = 900
+    table = pa.table(
+        {
+            "q": pa.FixedSizeListArray.from_arrays(pa.array(rng.normal(size=3 * count)), 3),
+            "n": pa.array(rng.integers(-300, 300, count).astype("int32")),
+            "done": pa.array(rng.random(count) > 0.5),
+            "task": pa.array([f"task {k % 3}" for k in range(count)]),
+        }
+    )
+    for version, size in (("1.0", 512), ("2.0", 512), ("1.0", 2**20)):
+        sink = pa.BufferOutputStream()
+        options = {"data_page_version": version, "data_page_size": size}
+        pq.write_table(table, sink, row_group_size=400, write_batch_size=50, **options)
+        content = sink.getvalue().to_pybytes()
+        old = pq.ParquetFile(pa.BufferReader(content)).metadata
+        begin = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+        for cut, groups in ((begin, 3), (begin - 1, 2)):
+            made = files.finished_parquet(content[:cut], table.slice(0, 1))
+            assert made[-4:] == b"PAR1"
+            new = pq.ParquetFile(pa.BufferReader(made)).metadata
+            assert (new.num_row_groups, new.num_columns) == (groups, old.num_columns)
+            assert new.num_rows == min(400 * groups, count)
+            for group in range(groups):
+                one, other = old.row_group(group), new.row_group(group)
+                assert one.num_rows == other.num_rows
+                assert one.total_byte_size == other.total_byte_size
+                for column in range(old.num_columns):
+                    a, b = one.column(column), other.column(column)
+                    for name in SIZES:
+                        assert getattr(a, name) == getattr(b, name), (group, column, name)
+            read = pq.read_table(pa.BufferReader(made), page_checksum_verification=False)
+            assert read.equals(table.slice(0, new.num_rows))
+
+
+SIZES = ("num_values", "total_compressed_size", "total_uncompressed_size", "physical_type")
+SIZES += ("data_page_offset", "has_dictionary_page", "dictionary_page_offset", "compression")
+SIZES += ("path_in_schema",)
+
+
+@pytest.mark.parametrize(
+    ("data", "kind", "value"),
+    [
+        # The specification of Thrift's compact protocol, read by hand.
+        ("", 1, True),
+        ("", 2, False),
+        ("a7", 3, 0xA7),
+        ("00", 5, 0),
+        ("02", 5, 1),
+        ("01", 6, -1),
+        ("7f", 6, -64),
+        ("8001", 6, 64),
+        ("ffffffff0f", 5, -(2**31)),
+        ("80808080808002", 6, 2**42),
+        ("03616263", 8, b"abc"),
+        ("00", 8, b""),
+        ("8001" + "78" * 128, 8, b"x" * 128),
+        ("f503020406", 9, (5, [1, 2, 3])),
+        ("f800", 9, (8, [])),
+        ("00", 12, {}),
+        ("1502250400", 12, {1: (5, 1), 3: (5, 2)}),
+        ("111213ff00", 12, {1: (1, True), 2: (2, False), 3: (3, 255)}),
+        ("f80201610162", 9, (8, [b"a", b"b"])),
+        ("2c150200160400", 12, {2: (12, {1: (5, 1)}), 3: (6, 2)}),
+        ("19f5010600", 12, {1: (9, (5, [3]))}),
+    ],
+)
+def test_values_of_thrifts_compact_protocol(data, kind, value):
+    raw = bytes.fromhex(data)
+    assert files._written(kind, value) == raw
+    # At another place, and with other bytes behind it.
+    assert files._read(b"\xff" * 3 + raw + b"\x85", 3, kind) == (value, 3 + len(raw))
+
+
+@pytest.mark.parametrize(
+    ("data", "kind", "value"),
+    [
+        ("35020406", 9, (5, [1, 2, 3])),  # short lists have their size in the first byte
+        ("05280200", 12, {20: (5, 1)}),  # fields more than 15 numbers on
+        ("1502055004150600", 12, {1: (5, 1), 40: (5, 2), 41: (5, 3)}),
+        ("e5" + "02" * 14, 9, (5, [1] * 14)),
+    ],
+)
+def test_shorter_and_longer_forms_are_read_too(data, kind, value):
+    raw = bytes.fromhex(data)
+    assert files._read(raw, 0, kind) == (value, len(raw))
+
+
 FEATURES = {
     "observation.state": Feature(
         key="observation.state", dtype="float32", shape=(4,), names=("a.pos", "b.pos", "c", "d")
