@@ -432,23 +432,23 @@ def _align_joints(
     Returns:
         Joint names, selections in that order, and joints of the quantities with other joints.
     """
-    first = next((found[role] for role in JOINT_FIELDS if role in found), None)
-    if first is None:
+    joints = [found[role] for role in JOINT_FIELDS if role in found]
+    if not joints:
         return (), found, {}
+    names, numbered = joints[0].labels, joints[0].numbered
+    if numbered:  # names of another quantity with as many joints say more
+        named = (s.labels for s in joints if not s.numbered and len(s.labels) == len(names))
+        names = next(named, names)
     aligned, unmatched = {}, {}
     for role, selection in found.items():
-        if role not in JOINT_FIELDS or selection.labels == first.labels:
+        if role not in JOINT_FIELDS or selection.labels == names:
             aligned[role] = selection
-        elif set(selection.labels) >= set(first.labels):
+        elif set(selection.labels) >= set(names):
             place = dict(zip(selection.labels, selection.columns, strict=True))
-            columns = tuple(place[label] for label in first.labels)
-            aligned[role] = replace(selection, columns=columns, labels=first.labels)
-        elif len(selection.labels) == len(first.labels) and (
-            selection.numbered or first.numbered
-        ):
-            aligned[role] = replace(selection, labels=first.labels)
+            columns = tuple(place[label] for label in names)
+            aligned[role] = replace(selection, columns=columns, labels=names)
+        elif len(selection.labels) == len(names) and (selection.numbered or numbered):
+            aligned[role] = replace(selection, labels=names)
         else:
             unmatched[role] = selection.labels
-    named = [s for role, s in aligned.items() if role in JOINT_FIELDS and not s.numbered]
-    names = named[0].labels if first.numbered and named else first.labels
     return names, aligned, unmatched
