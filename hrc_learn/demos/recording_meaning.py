@@ -97,8 +97,9 @@ def understand(
         if (signature := _signature(other)) in alike:
             continue
         alike.add(signature)
-        theirs, _ = _by_name(other, options, hinted)
-        contents = [(*m.selections, *m.kept, *m.cameras) for m in (meaning, theirs)]
+        theirs, found = _by_name(other, options, hinted)
+        pairs = (meaning, search), (theirs, found)
+        contents = [sorted([*m.selections, *m.kept, *m.cameras, *s.actions]) for m, s in pairs]
         for what, one, two in (
             ("joints", meaning.joint_names, theirs.joint_names),
             ("arrays", *contents),
@@ -320,10 +321,8 @@ def _decide_units(
             fields = ", ".join(dict.fromkeys(n for n, _ in selections[role].columns))
             raise first.error(f"the unit is doubtful: {doubt}", fields)
         if decision.converts:
-            text = (
-                f"{role}: no unit is declared, {decision.evidence}: taken for {decision.unit}"
-            )
-            warned.append(f"{text} and converted; overrule with --units {role} ...")
+            text = f"taken for {decision.unit} and converted; overrule with --units {role} ..."
+            warned.append(f"{role}: no unit is declared, {decision.evidence}: {text}")
         elif given.get(role) == "rad" and largest > 4 * np.pi:
             warned.append(f"{role}: rad are given, but values reach {largest:.4g}: degrees?")
     if "joint_position" in selections and "gripper" not in selections:
