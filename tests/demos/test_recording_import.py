@@ -1,5 +1,6 @@
 """Images, next states and the preview of an import."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,3 +103,113 @@ def test_a_value_that_is_not_finite_is_named_with_its_frame():
     plan = plan_of({"fps": 10}, qpos=q)
     with pytest.raises(DatasetError, match="is nan at frame 7: cut or mend"):
         next(plan.episodes())
+
+
+def again(plan):
+    """Options of a plan's mapping file."""
+    content = json.loads(plan.template())
+    return ImportOptions(**content | {"joint_names": tuple(content["joint_names"])})
+
+
+@pytest.mark.parametrize(
+    ("options", "tokens"),
+    [
+        ({"joint_position": "w", "action": "a"}, {"joint_position": ["w"], "action": ["a"]}),
+        ({"joint_position": ["w[2]", "w[0:2]"]}, {"joint_position": ["w[2:3]", "w[0:2]"]}),
+        ({"joint_position": ["w[1:3]", "v"]}, {"joint_position": ["w[1:3]", "v"]}),
+        (
+            {"position": "w[0:3]", "observation.other": ["w[3]", "a[0:2]"]},
+            {"position": ["w[0:3]"], "observation.other": ["w[3:4]", "a[0:2]"]},
+        ),
+        ({"joint_position": ["w[2]", "w[1]"]}, {"joint_position": ["w[2:3]", "w[1:2]"]}),
+    ],
+)
+def test_a_mapping_file_says_the_same_again(options, tokens):
+    wide = np.hstack([Q, Q[:, :1] / 2])
+    arrays = {"w": wide, "v": Q[:, :1], "a": Q, "time": np.arange(200) / 20}
+    plan = plan_of({"columns": options}, **arrays)
+    content = json.loads(plan.template())
+    assert content["columns"] == tokens
+    assert content["time"] == "time"
+    given = again(plan)
+    twin = replace(plan, meaning=understand(plan.recordings[:1], given), options=given)
+    assert json.loads(twin.template()) == content
+    for one, other in zip(plan.episodes(), twin.episodes(), strict=True):
+        for name in one.demonstration.recorded:
+            ours, theirs = (getattr(e.demonstration, name) for e in (one, other))
+            np.testing.assert_array_equal(ours, theirs)
+
+
+def episode_of(options=None, *, task="", **arrays):
+    plan = plan_of(options, **arrays)
+    plan = replace(plan, recordings=(replace(plan.recordings[0], task=task),))
+    (one,) = plan.episodes()
+    return one.demonstration
+
+
+@pytest.mark.parametrize(
+    ("step", "given", "fps"),
+    [(1 / 30, None, 30), (0.0334, None, 30), (0.45, None, 2), (2.0, None, 1), (0.05, 50, 50)],
+)
+def test_an_episode_has_a_whole_frame_rate_and_its_true_stamps(step, given, fps):
+    time = 1e9 + 5 + np.arange(200) * step
+    demo = episode_of({"fps": given, "units": {"time": "s"}}, qpos=Q, time=time)
+    assert demo.fps == fps
+    assert demo.start_time == time[0]
+    np.testing.assert_allclose(demo.time, np.arange(200) * step, atol=1e-6)
+
+
+def test_the_task_is_the_callers_then_the_files_then_its_name():
+    given = {"fps": 10}
+    assert episode_of(given | {"task": "pour"}, task="stir", qpos=Q).task == "pour"
+    assert episode_of(given, task="stir", qpos=Q).task == "stir"
+    assert episode_of(given, qpos=Q).task == "run"
+
+
+def test_quantities_are_in_si_units_and_what_is_kept_is_as_recorded():
+    opening = 40 + 30 * Q[:, 0]
+    units = {"joint_position": "deg", "gripper": "mm"}
+    grip = np.hstack([20 * Q, opening[:, None]])
+    demo = episode_of(
+        {"fps": 10, "units": units}, qpos=20 * Q, gripper=opening, action=grip, other=Q
+    )
+    np.testing.assert_allclose(demo.joint_position, np.deg2rad(20 * Q))
+    np.testing.assert_allclose(demo.command_position, np.deg2rad(20 * Q))
+    np.testing.assert_allclose(demo.gripper, 1e-3 * opening)
+    # The gripper's command has the unit of the gripper.
+    np.testing.assert_allclose(demo.extra["action"][:, 0], 1e-3 * opening)
+    kept = {"joint_position": "q", "observation.more": "other", "action": "u"}
+    demo = episode_of({"fps": 10, "columns": kept}, q=Q, other=7 * Q, u=5 * Q)
+    np.testing.assert_array_equal(demo.extra["observation.more"], 7 * Q)
+    np.testing.assert_array_equal(demo.extra["action"], 5 * Q)
+
+
+def test_a_preview_has_a_row_for_each_field_and_a_line_for_each_reason():
+    images = np.zeros((200, 16, 24, 3), np.uint8)
+    coded = np.array([b"\xff\xd8\xff"] * 200, object)
+    plan = plan_of(
+        {"units": {"joint_position": "deg"}},
+        qpos=20 * Q,
+        state=Q,
+        reward=Q[:, 0],
+        done=Q[:, 0],
+        odd=Q,
+        cam=images,
+        top=coded,
+        time=np.arange(200) / 20,
+        action=Q[:, :2],
+    )
+    lines = [*plan.lines()]
+    rows = {line.split("  ")[0]: line.split() for line in lines}
+    assert lines[0].split() == ["fields", "understood", "as", "unit", "sure", "evidence"]
+    assert rows["qpos"] == ["qpos", "joint_position", "of", "3", "deg", "100", "%", "given"]
+    assert rows["cam"] == ["cam", "camera", "cam", "16x24x3"]
+    assert rows["top"] == ["top", "camera", "top", "image", "files"]
+    assert rows["time"] == ["time", "time", "s", "by", "its", "name"]
+    assert rows["action"][:5] == ["action", "action,", "as", "recorded", "?"]
+    left = [line for line in lines if line.startswith("left out: ")]
+    assert "left out: reward, done (counts, or is of a learner or the next frame)" in left
+    assert len(left) == len({*plan.meaning.left_out.values()}) == 3
+    assert not any("no commands" in line for line in lines)
+    assert plan.has_actions
+    assert plan.counts()["understood"] == 3
