@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot_folders import joint_path, read_info, write_folder, write_info
 
-from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.quality.video_checks import read_stream
+from hrc_learn.demos.issues import DatasetError, ValidationReport
+from hrc_learn.demos.quality import video_checks
+from hrc_learn.demos.quality.video_checks import check_videos, read_stream
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.videos import (
     CameraRecorder,
@@ -347,3 +348,118 @@ def test_a_file_that_breaks_off_is_told(file, tmp_path):
     path.write_text("no video")
     with pytest.raises(DatasetError, match="is no video that can be read"):
         read_stream(path)
+
+
+def filmed(root, version="v2.1", lengths=(30, 20), size=SIZE, shown=None):
+    """A dataset whose videos brighten by one level a frame, each from its own level on."""
+    dataset(root, version, lengths)
+    info = read_info(root)
+    info["features"]["cam"]["shape"] = [*size, 3]
+    write_info(root, info)
+    for number, length in enumerate(lengths):
+        path = root / f"videos/chunk-{number:03d}/cam/episode_{number:06d}.mp4"
+        path.parent.mkdir(parents=True)
+        levels = range(40 * number, 40 * number + length) if shown is None else shown(length)
+        write(path, levels, rate=50)
+    return root
+
+
+def findings(root):
+    report = ValidationReport(path=root)
+    check_videos(open_folder(root), report)
+    return [
+        (one.level, one.episode, one.file, one.message)
+        for one in (*report.errors, *report.warnings)
+    ]
+
+
+def second(root):
+    return root / "videos/chunk-001/cam/episode_000001.mp4"
+
+
+def test_sound_videos_have_no_findings(tmp_path):
+    assert findings(filmed(tmp_path)) == []
+
+
+def test_videos_that_are_missing(tmp_path):
+    root = filmed(tmp_path)
+    second(root).unlink()
+    (found,) = findings(root)
+    assert found[:2] == ("error", 1)
+    assert found[2] == "videos/chunk-001/cam/episode_000001.mp4"
+    assert "not found" in found[3]
+    (root / "videos/chunk-000/cam/episode_000000.mp4").unlink()
+    (found,) = findings(root)
+    assert found[:3] == ("warning", None, "videos/**/cam")
+    assert "no file of it is here" in found[3]
+
+
+def test_an_episode_without_a_place_in_a_video(tmp_path):
+    root = dataset(tmp_path, "v3.0", (30, 20))
+    list_videos(
+        root,
+        chunk_index=[0, None],
+        file_index=[0, None],
+        from_timestamp=[0.0, None],
+        to_timestamp=[0.6, None],
+    )
+    (root / "videos/cam/chunk-000").mkdir(parents=True)
+    info = read_info(root)
+    info["features"]["cam"]["shape"] = [*SIZE, 3]
+    write_info(root, info)
+    write(root / "videos/cam/chunk-000/file-000.mp4", range(30), rate=50)
+    (found,) = findings(root)
+    assert found == ("error", 1, None, "the list of episodes names no video")
+
+
+def test_a_copy_of_a_video_is_named_with_its_original(tmp_path):
+    root = filmed(tmp_path, lengths=(20, 20, 20))
+    first = root / "videos/chunk-000/cam/episode_000000.mp4"
+    second(root).write_bytes(first.read_bytes())
+    third = root / "videos/chunk-002/cam/episode_000002.mp4"
+    third.write_bytes(first.read_bytes())
+    assert [(level, episode, text) for level, episode, _, text in findings(root)] == [
+        ("warning", k, "is the same video as that of episode 0") for k in (1, 2)
+    ]
+
+
+def test_a_video_of_the_wrong_length_size_or_content(tmp_path):
+    root = filmed(tmp_path)
+    write(second(root), range(60, 82), rate=50)
+    assert [found[3][:50] for found in findings(root)] == [
+        "shows 22 images, but the episode has 20 frames: it"
+    ]
+    write(second(root), range(60, 80), rate=20)
+    assert findings(root)[0][3] == "runs at 20 images a second, the dataset at 50"
+    second(root).write_text("no video")
+    ((level, episode, _, text),) = findings(root)
+    assert (level, episode) == ("error", 1)
+    assert "is no video that can be read" in text
+    info = read_info(root)
+    info["features"]["cam"]["shape"] = [SIZE[0], SIZE[1] + 2, 3]
+    write_info(root, info)
+    assert findings(root)[0][3] == "has images of 32 x 48, declared are [32, 50, 3]"
+
+
+def test_images_that_never_change_are_named(tmp_path):
+    root = filmed(tmp_path, lengths=(20, 2, 3), shown=lambda length: [90] * length)
+    still = [(episode, text) for _, episode, _, text in findings(root) if "shows" in text]
+    text = "shows all of one colour at the beginning, in the middle and at the end"
+    # Two images may be alike.
+    assert still == [(0, text), (2, text)]
+    # One image at a third of the episode differs.
+    path = root / "videos/chunk-000/cam/episode_000000.mp4"
+    write(path, [90] * 6 + [30] + [90] * 13, rate=50)
+    assert [one[1] for one in findings(root) if "shows" in one[3]] == [2]
+    write(path, [90] * 13 + [30] + [90] * 6, rate=50)
+    assert [one[1] for one in findings(root) if "shows" in one[3]] == [2]
+
+
+def test_of_many_files_only_so_many_are_examined(tmp_path, monkeypatch):
+    root = filmed(tmp_path, lengths=(20, 20, 20))
+    for number in (1, 2):
+        (root / f"videos/chunk-{number:03d}/cam/episode_{number:06d}.mp4").write_text("x")
+    monkeypatch.setattr(video_checks, "_MOST_FILES", 2)
+    found = [(level, text[:35]) for level, _, _, text in findings(root)]
+    assert found[1:] == [("warning", "1 further videos were not examined")]
+    assert found[0][0] == "error"
