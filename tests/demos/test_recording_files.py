@@ -167,6 +167,7 @@ def test_declared_units_are_spelled_as_elsewhere(declared, unit):
         ("t", ""),
         ("time", ""),
         ("Time [ms]", "ms"),
+        ("Time (seconds)", "s"),
         ("time(us)", "us"),
         ("%time", ""),
         ("robot/timestamp_ns", "ns"),
@@ -192,7 +193,7 @@ def test_stamps_are_known_by_name_with_their_unit(name, unit):
     [
         *("execution_time", "cycle_time", "delay_t", "latency_ms", "compute_time"),
         *("process_time", "duration", "time_delta", "response_time"),
-        *("times/x", "timer", "best", "tt"),
+        *("times/x", "timer", "best", "tt", "temperature"),
     ],
 )
 def test_durations_and_other_names_are_no_stamps(name):
@@ -355,7 +356,7 @@ def test_ends_split_the_arrays_that_reach_the_last_one(name):
     assert [part.fields["q"].frames for part in split({"q": Q, name: [1, 12]})] == [1, 11]
 
 
-@pytest.mark.parametrize("ends", [[0, 5], [5, 5], [5, 4], [5, 13]])
+@pytest.mark.parametrize("ends", [[0, 5], [5, 5], [5, 4], [5, 13], []])
 def test_ends_that_do_not_increase_up_to_the_frames_are_refused(ends):
     with pytest.raises(DatasetError, match=r"must increase up to the 12 frames") as caught:
         split({"q": Q, "episode_ends": ends})
@@ -380,6 +381,7 @@ def test_any_flag_ends_an_episode_after_its_frame():
     terminals[11] = 1
     assert len(split({"q": Q, "terminals": terminals})) == 2
     assert len(split({"q": Q, "terminals": np.zeros(12)})) == 1
+    assert len(split({"q": Q, "terminals": np.eye(12)})) == 1
     # Flags of other lengths contradict each other.
     assert len(split({"q": Q, "terminals": terminals, "dones": timeouts[:9]})) == 1
 

@@ -87,6 +87,10 @@ MATRIX = [[-1, 0, 0, 1], [0, -1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
             [("arm/command/joint_positions", ("a", "b"), [1, 2])],
         ),
         (Message(joint_names=["a"], points=[POINT]), []),
+        (
+            Message(joint_names=["a"], points=[Message(positions=[4.0])]),
+            [("arm/command/joint_positions", ("a",), [4])],
+        ),
         (Message(joint_names=[], points=[]), []),
         (Message(data=b"", encoding="rgb8", width=4), [("arm", None, [])]),
         (Message(data=b"", format="jpeg"), [("arm", None, [])]),
