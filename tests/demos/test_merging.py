@@ -213,3 +213,76 @@ def test_what_this_package_records_can_be_merged(tmp_path):
     report = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
     assert (report.episodes, report.notes) == (2, [])
     assert not check_dataset(tmp_path / "new").errors
+
+
+def test_a_report_counts_episodes_frames_and_tasks(tmp_path):
+    write(tmp_path / "a", [joint_path(60)], tasks=["pour"])
+    write(tmp_path / "b", [joint_path(31)] * 2, fps=FPS / 2, tasks=["stir", "pour"])
+    write(tmp_path / "c", [joint_path(20)], tasks=["cut"])
+    sets = [tmp_path / name for name in "abc"]
+    with pytest.raises(DatasetError, match=r"runs at 25 fps, but .*a at 50: --fps 50 --no-v"):
+        merge_datasets(sets, tmp_path / "new")
+    report = merge_datasets(sets, tmp_path / "new", fps=50)
+    assert str(report).splitlines() == [
+        f"{tmp_path / 'b'}: resampled from 25 to 50 fps",
+        f"{tmp_path / 'new'}: 4 episodes, 202 frames, 3 tasks",
+    ]
+    demos = load_demos(tmp_path / "new")
+    assert [demo.task for demo in demos] == ["pour", "stir", "pour", "cut"]
+    other = merge_datasets(sets, tmp_path / "slow", fps=25)
+    assert (other.frames, read_info(tmp_path / "slow")["fps"]) == (30 + 31 + 31 + 10, 25)
+    assert [note.split(": ")[1] for note in other.notes] == ["resampled from 50 to 25 fps"] * 2
+
+
+def test_features_that_some_lack_are_named_with_those_datasets(tmp_path):
+    q = joint_path(60)
+    for name in "abc":
+        more = {"observation.x": q, "observation.y": q} if name == "b" else {"observation.y": q}
+        more = {} if name == "c" else more
+        write_folder(
+            tmp_path / name, [{STATE: q, ACTION: q, **more}], {STATE: NAMES, ACTION: NAMES}
+        )
+    notes = merge_datasets([tmp_path / name for name in "abc"], tmp_path / "new").notes
+    a, c = tmp_path / "a", tmp_path / "c"
+    assert f"observation.x: left out, {a}, {c} has none" in notes
+    assert f"observation.y: left out, {c} has none" in notes
+
+
+def test_types_and_shapes_are_those_of_the_first(tmp_path):
+    """Columns of one width are alike, whatever their nesting; a width of its own is refused."""
+    q = joint_path(60)
+    write(tmp_path / "a", [q])
+    write(tmp_path / "b", [q], dtype="float64")
+    info = read_info(tmp_path / "b")
+    info["features"][STATE]["shape"] = [1, 3]
+    write_info(tmp_path / "b", info)
+    merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
+    assert read_info(tmp_path / "new")["features"][STATE]["dtype"] == "float32"
+    assert read_info(tmp_path / "new")["features"][STATE]["shape"] == [3]
+    merge_datasets([tmp_path / "b", tmp_path / "a"], tmp_path / "double")
+    assert read_info(tmp_path / "double")["features"][STATE]["dtype"] == "float64"
+    np.testing.assert_allclose(states(tmp_path / "double")[0], q, rtol=1e-12)
+    write(tmp_path / "c", [q[:, :2]], NAMES[:2])
+    fault = rf"{STATE}: is float32 of shape \[2\], but float32 of shape \[3\] in .*/a$"
+    with pytest.raises(DatasetError, match=fault):
+        merge_datasets([tmp_path / "a", tmp_path / "c"], tmp_path / "other")
+
+
+def test_a_single_column_needs_no_name_and_equal_sets_no_note(tmp_path):
+    q = joint_path(60)
+    for name, given in (("a", NAMES), ("b", NAMES)):
+        episode = {STATE: q, ACTION: q, "observation.force": q[:, :1]}
+        write_folder(tmp_path / name, [episode], {STATE: given, ACTION: given})
+    assert merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new").notes == []
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_details_of_videos_are_kept_where_all_datasets_agree(tmp_path, same):
+    a = with_video(tmp_path / "a", NAMES, [0, 1, 2])
+    b = with_video(tmp_path / "b", NAMES, [0, 1, 2], frames=40)
+    for root, codec in ((a, "h264"), (b, "h264" if same else "av1")):
+        info = read_info(root)
+        info["features"][CAMERA]["info"] = {"video.codec": codec}
+        write_info(root, info)
+    merge_datasets([a, b], tmp_path / "new")
+    assert ("info" in read_info(tmp_path / "new")["features"][CAMERA]) == same
