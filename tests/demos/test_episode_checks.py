@@ -381,3 +381,77 @@ def test_a_sketch_of_a_motion_knows_its_phases_only(frames):
     sketch = checks.motion_sketch(motion)
     np.testing.assert_allclose(sketch, np.linspace([0.0, 3.0], [1.0, -1.0], 20).ravel())
     assert len(checks.motion_sketch(motion, phases=5)) == 10
+
+
+# Values exactly at a limit are not reported.
+
+
+def test_three_frames_may_repeat_and_two_may_not(folder):
+    frames = {"observation.state": np.ones((3, 2))}
+    (issue,) = checks.repetitions(folder, replace(ENTRY, length=3), frames)
+    assert issue.message.startswith("the state never changes")
+
+
+def test_stamps_at_their_limits_are_sound():
+    half = np.arange(60) / FPS + 0.5 / FPS
+    assert places(checks.stamps(ENTRY, "timestamp", half, FPS)) == []
+    # A step of 1.6 usual ones.
+    time = np.array([0.0, 1, 2, 3.6, 4.6, 5.6, 6.6, 7.6])
+    assert np.diff(time).max() == 1.6
+    assert not any("gaps" in text for *_, text in places(checks.stamps(ENTRY, "t", time, 1.0)))
+    time[3:] += 1e-6
+    assert any("1 gaps" in text for *_, text in places(checks.stamps(ENTRY, "t", time, 1.0)))
+
+
+def test_motion_and_rest_at_their_limits():
+    q = np.linspace(0, 1e-4, 20)[:, None]
+    assert np.ptp(q) == 1e-4
+    assert places(checks.motion_present(ENTRY, demo(q))) == []
+
+    def ends(before, after):
+        ramp = np.concatenate([np.zeros(before), np.linspace(0, 1, 51), np.ones(after)])
+        return [
+            text[:4] for *_, text in places(checks.rest_at_ends(ENTRY, demo(ramp[:, None])))
+        ]
+
+    # One second, at the beginning and at the end.
+    assert ends(49, 10) == []
+    assert ends(50, 10) == ["begi"]
+    assert ends(51, 49) == ["begi"]
+    assert ends(51, 50) == ["begi", "ends"]
+    # Half a percent of the range is noise.
+    ramp = np.concatenate([np.zeros(60), np.linspace(0, 200, 51), np.full(60, 200.0)])
+    ramp[20], ramp[-20] = 1, 199
+    assert len(places(checks.rest_at_ends(ENTRY, demo(ramp[:, None])))) == 2
+    ramp[20], ramp[-20] = 1.01, 198.99
+    assert len(places(checks.rest_at_ends(ENTRY, demo(ramp[:, None])))) == 0
+
+
+@pytest.mark.parametrize(
+    ("step", "span"), [(0.01, 1.0), (0.01, 2.0), (0.02, 1.0), (0.125, 1.0)]
+)
+def test_spikes_and_jumps_at_their_limits(step, span):
+    usual = {"joint_position": (np.array([step]), np.array([span]))}
+    spike = max(4 * step, 0.03 * span) + 0.03
+    jump = max(8 * step, 0.1 * span) + 0.1
+    for size, at, what in ((spike, slice(20, 21), "leaps"), (jump, slice(20, None), "jumps")):
+        for factor, told in ((1.0, False), (1 + 1e-9, True)):
+            q = np.zeros((60, 1))
+            q[at] = factor * size
+            found = places(checks.spikes_and_jumps(ENTRY, demo(q), usual))
+            assert [f"j0 {what}" in text for *_, text in found] == [True] * told
+
+
+def test_a_joint_that_usually_rests_or_switches_has_no_spikes():
+    q = np.zeros((60, 1))
+    q[20] = 5.0
+    for step, told in ((0.0, False), (0.125, True), (0.25, False), (0.2499, True)):
+        usual = {"joint_position": (np.array([step]), np.array([1.25]))}
+        assert bool(places(checks.spikes_and_jumps(ENTRY, demo(q), usual))) == told
+
+
+def test_a_joint_may_turn_at_12_rad_a_second():
+    for step, told in ((12.0, False), (-12.0, False), (12.1, True)):
+        q = np.cumsum([0, 1, step, 1.0])[:, None]
+        one = demo(q, time=np.arange(4.0))
+        assert bool(places(checks.joint_speeds(ENTRY, one))) == told
