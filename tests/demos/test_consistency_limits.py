@@ -13,7 +13,9 @@ from hrc_learn.demos.read.profiles import (
     EpisodeProfile,
     FeatureProfiles,
     Tracking,
+    are_positions,
     commanded_rates,
+    is_discrete,
 )
 from hrc_learn.demos.read.units import UnitDecision
 
@@ -145,7 +147,7 @@ def test_only_the_ends_over_all_episodes_count():
 
 @pytest.mark.parametrize(
     ("largest", "told"),
-    [(999, False), (1001, True), (-1001, True), (2e12, True)],
+    [(999, False), (1000, False), (-1000, False), (1001, True), (-1001, True), (2e12, True)],
 )
 def test_sizes_that_no_robot_reports(largest, told):
     odd = profile(low=[0, min(largest, 0), 0], high=[1, max(largest, 1), 1])
@@ -172,7 +174,7 @@ def test_components_that_hardly_move_have_a_least_size():
     for high, told in ((0.9, 0), (1.1, 1)):
         given = alike(profile(high=[1e-6, high, 1e-6], **small), high=1e-6, **small)
         assert len(said(checks.sizes(feature(given)))) == told
-    for high, told in ((1e11, 0), (2e12, 1)):
+    for high, told in ((1e11, 0), (1e12, 0), (2e12, 1)):
         given = alike(profile(high=[1, high, 1]))
         assert len(said(checks.sizes(feature(given, smooth=False)))) == told
 
@@ -205,7 +207,12 @@ def test_holds_of_an_encoder(held, usual, length, fps, told):
 
 @pytest.mark.parametrize(
     ("noise", "usual", "told"),
-    [(0.0101, 1e-3, True), (0.0099, 1e-3, False), (0.0051, 1e-5, True), (0.0049, 1e-5, False)],
+    [
+        (0.0101, 1e-3, True),
+        (0.01, 1e-3, False),
+        (0.0051, 1e-5, True),
+        (0.005, 1e-5, False),
+    ],
 )
 def test_noise_of_ten_times_the_usual_and_half_a_percent(noise, usual, told):
     given = alike(profile(noise=[noise, noise, usual]), noise=usual)
@@ -508,6 +515,10 @@ LOST = "the state does not follow its command, as it does in the other episodes:
         ([1, -1, 1], 0.95, [(OPPOSITE + "b", "error")]),
         ([1, -0.51, 1], 0.95, [(OPPOSITE + "b", "error"), ("goes -0.51 times", "warning")]),
         ([1, -1.49, 1], 0.95, [(OPPOSITE + "b", "error")]),
+        ([1, -0.5, 1], 0.95, [("goes -0.5 times", "warning")]),
+        ([1, -1.5, 1], 0.95, []),
+        ([1, -1, 1], [0.95, 0.8, 0.95], []),
+        (1.0, [0.95, 0.4, 0.95], [(LOST + "b", "warning")]),
         ([1, -1, 1], [0.95, 0.79, 0.95], []),
         (1.0, [0.95, 0.39, 0.95], [(LOST + "b", "warning")]),
         (1.0, [0.95, 0.41, 0.95], []),
@@ -539,6 +550,7 @@ def test_two_episodes_are_too_few_to_compare_and_rest_follows_nothing():
     assert tracked(tracking(slope=3), count=1) == []
     assert len(tracked(tracking(slope=3), count=2)) == 1
     assert tracked(tracking(slope=3), usual=tracking(fit=0.79)) == []
+    assert tracked(tracking(slope=3), usual=tracking(fit=0.8)) == []
     assert tracked(tracking(slope=3), usual=tracking(fit=np.nan)) == []
 
 
@@ -560,7 +572,7 @@ def offsets(*rows, span=1.0, names=NAMES, unit="%"):
 NONE = (np.nan,) * 3
 
 
-@pytest.mark.parametrize(("offset", "told"), [(0.101, True), (-0.101, True), (0.099, False)])
+@pytest.mark.parametrize(("offset", "told"), [(0.101, True), (-0.101, True), (0.1, False)])
 def test_a_distance_of_a_tenth_of_the_range_at_rest(offset, told):
     rows = [(0, offset, np.nan)] * 3 + [NONE]
     found = offsets(*rows)
@@ -595,6 +607,12 @@ def test_offsets_that_scatter_have_no_common_cause():
     assert len(offsets((0.2, 0, 0), (0.249, 0, 0), (0.151, 0, 0))) == 1
     scattered = offsets((0.2, 0, 0), (0.252, 0, 0), (0.148, 0, 0))
     assert scattered == []
+    # A tenth of 1.25 is exact, and so is half of it.
+    exact = [(0.5, 0, 0), (0.5625, 0, 0), (0.4375, 0, 0)]
+    assert offsets(*exact, span=1.25) == []
+    same = [(0.5, 0, 0)] * 3
+    assert [e for e, _ in offsets(*same, (0.625, 0, 0), span=1.25)] == [None]
+    assert [e for e, _ in offsets(*same, (0.626, 0, 0), span=1.25)] == [None, 3]
     # Two episodes do not tell which of them is odd.
     assert [e for e, _ in offsets((0.0, 0, 0), (0.9, 0, 0), NONE)] == []
     assert [e for e, _ in offsets((0.0, 0, 0), (0.0, 0, 0), (0.9, 0, 0))] == [2]
@@ -608,19 +626,22 @@ def rates_of_commands(rates, positions, fps=50):
     ("rates", "positions", "told"),
     [
         ({}, {"fit": 0.39}, True),
-        ({}, {"fit": 0.41}, False),
-        ({"fit": 0.79}, {"fit": 0.1}, False),
+        ({}, {"fit": 0.4}, False),
+        ({"fit": 0.8}, {"fit": 0.1}, False),
+        ({"slope": 0.0}, {"fit": 0.1}, False),
         ({"slope": 0.01}, {"fit": 0.1}, True),
         ({"slope": -0.01}, {"fit": 0.1}, False),
         # Joints that merely move together have factors of their own.
         ({"slope": [1.0, 1.29, 1.31]}, {"fit": 0.1}, True),
         ({"slope": [1.0, 2.0, 3.0]}, {"fit": 0.1}, False),
+        ({"slope": [7.0, 10.0, 13.0]}, {"fit": 0.1}, False),
+        ({"slope": [7.1, 10.0, 13.0]}, {"fit": 0.1}, True),
         # Both fit; the velocity comes at once, the position with a delay of more than 0.2 s.
         ({"delay": 10}, {"delay": 11, "fit": 0.9}, True),
         ({"delay": 10}, {"delay": -11, "fit": 0.9}, True),
         ({"delay": 10}, {"delay": 10, "fit": 0.9}, False),
         ({"delay": 11}, {"delay": 12, "fit": 0.9}, False),
-        ({"delay": 10}, {"delay": 11, "fit": 0.96}, False),
+        ({"delay": 10}, {"delay": 11, "fit": 0.95}, False),
         # More than half of the joints.
         ({"fit": [0.9, 0.9, 0.1]}, {"fit": 0.1}, True),
         ({"fit": [0.9, 0.1, 0.1]}, {"fit": 0.1}, False),
@@ -636,6 +657,48 @@ def test_commands_that_are_rates(rates, positions, told):
         assert followed.sum() >= 2
         np.testing.assert_array_equal(slope[followed], given[followed])
         assert 0.8 < fit <= 1
+
+
+@pytest.mark.parametrize(
+    ("given", "fps", "positions"),
+    [
+        ({}, 50, True),
+        ({"slope": 1.99}, 50, True),
+        ({"slope": 2.0}, 50, False),
+        ({"slope": 0.51}, 50, True),
+        ({"slope": 0.5}, 50, False),
+        ({"slope": -1.0}, 50, False),
+        ({"fit": 0.41}, 50, True),
+        ({"fit": 0.4}, 50, False),
+        # A lead of 0.2 s and a delay of 0.75 s.
+        ({"delay": -10}, 50, True),
+        ({"delay": -11}, 50, False),
+        ({"delay": 30}, 40, True),
+        ({"delay": 31}, 40, False),
+        # Half of the joints that move.
+        ({"slope": [1.0, 3.0, 1.0], "fit": [0.9, 0.9, np.nan]}, 50, True),
+        ({"slope": [1.0, 3.0, 3.0]}, 50, False),
+    ],
+)
+def test_joints_that_follow_positions_in_their_unit(given, fps, positions):
+    one = {"command_position": tracking(**given)}
+    assert are_positions([one], fps) == positions
+    # Half of the episodes; those where nothing moves do not count.
+    sound = {"command_position": tracking()}
+    assert are_positions([one, sound, {}], fps)
+    assert are_positions([one, one, sound], fps) == positions
+
+
+def test_joints_that_never_move_follow_any_command():
+    assert are_positions([], 50)
+    assert are_positions([{}, {}], 50)
+
+
+def test_half_of_the_episodes_tell_of_rates():
+    rates = {"rates": tracking(0), "command_position": tracking(fit=0.1)}
+    other = {"command_position": tracking(fit=0.1)}
+    assert commanded_rates([rates, other], 50) is not None
+    assert commanded_rates([rates, other, other], 50) is None
 
 
 def test_positions_that_follow_at_once_are_not_examined():
@@ -674,3 +737,33 @@ def test_other_units_make_no_other_findings(scale):
     for column, told in ((moved(RISING, 0.46), True), (moved(RISING, 0.44), False)):
         odd_one = figures(column, FALLING, ARCH)
         assert found(checks.exchanged_columns, *same, odd_one) == told
+
+
+@pytest.mark.parametrize(
+    ("statistics", "length", "discrete"),
+    [
+        ({"distinct": 4}, 20, True),
+        ({"distinct": 5}, 20, False),
+        ({"distinct": 5}, 100, True),
+        ({"distinct": 12}, 240, True),
+        ({"distinct": 13}, 260, False),
+        ({"distinct": 49, "flat": 0.91, "step": 0.21}, 100, True),
+        ({"distinct": 50, "flat": 0.91, "step": 0.21}, 100, False),
+        ({"distinct": 49, "flat": 0.9, "step": 0.21}, 100, False),
+        ({"distinct": 49, "flat": 0.91, "step": 0.2}, 100, False),
+    ],
+)
+def test_switches_have_few_levels_or_rest_and_jump(statistics, length, discrete):
+    assert is_discrete(profile(**statistics), length).tolist() == [discrete] * 3
+
+
+@pytest.mark.parametrize(("count", "named"), [(2, 2), (4, 4), (6, 4)])
+def test_of_many_exchanged_columns_four_are_named(count, named):
+    usual = np.tile(RISING, (count, 1)).T + 3.0 * np.arange(count)
+    own, scale = np.roll(usual, -1, axis=1), np.full(count, 0.05)
+    off = np.abs(own - usual).mean(0) / scale
+    names = [f"c{k}" for k in range(count)]
+    level, text = checks._permuted(own, usual, scale, off, names)
+    assert level == "error"
+    pairs = [f"c{k} like c{(k + 1) % count}" for k in range(named)]
+    assert text.endswith(f"in this episode alone: {', '.join(pairs)}")
