@@ -1,14 +1,16 @@
 """The arm of a dataset, and its configuration from the dataset's own units."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from lerobot_folders import joint_path, write_folder
 
-from hrc_learn.demos import DatasetError, open_demos
-from hrc_learn.demos.dataset_views import arm_of_dataset
+from hrc_learn.demos import DatasetError, Demonstration, open_demos
+from hrc_learn.demos.dataset_views import arm_of_dataset, demonstration_charts
 from hrc_learn.demos.read.dataset_files import INFO_PATH
+from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.registry import arm_of_robot
 
@@ -91,3 +93,68 @@ def test_a_gripper_in_metres_opens_by_its_width(tmp_path, robot, widest, opened)
     opening = found.opening(source[0])
     np.testing.assert_allclose(opening[[0, -1]], [0, opened], atol=1e-6)
     assert (np.diff(opening) >= 0).all()
+
+
+def unit(role, name, *units):
+    return UnitDecision(role=role, unit=name, units=units)
+
+
+def test_charts_are_in_the_units_of_the_dataset():
+    time = np.arange(5) / 10
+    q, p = np.outer(time, [1.0, 2.0]), np.outer(time, [1.0, 2, 3])
+    seen = np.array([True, False, True, True, False])
+    demo = Demonstration(
+        time=time,
+        joint_names=("a", "b"),
+        joint_position=q,
+        command_position=q + 1,
+        position=p,
+        gripper=0.04 + time,
+        feature=np.outer(time, [10.0, 20]),
+        feature_visible=seen,
+        human_effort=3 * q,
+        fps=10,
+    )
+    units = {
+        "joint_position": unit("joint_position", "deg", "deg", "rad"),
+        "gripper": unit("gripper", "mm"),
+    }
+    charts = {chart.key: chart for chart in demonstration_charts(demo, units)}
+    assert [(chart.key, chart.title, chart.unit) for chart in charts.values()] == [
+        ("joint_0", "a", "deg"),
+        ("joint_1", "b", "rad"),
+        ("gripper", "Gripper", "mm"),
+        ("position", "Tool centre point", "m"),
+        ("feature", "Feature in the image", "px"),
+        ("effort", "Effort of the person", "N m"),
+    ]
+    np.testing.assert_allclose(charts["joint_0"].lines["measured"], np.rad2deg(q[:, 0]))
+    # Its unit is not known: commands stay in radians.
+    np.testing.assert_allclose(charts["joint_0"].lines["commanded"], q[:, 0] + 1)
+    np.testing.assert_allclose(charts["joint_1"].lines["measured"], q[:, 1])
+    np.testing.assert_allclose(charts["gripper"].lines["opening"], 40 + 1000 * time)
+    np.testing.assert_allclose(charts["position"].lines["z"], p[:, 2])
+    assert [*charts["position"].lines] == ["x", "y", "z"]
+    down = charts["feature"].lines["v (down)"]
+    np.testing.assert_array_equal(np.isnan(down), ~seen)
+    np.testing.assert_allclose(down[seen], 20 * time[seen])
+    np.testing.assert_allclose(charts["effort"].lines["b"], 3 * q[:, 1])
+
+
+def test_charts_show_what_was_recorded_only():
+    time = np.arange(5) / 10
+    bare = Demonstration(time=time, gripper=time, fps=10)
+    (one,) = demonstration_charts(bare, {})
+    assert (one.key, one.unit) == ("gripper", "m")
+    (one,) = demonstration_charts(bare, {"gripper": unit("gripper", "1")})
+    assert one.unit == ""
+    (one,) = demonstration_charts(bare, {"gripper": unit("gripper", "%")})
+    assert one.unit == "%"
+    np.testing.assert_allclose(one.lines["opening"], 100 * time)
+    feature = replace(bare, gripper=None, feature=np.outer(time, [1.0, 2]))
+    (one,) = demonstration_charts(feature, {})
+    assert np.isfinite(one.lines["u (right)"]).all()
+    rates = Demonstration(
+        time=time, joint_names=("a",), joint_velocity=time[:, None], fps=10, gripper=time
+    )
+    assert [chart.key for chart in demonstration_charts(rates, {})] == ["gripper"]
