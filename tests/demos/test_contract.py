@@ -17,8 +17,8 @@ from hrc_learn.demos import (
     load_demos,
     repair_dataset,
 )
-from hrc_learn.demos.read.contract import keep_contract
-from hrc_learn.demos.read.metadata import SIDECAR_PATH
+from hrc_learn.demos.read.contract import ComponentContract, Contract, keep_contract
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature
 from hrc_learn.demos.read.source import open_dataset
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
@@ -288,3 +288,122 @@ def test_what_only_names_tell_is_not_called_declared(tmp_path):
     part = named(contract, STATE, "ee.qw")
     assert (part.role, part.evidence) == ("quaternion_wxyz", "by its name")
     assert part.confidence < 1
+
+
+def part(name="a", index=0, key=STATE, role="arm", unit="rad", **more):
+    return ComponentContract(
+        **{"key": key, "index": index, "name": name, "role": role, "unit": unit}
+        | {"low": -1.0, "high": 2.0, **more}
+    )
+
+
+JOINT = "arm"
+
+
+def test_similar_neighbours_are_one_row():
+    contract = Contract(
+        components=(
+            part("a", 0, confidence=0.9, evidence="strong"),
+            part("b", 1, low=-3.0, high=1.0, confidence=0.6, evidence="weak"),
+            part("c", 2, unit="deg", low=4.0, high=5.25),
+            part("d", 0, key="action", sign=-1, delay=0.04),
+            part("e", 1, key="action", role="other", unit="", sign=1),
+        )
+    )
+    assert contract.rows() == [
+        ("column", "role", "unit", "range", "sign", "delay", "sure", "evidence"),
+        (f"{STATE}/a .. b", JOINT, "rad", "-3 .. 2", "", "", "60 %", "weak"),
+        (f"{STATE}/c", JOINT, "deg", "4 .. 5.25", "", "", "100 %", ""),
+        ("action/d", JOINT, "rad", "-1 .. 2", "-", "40 ms", "100 %", ""),
+        ("action/e", "other", "-", "-1 .. 2", "+", "", "100 %", ""),
+    ]
+    lines = [*contract.lines()]
+    assert len(lines) == 5
+    assert " ".join(lines[3].split()) == "action/d arm rad -1 .. 2 - 40 ms 100 %"
+
+
+def test_components_are_listed_once_and_have_known_roles():
+    with pytest.raises(ValueError, match=f"component 1 of {STATE} is listed 2 times"):
+        Contract(components=(part(index=0), part(index=1), part("b", 1)))
+    with pytest.raises(ValueError, match="a has the unknown role 'hat'; known are"):
+        part(role="hat")
+
+
+FEATURES = {
+    STATE: Feature(key=STATE, dtype="float32", shape=(3,), names=("a.pos", "b.pos", "c")),
+    "bare": Feature(key="bare", dtype="float32", shape=(3,), names=None),
+}
+
+
+def test_quantities_are_read_in_the_order_of_the_contract():
+    contract = Contract(
+        components=(
+            part("b.pos", 1, unit="deg"),
+            part("a.pos", 0),
+            part("c", 2, role="other", unit=""),
+            *(part(f"joint_{k}", k, key="bare", role="position", unit="m") for k in (2, 0, 1)),
+        )
+    )
+    found = contract.selections(FEATURES)
+    assert found["joint_position"].columns == ((STATE, 1), (STATE, 0))
+    assert found["joint_position"].labels == ("b", "a")
+    assert not found["joint_position"].numbered
+    assert found["position"].columns == (("bare", 2), ("bare", 0), ("bare", 1))
+    assert found["position"].numbered
+    assert contract.units(found) == {"joint_position": ("deg", "rad"), "position": ("m",) * 3}
+    # A column of unknown unit leaves its quantity out, as one that is not listed does.
+    doubtful = replace(
+        contract, components=(part("b.pos", 1, unit=""), *contract.components[1:])
+    )
+    assert doubtful.units(found) == {"position": ("m",) * 3}
+    assert Contract(components=contract.components[1:]).units(found) == {"position": ("m",) * 3}
+
+
+@pytest.mark.parametrize(
+    ("parts", "text"),
+    [
+        ([part("x", 3)], f"{STATE}/x is no component of the dataset; edit it"),
+        ([part("x", 0, key="none")], "none/x is no component of the dataset"),
+        (
+            [part(str(k), k, key="bare", role="position", unit="m") for k in range(2)],
+            "position has 2 components, it takes 3",
+        ),
+    ],
+)
+def test_components_that_do_not_fit_the_dataset(parts, text):
+    with pytest.raises(DatasetError, match=text):
+        Contract(components=tuple(parts)).selections(FEATURES)
+
+
+def test_a_new_contract_keeps_names_roles_and_units_that_were_edited():
+    old = Contract(
+        components=(
+            part("A", 0, role=JOINT, unit="deg"),
+            part("B", 1, role="other", unit="N"),
+            part("C", 2, role="flag", unit=""),
+        )
+    )
+    new = Contract(
+        components=(
+            part("a", 0, unit="rad"),
+            part("b", 1, role="other", unit=""),
+            part("c", 2, role=JOINT, unit="rad"),
+            part("d", 3, role="other", unit="m"),
+        )
+    )
+    kept = new.keeping(old)
+    assert [(p.name, p.role, p.unit) for p in kept.components] == [
+        ("A", JOINT, "rad"),
+        ("B", "other", "N"),
+        ("C", JOINT, "rad"),
+        ("d", "other", "m"),
+    ]
+
+
+@pytest.mark.parametrize(("confidence", "doubtful"), [(0.74, True), (0.75, False)])
+def test_doubtful_units_are_left_out(confidence, doubtful):
+    sure = part("a", 0)
+    unsure, none = part("b", 1, confidence=confidence), part("c", 2, unit="", confidence=0.1)
+    contract, named = Contract(components=(sure, unsure, none)).without_doubt()
+    assert [p.unit for p in contract.components] == ["rad", "" if doubtful else "rad", ""]
+    assert named == [f"{STATE}/b"] * doubtful

@@ -56,13 +56,17 @@ def test_columns_and_tasks_are_matched_by_name(tmp_path, version):
     }
 
 
-def test_degrees_become_the_unit_of_the_first(tmp_path):
-    first, second = joint_path(60), joint_path(60, seed=1)
-    write(tmp_path / "a", [first], [f"{n}_rad" for n in "abc"])
-    write(tmp_path / "b", [np.rad2deg(second)], [f"{n}_deg" for n in "abc"])
-    report = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
-    assert sum("converted from deg to rad" in note for note in report.notes) == 2
-    np.testing.assert_allclose(states(tmp_path / "new")[1], second, atol=1e-5)
+def test_values_take_the_unit_of_the_first(tmp_path):
+    q = joint_path(60), joint_path(60, seed=1)
+    write(tmp_path / "rad", [q[0]], [f"{n}_rad" for n in "abc"])
+    write(tmp_path / "deg", [np.rad2deg(q[1])], [f"{n}_deg" for n in "abc"])
+    for one, other, values in (("rad", "deg", q), ("deg", "rad", q[::-1])):
+        sets = [tmp_path / one, tmp_path / other]
+        report = merge_datasets(sets, tmp_path / f"from {one}")
+        note = f"converted from {other} to {one}"
+        assert sum(text.endswith(note) for text in report.notes) == 2
+        for made, expected in zip(states(report.path), values, strict=True):
+            np.testing.assert_allclose(made, expected, atol=1e-5)
 
 
 def test_components_and_features_that_one_lacks(tmp_path):
