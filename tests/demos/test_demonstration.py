@@ -110,3 +110,48 @@ def test_lists_and_tensors_become_arrays():
     assert demo.joint_position.dtype == np.float64
     np.testing.assert_array_equal(demo.joint_position, joints.detach().numpy())
     assert demo.duration == pytest.approx(0.1)
+
+
+def test_time_goes_on_by_the_last_step_or_by_one_period():
+    uneven = demonstration(3, time=np.array([0.0, 0.1, 0.4]))
+    padded = DemonstrationSet([uneven, demonstration(5), demonstration(1)]).padded()
+    np.testing.assert_allclose(padded.time[0], [0, 0.1, 0.4, 0.7, 1.0])
+    np.testing.assert_allclose(padded.time[1], np.arange(5) / 10)
+    np.testing.assert_allclose(padded.time[2], np.arange(5) / 10)
+    assert padded.mask[2].tolist() == [True, False, False, False, False]
+    assert (padded.position[2] == padded.position[2, :1]).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "shape"),
+    [
+        ({"orientation": np.ones((5, 4))}, None),
+        ({"position": np.ones((5, 2))}, r"\(5, 2\), expected \(5, 3\)"),
+        ({"feature": np.ones((5, 3))}, r"\(5, 3\), expected \(5, 2\)"),
+        ({"joint_velocity": np.ones((5, 4))}, r"\(5, 4\), expected \(5, 3\) for the joints"),
+        ({"gripper": np.ones(5)}, None),
+        ({"joint_position": None, "human_effort": None, "joint_names": ()}, None),
+    ],
+)
+def test_fields_have_their_widths(changed, shape):
+    if shape is None:
+        assert len(demonstration(**changed)) == 5
+        return
+    with pytest.raises(ValueError, match=f"has shape {shape}"), shapes_unchecked():
+        demonstration(**changed)
+
+
+def test_sets_keep_their_notes_and_unit_whatever_is_done_with_them():
+    demos = DemonstrationSet(
+        [demonstration(n) for n in (2, 3, 4)], notes=["x"], source="set", joint_unit="1"
+    )
+    assert repr(demos) == "DemonstrationSet(3 demonstrations, 9 frames, joints: a, b, c)"
+    assert repr(DemonstrationSet([])).endswith("0 demonstrations, 0 frames, joints: none)")
+    short = demos.filter(lambda demo: len(demo) < 4)
+    slow = demos.map(lambda demo: dataclasses.replace(demo, time=2 * demo.time))
+    for made, lengths in ((short, [2, 3]), (slow, [2, 3, 4]), (demos[::2], [2, 4])):
+        assert [len(demo) for demo in made] == lengths
+        assert (made.notes, made.source, made.joint_unit) == (("x",), "set", "1")
+    assert slow[1].duration == pytest.approx(0.4)
+    same = demonstration()
+    assert same.select_joints(NAMES) is same

@@ -5,11 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from lerobot_folders import write_folder
 
+from hrc_learn.demos.issues import ValidationReport
 from hrc_learn.demos.quality import structure_checks, video_checks
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.profiles import FeatureProfiles, profile_columns
 from hrc_learn.demos.videos import VideoSegment
 
@@ -243,3 +246,144 @@ def test_statistics_fit_within_a_fiftieth_of_the_range(folder, tmp_path, name, s
     found = [*structure_checks.statistics_fit(replace(folder, root=tmp_path), [feature])]
     assert len(found) == told
     assert all("do not fit the data in 1 components" in issue.message for issue in found)
+
+
+def named(folder, names, width=3, dtype="float32"):
+    """A dataset with another feature, whose names are declared so."""
+    flat = tuple(names) if isinstance(names, list) and len(names) == width else None
+    feature = Feature(key="x", dtype=dtype, shape=(width,), names=flat)
+    declared = {"dtype": dtype, "shape": [width], "names": names}
+    features = {**folder.info["features"], "x": declared}
+    return replace(
+        folder,
+        features={**folder.features, "x": feature},
+        info={**folder.info, "features": features},
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "width", "text"),
+    [
+        (["a", "b", "c"], 3, None),
+        (None, 3, None),
+        (["all"], 3, None),
+        (["a", "b"], 3, "2 names for 3 components: they are not used; correct names or shape"),
+        (["a", "b", "c", "d"], 3, "4 names for 3 components"),
+        (["a", "b", "a"], 3, "two components have the same name"),
+        (["a", "b\x1b", "c"], 3, "a name holds unprintable characters"),
+    ],
+)
+def test_names_of_components(folder, names, width, text):
+    found = messages(structure_checks.component_names(named(folder, names, width)))
+    assert [(key, message[: len(text or "")]) for *_, key, message in found] == (
+        [("x", text)] if text else []
+    )
+
+
+def test_names_of_pictures_are_those_of_their_axes(folder):
+    own = named(folder, ["height", "width", "channels"], 4, "video")
+    assert messages(structure_checks.component_names(own)) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (pa.float32(), "float32"),
+        (pa.float64(), "float64"),
+        (pa.int16(), "int16"),
+        (pa.bool_(), "bool"),
+        (pa.list_(pa.float32(), 3), "float32"),
+        (pa.list_(pa.list_(pa.float64())), "float64"),
+        (pa.struct([("bytes", pa.binary())]), "struct<bytes: binary>"),
+    ],
+)
+def test_types_of_numbers_in_columns(kind, name):
+    assert structure_checks._number_type(kind) == name
+
+
+def test_columns_of_a_file_are_those_declared(folder):
+    declared = pa.schema(
+        {STATE: pa.list_(pa.float32(), 2), "timestamp": pa.float32()}
+        | dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), pa.int64())
+    )
+
+    def found(schema):
+        report = ValidationReport(path=folder.root)
+        report.run(structure_checks._column_faults, folder, "f.parquet", schema, report)
+        again = structure_checks._column_faults(folder, "g.parquet", schema, report)
+        issues = [*report.errors, *report.warnings]
+        return [(one.level, one.key, one.message[:30]) for one in issues], len([*again])
+
+    place = declared.get_field_index(STATE)
+    assert found(declared) == ([], 0)
+    assert found(declared.append(declared.field(STATE))) == (
+        [("error", STATE, "the column is there more than ")],
+        1,
+    )
+    assert found(declared.remove(place)) == (
+        [("error", STATE, "the column is declared in meta")],
+        1,
+    )
+    double = declared.set(place, pa.field(STATE, pa.list_(pa.float64())))
+    assert found(double) == ([("warning", STATE, "holds float64, but meta/info.j")], 1)
+    # A missing index column is named once for all files.
+    bare = declared.remove(declared.get_field_index("task_index"))
+    assert found(bare) == ([("warning", "task_index", "the column is missing: LeRobot")], 0)
+
+
+@pytest.mark.parametrize(
+    ("stated", "level", "text"),
+    [
+        ({"min": [0, 0], "max": [1, 1], "mean": [0.5, 0.5]}, "warning", "are incomplete"),
+        ({"min": "x", "max": 1, "mean": 1, "std": 1}, "warning", "are incomplete"),
+        (
+            {"min": [0], "max": [1], "mean": [0.5], "std": [0.3]},
+            "error",
+            "of 1 components for 2",
+        ),
+        (
+            {"min": [0, 0], "max": [1, 1], "mean": [0.5, 0.5], "std": [0.3]},
+            "error",
+            "of 2 components for 2",
+        ),
+        (
+            {"min": [0, 0], "max": [1, 1], "mean": [0.5, 0.5], "std": [0.3, -0.1]},
+            "warning",
+            "do not fit the data in 1 components",
+        ),
+        (
+            {"min": [0, 2], "max": [1, 1], "mean": [0.5, 0.5], "std": [0.3, 0]},
+            "warning",
+            "do not fit the data in 1 components",
+        ),
+        ({"min": [0, 0], "max": [1, 1], "mean": [0.5, 0.5], "std": [0.3, 0]}, None, ""),
+        ({"min": [[0], [0]], "max": [1, 1], "mean": [0.5, 0.5], "std": [0.3, 0]}, None, ""),
+    ],
+)
+def test_statistics_have_a_number_for_each_component(folder, tmp_path, stated, level, text):
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/stats.json").write_text(json.dumps({STATE: stated}))
+    values = np.linspace(0, 1, 30)[:, None].repeat(2, 1)
+    feature = FeatureProfiles(
+        key=STATE,
+        fps=50.0,
+        entries=[entry(0)],
+        profiles=[profile_columns({STATE: values})[STATE]],
+        names=["a", "b"],
+        smooth=np.ones(2, bool),
+    )
+    own = replace(folder, root=tmp_path)
+    found = [*structure_checks.statistics_fit(own, [feature, replace(feature, key="other")])]
+    assert [issue.level for issue in found] == ([level] if level else [])
+    assert all(f"statistics {text}" in issue.message for issue in found)
+
+
+def test_statistics_of_either_version_are_looked_for(folder, tmp_path):
+    own = replace(folder, root=tmp_path)
+    (tmp_path / "meta").mkdir()
+    assert len(messages(structure_checks.statistics_exist(own))) == 1
+    for name in ("stats.json", "episodes_stats.jsonl"):
+        path = tmp_path / "meta" / name
+        path.touch()
+        assert messages(structure_checks.statistics_exist(own)) == []
+        path.unlink()
