@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -10,6 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot_folders import joint_path, read_info, write_folder, write_info
 
+from hrc_learn.demos import Demonstration
+from hrc_learn.demos.images import ImageReader, camera_images, thumbnails
 from hrc_learn.demos.issues import DatasetError, ValidationReport
 from hrc_learn.demos.quality import video_checks
 from hrc_learn.demos.quality.video_checks import check_videos, read_stream
@@ -463,3 +466,74 @@ def test_of_many_files_only_so_many_are_examined(tmp_path, monkeypatch):
     found = [(level, text[:35]) for level, _, _, text in findings(root)]
     assert found[1:] == [("warning", "1 further videos were not examined")]
     assert found[0][0] == "error"
+
+
+# Readers
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ([32, 48, 3], (32, 48)),
+        ([3, 32, 48], (32, 48)),
+        ([1, 5, 7], (5, 7)),
+        ([4, 6, 3], (4, 6)),
+        ([3, 9, 4], (3, 9)),
+        ([32, 48, 2], (32, 48)),
+        ([32, 48], None),
+    ],
+)
+def test_sizes_are_declared_with_channels_first_or_last(tmp_path, shape, size):
+    root = dataset(tmp_path, "v2.1")
+    info = read_info(root)
+    info["features"]["cam"]["shape"] = shape
+    write_info(root, info)
+    reader = ImageReader(root)
+    assert reader.cameras == ("cam",)
+    if size is None:
+        with pytest.raises(DatasetError, match=r"declares images of the shape \[32, 48\]"):
+            reader.size("cam")
+    else:
+        assert reader.size("cam") == size
+
+
+def test_images_of_an_episode_are_read_in_any_order(tmp_path):
+    root = filmed(tmp_path)
+    reader = ImageReader(root)
+    assert reader.segment(1, "cam") == segment(second(root), 0.0, 0.4)
+    assert (reader.available(1), reader.available(9)) == (("cam",), ())
+    images = reader.read(1, frames=[19, 0, 0, 7])["cam"]
+    assert images.shape == (4, 3, *SIZE)
+    np.testing.assert_allclose(images.float().mean((1, 2, 3)), [59, 40, 40, 47], atol=2)
+    assert len(reader.read(1)["cam"]) == 20
+    assert reader.read(1, cameras=[]) == {}
+    assert [frame for frame, _ in reader.stream(1, "cam", [3, 5])] == [3, 5]
+    for frames in ([-1], [3, 20]):
+        with pytest.raises(DatasetError, match=f"has no frames {frames[0]} to"):
+            reader.read(1, frames=frames)
+    write(second(root), range(40, 50), rate=50)
+    with pytest.raises(DatasetError, match="holds no image of frame 10") as caught:
+        reader.read(1)
+    assert (caught.value.issue.episode, caught.value.issue.frame) == (1, 10)
+
+
+def test_thumbnails_are_five_a_second_and_spread_over_the_episode(tmp_path):
+    root = filmed(tmp_path, lengths=(61, 20))
+    reader = ImageReader(root)
+    demos = [
+        Demonstration(time=np.arange(n) / 50, gripper=np.zeros(n), fps=50, episode=k)
+        for k, n in enumerate((61, 20))
+    ]
+    shown = thumbnails(reader, demos[0], "cam")
+    # 1.2 s hold seven of them, from the first frame to the last.
+    np.testing.assert_allclose(shown.time, np.arange(7) / 5, atol=1e-6)
+    levels = [decode_image(file).mean() for file in shown.samples]
+    np.testing.assert_allclose(levels, np.arange(0, 61, 10), atol=3)
+    assert len(thumbnails(reader, demos[0], "cam", 3).time) == 3
+    thin = replace(demos[1], time=10 * demos[1].time)
+    assert len(thumbnails(reader, thin, "cam").time) == 20
+    (found,) = camera_images(reader, demos[1])
+    assert (found[0], found[1].codec) == ("cam", "h264")
+    second(root).write_text("no video")
+    ((_, error),) = camera_images(reader, demos[1])
+    assert isinstance(error, DatasetError)
