@@ -20,10 +20,12 @@ from hrc_learn.demos import (
     open_demos,
     repair_dataset,
 )
-from hrc_learn.demos.read.columns import map_columns
+from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection, map_columns
 from hrc_learn.demos.read.contract import keep_contract
 from hrc_learn.demos.read.metadata import Feature
-from hrc_learn.demos.read.units import unit_factor
+from hrc_learn.demos.read.profiles import Tracking
+from hrc_learn.demos.read.source import _meaning_of_commands
+from hrc_learn.demos.read.units import UnitDecision, unit_factor
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation
@@ -286,3 +288,99 @@ def test_names_of_changes_are_no_joints(name):
         for key, own in ((STATE, names[:3]), (ACTION, (name, "delta_z", "gripper")))
     }
     assert "command_position" not in map_columns(features).selections
+
+
+def followed(slope, *, names=None, unit="rad", fps=50.0, fit=0.95, position=0.1):
+    """Decisions on commands whose sum the joints follow with these slopes [1/s]."""
+    width = len(slope)
+    slope = np.array(slope, float)
+    fits = np.where(np.isnan(slope), np.nan, fit)
+
+    def tracking(fit):
+        flat = np.full(201, 0.5, np.float32)
+        rest = np.full(width, np.nan)
+        return Tracking(delay=0, residual=flat, slope=slope, fit=fit, offset=rest)
+
+    columns = ColumnMapping(
+        selections={
+            role: ColumnSelection(
+                role=role,
+                columns=tuple((key, k) for k in range(width)),
+                labels=tuple(names or (f"joint_{k + 1}" for k in range(width))),
+                numbered=names is None,
+            )
+            for role, key in (("joint_position", STATE), ("command_position", "action"))
+        },
+        joint_names=(),
+        extra=(),
+        notes=(),
+        unmatched={},
+    )
+    known = {"rates": tracking(fits), "command_position": tracking(np.full(width, position))}
+    decisions = {
+        role: UnitDecision(role=role, unit=unit, guessed=True, evidence="small")
+        for role in columns.selections
+    }
+    return _meaning_of_commands(columns, decisions, [known] * 3, fps)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"),
+    [
+        (1.0, "rad/step"),
+        (0.11, "rad/step"),
+        (0.099, "0.099 rad/step"),
+        (1.49, "rad/step"),
+        (1.51, "1.5 rad/step"),
+        (0.02, "0.02 rad/step"),
+    ],
+)
+def test_changes_have_the_scale_of_the_motion_they_make(scale, unit):
+    found = followed([50 * scale] * 6)
+    assert [*found] == ["command_position"]
+    command = found["command_position"]
+    assert (command.unit, command.units, command.guessed) == (unit, (), True)
+    text = f"the joints follow its sum ({scale:.2g} rad per unit, R2 0.95), so that it holds"
+    assert command.evidence.startswith(text)
+    assert command.steps.all()
+
+
+@pytest.mark.parametrize(
+    ("rate", "told"), [(0.66, False), (0.67, True), (1.0, True), (1.49, True), (1.51, False)]
+)
+def test_velocities_among_the_changes_are_told(rate, told):
+    command = followed([rate] * 6)["command_position"]
+    assert ("(velocities in rad/s: map them to command_velocity)" in command.evidence) == told
+
+
+def test_a_gripper_that_does_not_follow_keeps_its_unit():
+    names = ("a", "b", "c", "d", "e", "gripper")
+    found = followed([50.0] * 5 + [np.nan], names=names)["command_position"]
+    assert found.units == ("rad/step",) * 5 + ("rad",)
+    assert found.unit == "rad/step"
+    # Without names of its own it comes last; other joints at rest are no grippers.
+    assert followed([50.0] * 5 + [np.nan])["command_position"].units[-1] == "rad"
+    other = followed([50.0] * 5 + [np.nan], names=("a", "b", "c", "d", "e", "f"))
+    assert other["command_position"].units == ()
+    inner = followed([np.nan, *[50.0] * 5], names=("gripper", *names[:5]))["command_position"]
+    assert inner.units == ("rad", *["rad/step"] * 5)
+    # One that follows moves by changes, too.
+    assert followed([50.0] * 6, names=names)["command_position"].units == ()
+
+
+def test_few_columns_without_names_that_move_by_changes_may_be_a_pose():
+    for count, doubted in ((4, True), (5, False)):
+        found = followed([50.0] * count)
+        assert ("joint_position" in found) == doubted
+    joints = followed([50.0] * 4)["joint_position"]
+    assert joints.confidence == 0.5
+    assert joints.evidence.startswith("small; 4 columns without names that move by changes may")
+    assert "joint_position" not in followed([50.0] * 4, names=tuple("abcd"))
+
+
+def test_commands_that_no_joint_follows_are_doubted_without_names():
+    found = followed([5.0] * 6, fit=0.3)["command_position"]
+    assert (found.confidence, found.leader, found.unit) == (0.3, "", "rad")
+    assert found.evidence == "action names no components, and the joints do not follow it"
+    assert followed([5.0] * 6, fit=0.3, names=tuple("abcdef")) == {}
+    assert followed([1.0] * 6, position=0.9) == {}
