@@ -112,6 +112,7 @@ def gripper_like(count=1, rest=0.6, size=1.0):
     [
         (gripper_like(), 1),
         (gripper_like(2), 2),
+        (gripper_like(2)[:, 1:], 2),
         (gripper_like(2)[:, 2:], 0),
         (gripper_like(rest=0.45), 0),
         (gripper_like(size=1.04), 1),
