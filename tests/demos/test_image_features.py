@@ -1,5 +1,7 @@
 """Features found in videos: where they are, kept beside the dataset, whatever breaks off."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from lerobot_folders import joint_path, write_folder
@@ -14,6 +16,7 @@ from hrc_learn.demos import (
     open_demos,
     repair_dataset,
 )
+from hrc_learn.demos.image_features import FeatureCache, camera_key
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation
@@ -175,3 +178,44 @@ def test_what_cannot_be_looked_at_is_told(tmp_path):
     bare = write_folder(tmp_path / "bare", [{"state": joint_path()}], {})
     with pytest.raises(DatasetError, match="has videos of none"):
         extract_features(bare, "spot", lambda: brightest)
+
+
+@pytest.mark.parametrize(
+    ("count", "named"),
+    [(0, None), (1, "(0)"), (5, "(0, 1, 2, 3, 4)"), (6, "(0, 1, 2, 3, 4, ...)")],
+)
+def test_episodes_without_a_feature_are_named(tmp_path, count, named):
+    notes = FeatureCache(tmp_path / "set", "front.marker").note(range(count))
+    assert len(notes) == (named is not None)
+    assert all(f"was not extracted from {count} episodes {named} and" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("keys", "camera", "found"),
+    [
+        (["observation.images.a"], None, "observation.images.a"),
+        (["observation.images.a", "observation.images.b"], "b", "observation.images.b"),
+        (["observation.images.a", "x"], "x", "x"),
+        (["observation.images.a", "x"], None, "name the camera; the dataset has videos of obs"),
+        (
+            ["observation.images.a"],
+            "b",
+            "there is no camera 'b'; the dataset has videos of obs",
+        ),
+        ([], None, "there is no camera None; the dataset has videos of none"),
+    ],
+)
+def test_the_camera_is_the_named_or_the_only_one(keys, camera, found):
+    if found in keys:
+        assert camera_key(keys, camera) == found
+    else:
+        with pytest.raises(DatasetError, match=found):
+            camera_key(keys, camera)
+
+
+def test_features_of_the_folder_where_one_is_lie_next_to_it(tmp_path, monkeypatch):
+    (tmp_path / "set").mkdir()
+    monkeypatch.chdir(tmp_path / "set")
+    for root in (".", "../set", tmp_path / "set"):
+        path = FeatureCache(Path(root), "front.m").path(3)
+        assert path.parent.resolve() == tmp_path / "set.features/front.m"
