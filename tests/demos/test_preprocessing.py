@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.demos.preprocessing import (
+    _scale,
     align,
     at_times,
     butterworth,
@@ -672,3 +673,12 @@ def test_joints_are_aligned_by_their_own_ranges():
         aligned = align(DemonstrationSet([demo(s, size), demo(late, size)]))
         apart = np.abs(aligned[1].joint_position - aligned[0].joint_position).max()
         assert apart < 0.1 * size
+
+
+def test_motions_are_compared_by_their_ranges_over_all_of_them():
+    time = np.linspace(0, 0.5, 20)
+    turns = [turn(time, rate) for rate in (1.0, 2.4, 0.3)]
+    np.testing.assert_allclose(_scale("orientation", turns), [1.2], rtol=1e-9)
+    np.testing.assert_allclose(_scale("orientation", [-turns[1], turns[0]]), [1.2], rtol=1e-9)
+    q = [np.outer(time, [1.0, -2, 0]), np.add(np.outer(time, [1.0, 1, 0]), [3, 0, 0])]
+    np.testing.assert_allclose(_scale("joint_position", q), [3.5, 1.5, 1e-9])
