@@ -117,7 +117,7 @@ def test_charts_are_in_the_units_of_the_dataset():
     )
     units = {
         "joint_position": unit("joint_position", "deg", "deg", "rad"),
-        "gripper": unit("gripper", "mm"),
+        "gripper": unit("gripper", "mm", "mm"),
     }
     charts = {chart.key: chart for chart in demonstration_charts(demo, units)}
     assert [(chart.key, chart.title, chart.unit) for chart in charts.values()] == [
