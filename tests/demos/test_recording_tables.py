@@ -109,3 +109,15 @@ def test_columns_of_parquet(tmp_path):
     path.write_bytes(b"PAR1")
     with pytest.raises(DatasetError, match="cannot be read as Parquet"):
         read_parquet_table(path)
+
+
+@pytest.mark.parametrize("name", [" Index ", "unnamed: 0", " "])
+def test_blanks_around_the_name_of_an_index_do_not_matter(tmp_path, name):
+    path = tmp_path / "run.parquet"
+    for counts, kept in (([0, 1], ["q"]), ([7, 9], [name, "q"])):
+        pq.write_table(pa.table({name: counts, "q": [3.0, 4.0]}), path)
+        if name.strip() or kept == ["q"]:
+            assert [*read_parquet_table(path)] == kept
+        else:
+            with pytest.raises(DatasetError, match="holds a column without a name"):
+                read_parquet_table(path)
