@@ -6,6 +6,7 @@ import pytest
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import ColumnSelection, map_columns
 from hrc_learn.demos.read.metadata import Feature
+from hrc_learn.demos.read.naming import without_unit
 
 STATE = "observation.state"
 
@@ -336,3 +337,8 @@ def test_texts_images_and_index_columns_have_no_meaning():
     assert found.selections["joint_position"].columns[0] == ("observation.qpos", 0)
     assert found.extra == ()
     assert np.shape(found.selections["joint_position"].columns) == (2, 2)
+
+
+def test_blanks_around_a_name_hide_no_unit():
+    assert without_unit(" q_deg ") == ("q", "deg")
+    assert without_unit("q") == ("q", "")
