@@ -136,6 +136,8 @@ def test_images_are_observed_as_declared():
     assert env.observation_space.contains(state)
     assert state["pixels"]["front"].shape == (48, 64, 3)
     assert state["pixels"]["front"].any()
+    image = env.observation_space["pixels"]["front"]
+    assert (image.low.min(), image.high.max()) == (0, 255)
     assert env.action_space.contains(held(env))
     env.close()
 

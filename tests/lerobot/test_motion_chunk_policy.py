@@ -3,6 +3,7 @@
 import json
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -559,3 +560,16 @@ def test_settings_have_their_least_values(settings, complaint):
             MotionChunkConfig(device="cpu", **settings)
     else:
         MotionChunkConfig(device="cpu", **settings)
+
+
+@pytest.mark.parametrize("path", [None, Path("weights")])
+def test_only_a_policy_without_weights_is_fitted_to_the_dataset(monkeypatch, path):
+    fitted = []
+    monkeypatch.setattr(
+        MotionChunkPolicy, "_fit_dataset", lambda self, meta: fitted.append(meta)
+    )
+    config = chunk_policy(reaching(4)).config
+    config.pretrained_path = path
+    fitted.clear()
+    MotionChunkPolicy(config, dataset_stats=stats_of(reaching(4)))
+    assert fitted == ([None] if path is None else [])

@@ -13,7 +13,7 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, gripper_down, panda
 from hrc_learn.skills import grasping
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspJob, _reachable_probe
-from hrc_learn.skills.placing import BlockedPathError
+from hrc_learn.skills.placing import BlockedPathError, Plan, check_plan
 from hrc_learn.skills.work_cell import MissedGraspError
 
 pytestmark = pytest.mark.simulation
@@ -334,3 +334,17 @@ def test_a_probe_keeps_a_tenth_of_a_radian_from_joint_limits(margin, fits):
             object_region=lambda: (None, torch.tensor([0.1, 0.08, 0.0], dtype=torch.float64)),
         )
         assert _reachable_probe(workplace, 1.0) == (1.0 if fits else 0.25)
+
+
+@pytest.mark.parametrize("beyond", [0.0, 1e-9])
+def test_a_plan_may_end_at_a_joint_limit_but_not_beyond(beyond):
+    world: Any = SimpleNamespace(collisions_along=lambda *given: [])
+    for limit, side in ((panda.limits.lower, -1.0), (panda.limits.upper, 1.0)):
+        path = np.tile(panda.ready.numpy(), (5, 1))
+        path[3, 2] = float(limit[2]) + side * beyond
+        plan = Plan(goal=Pose(HERE[:3], gripper_down()), dt=50.0, path=path, chain=panda)
+        if beyond:
+            with pytest.raises(BlockedPathError, match=r"panda_joint3 after 150\.0 s"):
+                check_plan(plan, world, None)
+        else:
+            check_plan(plan, world, None)
