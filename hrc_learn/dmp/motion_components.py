@@ -31,7 +31,7 @@ TINY = 1e-24
 """Smallest variance, of columns that never move."""
 TURN = 6.0
 """Distance of the third control point from a limit relative to that of the second beyond it:
-motions stay within if the second is no farther beyond than four times the margin."""
+motions stay within if the second is no farther beyond than 2.5 times the margin."""
 KNOWN_STATE = 2
 DEGREE = 3
 

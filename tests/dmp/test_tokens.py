@@ -150,6 +150,31 @@ def test_control_points_reach_the_limits_or_a_tenth_beyond_the_start(tokenizer, 
     torch.testing.assert_close(free.amax(0), high)
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("beyond", [0.5, 2.5, 40.0])
+def test_a_velocity_out_of_the_range_turns_back_behind_its_limit(tokenizer, side, beyond):
+    """The third control point is six times as far inside as the second is outside, which keeps
+    motions within up to 2.5 times the margin."""
+    parts = tokenizer.components
+    limit = parts.high if side > 0 else parts.low
+    margin = (parts.high - parts.low) / 12
+    start = limit - side * margin
+    # The second control point is a third of a knot's spacing along the velocity.
+    rate = side * (beyond + 1) * margin * 3 * (parts.points - 3) / parts.duration
+    rng = torch.Generator().manual_seed(0)
+    z = 1e6 * torch.randn(40, len(parts.spread), generator=rng).double()
+    points, _ = parts.polygon(z, start, rate)
+    second, third = (points * parts.scale + parts.centre)[:, 1:3].unbind(1)
+    torch.testing.assert_close(second, (limit + side * beyond * margin).expand(40, 3))
+    inside = side * (limit - third) / margin
+    expected = torch.full((3,), min(6 * beyond, 12.0)).double()
+    torch.testing.assert_close(inside.amin(0), expected, rtol=1e-6, atol=1e-6)
+    assert (inside <= 12 + 1e-6).all()
+    if beyond <= 2.5:
+        made = parts(z, torch.linspace(0, 1, 200).double(), start, rate)
+        assert (side * (made - limit) <= 1e-9 * margin).all()
+
+
 def test_motions_continue_what_is_executed(tokenizer):
     position, velocity = motions(50, seed=2)
     rng = torch.Generator().manual_seed(6)

@@ -97,6 +97,10 @@ def test_new_motions_grasp_the_block_as_demonstrated(source, tool):
     made = source.motions(draws(blocks, start=(0.02, -0.03, 0.01)))
     assert [motion.reason for motion in made] == ["", "", ""]
     for k, at in enumerate(blocks):
+        begun = panda.forward(made[k].joints[0]).position - tool[k][0].position
+        torch.testing.assert_close(
+            begun, torch.tensor([0.02, -0.03, 0.01]).double(), rtol=0, atol=1.5e-3
+        )
         grasp = int(torch.where(made[k].phase >= GRASP)[0][0])
         found = panda.forward(made[k].joints[grasp])
         T, shown = at.matrix().numpy(), np.linalg.inv(BLOCKS[k].matrix().numpy())

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from hrc_learn.regions import JointRegion
@@ -39,3 +40,15 @@ def test_the_printed_form_fails_at_the_limit():
 def test_the_value_is_negative_near_either_limit():
     value = JointRegion.from_limits(**LIMITS).value(column(-0.95, 0.0, 1.95))
     assert (value < 0).squeeze(-1).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.2, 0.35])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_printed_functions_are_differences_of_squares(distance, side):
+    """f = d^2 - 0.1^2 and f_r = d^2 - 0.3^2, with the gains 10 and 1."""
+    region = JointRegion.from_limits(**LIMITS, formulation="paper")
+    x = torch.tensor([0.5 + side * (1.5 - distance)]).double()
+    f, f_reference = distance**2 - 0.01, distance**2 - 0.09
+    assert region.value(x).item() == pytest.approx(f)
+    expected = (10 * min(f, 0) ** 2 + min(f_reference, 0) ** 2) / 2
+    assert region.potential(x).item() == pytest.approx(expected)
