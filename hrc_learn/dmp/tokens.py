@@ -216,7 +216,8 @@ class MotionTokenizer(nn.Module):
         """Motions of any sequences of tokens.
 
         A motion begins with exactly the given state. It stays in the demonstrated range and a
-        tenth of it to either side; a start beyond that moves the limit.
+        tenth of it to either side. A start beyond that moves the limit. A start velocity may
+        exceed it if it takes the second control point a quarter of the range beyond.
 
         Args:
             ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.

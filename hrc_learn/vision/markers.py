@@ -180,7 +180,7 @@ class MarkerDetector:
 
     def _search(self, grey: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
         corners, found, _ = self._aruco.detectMarkers(np.ascontiguousarray(grey))
-        seen = [] if found is None else found.ravel().tolist()
+        seen = [] if found is None else [int(id) for id in found.ravel()]
         for id in ids.intersection(id for id in seen if seen.count(id) > 1):
             warnings.warn(f"marker {id} is in the image twice: neither is used", stacklevel=2)
         return {
