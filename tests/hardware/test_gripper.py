@@ -57,11 +57,12 @@ def driver():
 @pytest.fixture
 def told(capfd):
     """Returns the failures printed so far."""
-    lines = []
+    text = ""
 
     def read():
-        lines.extend(capfd.readouterr().err.splitlines())
-        return lines
+        nonlocal text
+        text += capfd.readouterr().err
+        return text.split("\n")[:-1]  # the last line may be half written
 
     return read
 
