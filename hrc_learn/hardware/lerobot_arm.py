@@ -190,7 +190,8 @@ class LeRobotArm(Connected):
                 self._fault = fault
                 if fault:
                     raise ArmFaultError(fault)
-                self._goal, self._velocity = self._readings[-1][1].copy(), 0 * self._velocity
+                self._goal = self._readings[-1][1].copy()
+                self._velocity = np.zeros(len(self._names))
                 self._behind_since = math.inf
 
     def close(self) -> None:

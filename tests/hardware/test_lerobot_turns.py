@@ -221,6 +221,14 @@ def test_a_joint_that_catches_up_does_not_count_as_blocked(servos, connect):
         servos.turn()
 
 
+def test_two_readings_are_enough_for_a_velocity(servos, connect):
+    arm = connect()
+    np.testing.assert_array_equal(arm.read().joint_velocity, 0.0)
+    servos.at[f"{NAMES[0]}.pos"] += math.degrees(0.01)
+    servos.turn()
+    np.testing.assert_allclose(arm.read().joint_velocity, one(0, 0.01 / PERIOD), atol=1e-9)
+
+
 def test_a_silent_bus_is_a_fault_by_its_age_and_its_words(servos, connect):
     arm = connect()
     servos.turn()
