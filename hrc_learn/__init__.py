@@ -38,7 +38,7 @@ def __getattr__(name: str) -> object:
     if name not in _PACKAGES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_PACKAGES[name]}"), name)
-    globals()[name] = value  # asked for once only
+    globals()[name] = value  # later accesses do not call this function
     return value
 
 

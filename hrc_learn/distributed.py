@@ -1,8 +1,8 @@
 """Work divided over processes.
 
-The functions join the processes that `torchrun` starts; in a single process they do nothing, so
-that the same code serves both. `worker_pool` and `ByValue` serve processes that a program
-starts by itself.
+Most functions combine results of the processes that `torchrun` starts. In a single process they
+do nothing, so the same code runs with and without `torchrun`. `worker_pool` and `ByValue` are
+for processes that a program starts itself.
 """
 
 import multiprocessing
@@ -19,10 +19,10 @@ from torch import Tensor, nn
 
 
 class ByValue:
-    """An argument for another process, which receives a copy of it.
+    """Argument for another process, which receives a copy.
 
     Without this, `multiprocessing` moves each tensor of an argument to shared memory and frees
-    its old memory, while NumPy arrays that view the tensor still read it.
+    the old memory, although NumPy views of the tensor still use it.
     """
 
     def __init__(self, value: object):
@@ -37,9 +37,10 @@ class ByValue:
 def worker_pool(
     number: int, begin: Callable[..., object], *given: object
 ) -> Iterator[ProcessPoolExecutor]:
-    """Processes that start afresh, each by `begin(*given)`; open work ends with the block.
+    """Pool of new processes, initialized by `begin(*given)`; the end of the block cancels
+    pending work.
 
-    A forked process would inherit locks of threads that do not exist in it.
+    The processes are spawned: forked ones would inherit locks of threads that they lack.
     """
     context, sent = multiprocessing.get_context("spawn"), tuple(map(ByValue, given))
     with ProcessPoolExecutor(number, context, initializer=begin, initargs=sent) as pool:
@@ -77,9 +78,9 @@ def count() -> int:
 
 
 def local_items[T](items: Sequence[T]) -> Iterator[tuple[int, T]]:
-    """Items of this process, every n-th one, with their indices among all.
+    """Items of this process, every n-th of the sequence, with their indices in the sequence.
 
-    The sequence is sliced, so that one that loads items on demand loads only these.
+    The sequence is sliced: if it loads items on demand, it loads only these.
     """
     mine = slice(rank(), None, count())
     return zip(range(len(items))[mine], items[mine], strict=True)
@@ -106,8 +107,8 @@ def gather(tensor: Tensor) -> list[Tensor]:
 def differentiable_sum(tensor: Tensor) -> Tensor:
     """Sum over processes, differentiable for modules inside `data_parallel`.
 
-    The backward pass sums the gradients of all processes, and the mean that `data_parallel`
-    takes afterwards divides by their number, which leaves the gradient of the sum.
+    The backward pass sums the gradients of all processes. `data_parallel` then divides by the
+    number of processes, which leaves the gradient of the sum.
     """
     if count() == 1:
         return tensor

@@ -31,7 +31,8 @@ def write_model(
         tensors: Tensors by name.
 
     Raises:
-        InTheWayError: A ValueError: `folder` holds anything else; it is left unchanged.
+        InTheWayError: `folder` holds something other than a saved model and is left unchanged.
+            The error is a ValueError.
         BusyError: Another process is writing there.
     """
     # Clones, because safetensors refuses tensors that use the same memory.
@@ -40,12 +41,12 @@ def write_model(
     with store.replacing(folder, store.MODEL, overwrite=True) as new:
         new.mkdir()
         (new / CONFIG).write_text(store.json_text(header | config), encoding="utf-8")
-        # Not by `save_file`, whose errors are no OSErrors.
+        # `save_file` would raise errors that are not OSErrors.
         (new / MODEL).write_bytes(save(tensors))
 
 
 class SavedModel:
-    """A saved model, whose error messages name the file and the field."""
+    """A saved model. Error messages name the file and the field."""
 
     def __init__(self, folder: str | Path, kind: str):
         self.folder = Path(folder)
@@ -64,7 +65,7 @@ class SavedModel:
         if field not in self.config:
             raise ValueError(f"{self.folder / CONFIG}: field {field!r} is missing")
         value = self.config[field]
-        # Exactly these, because a truth value counts as an integer.
+        # Exact types: for isinstance, a bool is also an int.
         if type(value) not in types:
             names = " or ".join(t.__name__ for t in types)
             raise ValueError(
@@ -73,10 +74,10 @@ class SavedModel:
         return value
 
     def part[T](self, field: str, kind: type, make: Callable[[Any], T]) -> T:
-        """Object made of a config field of this type.
+        """Object made from a config field, which must have this type.
 
         Raises:
-            ValueError: A missing or wrong field; the message names it.
+            ValueError: The field, which the message names, is missing or wrong.
         """
         value = self.get(field, kind)
         try:
@@ -96,7 +97,7 @@ class SavedModel:
         return self.tensors[name]
 
     def invalid(self, complaint: object) -> ValueError:
-        """Error of a constructor, with the folder that caused it."""
+        """Error that adds the model's folder to the complaint of a constructor."""
         return ValueError(f"{self.folder}: {complaint}")
 
     def _read_tensors(self) -> dict[str, Tensor]:

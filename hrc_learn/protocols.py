@@ -46,7 +46,7 @@ class Gripper(Protocol):
     """A parallel gripper."""
 
     def move(self, width: float) -> None:
-        """Set the opening to reach or to squeeze towards [m]."""
+        """Set the opening to reach, or to squeeze towards if an object is in between [m]."""
         ...
 
 
@@ -57,7 +57,7 @@ class OpenedArm:
     arm: Arm
     gripper: Gripper
     advance: Callable[[float], None]
-    """Lets a duration pass: waits, or steps a simulation [s]."""
+    """Waits for a duration [s], or steps a simulation by it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class Touch:
     first: str
     """Geom of the moving side (arm, hand or carried object)."""
     second: str
-    """Geom that it met."""
+    """Geom that the moving side touched."""
     start: float
     """[s]"""
     end: float
@@ -134,8 +134,8 @@ class HumanInput:
     target: tuple[float, float, float] | None = None
     """Target point of the end effector, in the base frame [m]; None: no target."""
     turn: tuple[float, float, float] | None = None
-    """Rotation added to the end effector's orientation by rule or task, as a rotation vector in
-    the base frame [rad]; None: no rotation."""
+    """Rotation added to the end-effector orientation that the task requests, as a rotation
+    vector in the base frame [rad]; None: no rotation."""
     requests: tuple[Request, ...] = ()
     """Requests since the last reading, in order."""
     pause: bool = False
@@ -185,15 +185,13 @@ HINDRANCES: tuple[Hindrance, ...] = get_args(Hindrance)
 
 @dataclass(frozen=True, kw_only=True)
 class Reason:
-    """Reason why an arm does not follow, or only in part."""
+    """Reason why an arm does not follow a person's guidance, or follows it only in part."""
 
     hindrance: Hindrance
     text: str
     """Text for the person, such as "joint 4 is at its limit"."""
     kept: float = 1.0
-    """Fraction of the motion that remains, 0 to 1; 1 for a reason that merely accompanies the
-    push.
-    """
+    """Fraction of the motion that this reason leaves, 0 to 1; 1 if it is only mentioned."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,7 +206,8 @@ class Feedback:
     phase does not lower it.
     """
     reasons: tuple[Reason, ...] = ()
-    """Reasons why it is below 1, the strongest first; empty while no motion is requested."""
+    """Reasons why `followed` is below 1, the strongest first; empty while no motion is
+    requested."""
     contact_force: Float[np.ndarray, "3"] | None = None
     """Force at the end effector equivalent to the external torques, in the base frame [N]; None
     if the arm gives no estimate."""
@@ -253,10 +252,10 @@ class PersonObservation:
     radius: Float[np.ndarray, " parts"]
     """Radii of the capsules [m]."""
     velocity: Float[np.ndarray, "parts 2 3"]
-    """Velocities of the ends [m/s]; zero after the first image."""
+    """Velocities of the ends [m/s]; zero in the first observation."""
     regions: tuple[str, ...] = ()
-    """Body region of each capsule (`hrc_learn.controller.BODY_REGIONS`); empty: unknown, so
-    that none may be touched."""
+    """Body region of each capsule (`hrc_learn.controller.BODY_REGIONS`); empty: unknown, and
+    the arm may touch none of them."""
 
 
 @runtime_checkable
@@ -267,6 +266,6 @@ class PersonTracker(Protocol):
         """Return the newest observation that has arrived; None if there is none, for whatever
         reason.
 
-        Callers allow for the largest motion of a person since its time.
+        Callers must allow for the largest motion of a person since the time of exposure.
         """
         ...

@@ -22,8 +22,8 @@ def pytree[T](cls: type[T]) -> type[T]:
     """Register a dataclass as a pytree: fields are children, `static` ones structure.
 
     A field that is None has no child, so an optional tensor may be absent. Unlike
-    `torch.export.register_dataclass`, this keeps floats out of the leaves, which `vmap` would
-    refuse.
+    `torch.export.register_dataclass`, this supports static fields for floats, because `vmap`
+    refuses floats as leaves.
     """
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     children = [f.name for f in fields if not f.metadata.get("static")]
@@ -78,15 +78,15 @@ def zero_where[T](mask: Tensor, tree: T) -> T:
 def apply_where(
     mask: Tensor, function: Callable[[Any], Any], arguments: Any, otherwise: Any
 ) -> Any:
-    """Results of a batched function where a mask holds, elsewhere given values.
+    """Results of a batched function where a mask holds, and given values elsewhere.
 
-    The function sees the selected elements of the batch only, which saves its time.
+    To save time, the function is called on the selected elements of the batch only.
 
     Args:
         mask: Elements for which to call the function, (*batch).
-        function: From a pytree of tensors to one; its batch dimensions lead.
+        function: Maps a pytree of tensors to a pytree; batch dimensions lead.
         arguments: Pytree for the whole batch.
-        otherwise: Results elsewhere, of the structure of the function's.
+        otherwise: Values elsewhere, with the structure of the function's result.
     """
     if not bool(mask.any()):
         return otherwise
@@ -101,7 +101,7 @@ def chosen(mask: Tensor, one: Any, other: Any) -> Any:
     """Elements of one batched pytree where a mask holds, elsewhere those of another.
 
     Args:
-        mask: Elements of the first one, (*batch).
+        mask: Elements to take from `one`, (*batch).
         one: Pytree of tensors (*batch, ...).
         other: Pytree of the same structure.
     """

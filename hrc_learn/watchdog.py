@@ -11,12 +11,12 @@ from typing import final
 
 _FIRST_PAUSE = 0.02
 _LONGEST_PAUSE = 1.0
-"""Between two attempts to stop [s]: doubled from the first to the longest. Network drivers
-recover within some tens of milliseconds, a control box within seconds."""
+"""Pauses between attempts to stop [s]: each is twice the one before, up to the longest. Network
+drivers recover within some tens of milliseconds, a control box within seconds."""
 
 
 class WatchdogError(RuntimeError):
-    """The watchdog is no longer alive: do not move the arm."""
+    """The watchdog no longer works: do not move the arm."""
 
 
 def bring_to_rest(stop: Callable[[], object], timeout: float) -> bool:
@@ -24,7 +24,7 @@ def bring_to_rest(stop: Callable[[], object], timeout: float) -> bool:
 
     Args:
         stop: Brings the arm to rest.
-        timeout: Time to go on retrying [s].
+        timeout: Time for which to retry [s].
 
     Returns:
         True if an attempt succeeded.
@@ -40,14 +40,14 @@ def bring_to_rest(stop: Callable[[], object], timeout: float) -> bool:
 
 
 def _attempt(stop: Callable[[], object], failed: int) -> bool:
-    """Try to stop once, after a number of failures in a row; True if the arm is at rest."""
+    """Try to stop once, after `failed` failures in a row; True if the arm is at rest."""
     try:
         stop()
         return True
-    except (Exception, SystemExit) as error:  # a driver's sys.exit() must not end the watch
+    except (Exception, SystemExit) as error:  # a driver's sys.exit() must not end the thread
         failed += 1
         if failed & (failed - 1) == 0:  # the 1st, 2nd, 4th, ...
-            with suppress(Exception):  # a closed stderr must not end the watch either
+            with suppress(Exception):  # a closed stderr must not end the thread either
                 text = f"watchdog: stop failed {failed} times, retrying: {error!r}"
                 print(text, file=sys.stderr)
         return False
@@ -80,10 +80,10 @@ class Watchdog:
         *,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Set up; the time starts with the first `feed`, or on entering the context.
+        """Set up the watchdog; its time starts with the first `feed`, or with the context.
 
         Args:
-            timeout: Longest silence [s]; it is noticed up to a quarter of it late.
+            timeout: Longest silence [s]; noticed at most a quarter of this time late.
             stop: Brings the arm to rest. Called once for every silence, and again if it fails.
             clock: Current time [s].
 
@@ -95,7 +95,7 @@ class Watchdog:
         self.trips = 0
         self._timeout, self._stop, self._clock = timeout, stop, clock
         self._fed: float | None = None
-        # When to stop next, and the pause after that; None: there is nothing to stop.
+        # Time of the next attempt to stop; None: no stop is pending.
         self._due: float | None = None
         self._pause, self._in_a_row = _FIRST_PAUSE, 0
         self._stopping_since: float | None = None
@@ -126,20 +126,20 @@ class Watchdog:
         with self._lock:
             now = self._clock()
             if self._fed is not None and now - self._fed > self._timeout:
-                self._fed, self._due = None, now  # until fed again there is nothing to notice
+                self._fed, self._due = None, now  # a silence counts once, until the next feed
                 self._pause, self._in_a_row = _FIRST_PAUSE, 0
                 self.trips += 1
             if self._due is None or now < self._due:
                 return False
             self._due, self._stopping_since = None, now
-        # Outside the lock: stopping an arm may take long, and may feed.
+        # Outside the lock, because `stop` may take long and may call `feed`.
         stopped = _attempt(self._stop, self._in_a_row)
         with self._lock:
             self._stopping_since = None
             self._in_a_row += 1
             if (
                 not stopped and self._fed is None
-            ):  # if it was fed meanwhile, the loop is in charge again
+            ):  # if it was fed meanwhile, the loop is running again
                 self._due = self._clock() + self._pause
                 self._pause = min(2 * self._pause, _LONGEST_PAUSE)
         return True
@@ -149,7 +149,7 @@ class Watchdog:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread. A stop that hangs is not waited for: the process must end."""
+        """End the thread, but do not wait for a stop that hangs: the process must end."""
         self._done.set()
         self._thread.join(self._timeout + _LONGEST_PAUSE)
 

@@ -1,7 +1,8 @@
 """Step logs of control loops and recordings of runs, in NumPy; `hrc_learn.viz` draws them.
 
-A log has columns of equal length, one row per step, and is cheap to append to. A field of a
-recording that is None or empty drops its panel or figure; its times are seconds from the start.
+A log has columns of equal length, one row per step, and is cheap to append to. Times of a
+recording are in seconds from its start. If a field of a recording is None or empty, the panel
+or figure that would show it is left out.
 """
 
 import os
@@ -34,7 +35,7 @@ class LoggedSteps:
     """
 
     def __init__(self, blocks: Sequence[np.ndarray], length: int, events: Sequence[Event]):
-        """Columns over blocks of rows, all but the last full.
+        """Take blocks of rows, of which all but the last are full.
 
         Args:
             blocks: Structured arrays of one type and length.
@@ -92,9 +93,9 @@ Value = np.ndarray | np.generic | float | int | bool
 class StepLog(LoggedSteps):
     """Columns of the quantities that a loop measures, one row per step.
 
-    The first row decides the columns and their shapes; every later row must bring the same
-    ones. Numbers become float64, whatever their first value looks like (`time=0`); truth values
-    stay so. Memory is taken in blocks and never moved, so no step pays for growth.
+    The first row determines the columns and their shapes; every later row must have the same
+    ones. Numbers become float64, even if the first value is an integer (`time=0`); booleans
+    stay boolean. Memory is allocated in blocks and never moved, so that no step has to copy it.
 
         log = StepLog()
         log.append(time=t, joint_position=q, feature=x, pushed=True)
@@ -109,7 +110,7 @@ class StepLog(LoggedSteps):
         """
         if block < 1:
             raise ValueError(f"block must be at least one row, but is {block}.")
-        # The length is counted up last, so that another thread sees whole rows only.
+        # `_length` is increased last, so that another thread sees complete rows only.
         super().__init__(blocks=(), length=0, events=())
         self._block = block
         self._dtype: np.dtype | None = None
@@ -131,7 +132,7 @@ class StepLog(LoggedSteps):
         """Add a row.
 
         Raises:
-            ValueError: If the row lacks a column, brings a new one, or one of another shape.
+            ValueError: The row lacks a column, has a new one, or has one of another shape.
         """
         if self._dtype is None:
             self._open(values)
@@ -169,9 +170,9 @@ class StepLog(LoggedSteps):
             if given.get(name) != expected.get(name)
         ]
         return ValueError(
-            f"row {len(self)} does not fit the columns that the first row decided: "
+            f"row {len(self)} does not fit the columns of the first row: "
             + "; ".join(differing)
-            + ". Log every quantity at every step, with NaN where there is none."
+            + ". Log every quantity at every step, with NaN where it has no value."
         )
 
     def _extend(self) -> None:
@@ -246,7 +247,7 @@ class RunRecording:
     """[rad/s]"""
     joint_limits: JointRanges | None = None
     demo_joint_position: Float[np.ndarray, "time joints"] | None = None
-    """Demonstration at the matching phase of the run, NaN elsewhere [rad]."""
+    """Demonstrated joint positions at the same fraction of the motion [rad]; NaN elsewhere."""
 
     position: Float[np.ndarray, "time 3"]
     """Tool centre point in the base frame [m]."""
@@ -297,8 +298,8 @@ class RunRecording:
     """Angle of the end effector from its undisturbed orientation [rad]."""
 
     worker_distance: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
-    """Smallest distance between a worker and the robot with its load, true and seen by the
-    robot, by name [m]; NaN while unknown."""
+    """Distances between a worker and the robot with its load, by name [m]: the true smallest
+    one, the one seen by the robot, and the protective distance; NaN while unknown."""
     worker_nearest: Float[np.ndarray, "time 2 3"] | None = None
     """Nearest points of robot and worker [m]."""
 

@@ -1,18 +1,18 @@
-"""Files and folders that are complete or absent, however their writing ends.
+"""Files and folders that are complete or absent, even if their writing is interrupted.
 
-A file or folder takes shape in a workspace next to its place, on the same file system:
+A file or folder is written in a workspace next to its destination, on the same file system:
 
-    .NAME.writing/lock        held by the one process that writes NAME, and names it
+    .NAME.writing/lock        locked by the only process that writes NAME; contains its number
     .NAME.writing/new         new content
     .NAME.writing/old         previous content
     .NAME.writing/owned.json  parts of `old` that may be deleted
 
 A folder replaces another in three steps, each on disk before the next: `owned.json` is written,
-NAME is renamed to `old`, `new` is renamed to NAME. The content of a workspace therefore tells
-how far a killed process came, and the next writer of NAME, or `recover`, completes it:
+NAME is renamed to `old`, `new` is renamed to NAME. The content of a workspace therefore shows
+how far a killed process got, and the next writer of NAME, or `recover`, cleans up:
 
     new          unfinished: removed
-    old and new  between the two renames, so `new` is complete: it takes the name
+    old and new  between the two renames, so `new` is complete: renamed to NAME
     old          after both renames: the owned parts of `old` are removed
 
 Two renames are used instead of an exchange because every file system supports them.

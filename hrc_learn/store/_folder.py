@@ -1,4 +1,4 @@
-"""Folders on disk: locks, listing, syncing, deleting, and the manifests that say what is ours.
+"""Folders on disk: locks, listing, syncing, deleting, and manifests of the files written here.
 
 Only files that this package has written may be deleted with their folder.
 """
@@ -51,9 +51,9 @@ def try_lock(file: TextIO) -> bool:
 
 
 def sign(file: TextIO) -> None:
-    """Write the process and host into its locked file."""
+    """Write the number and host of this process into a locked file."""
     os.truncate(file.fileno(), 0)
-    # Without a buffer, so that closing the file cannot fail, too, on a full disk.
+    # Unbuffered, so that on a full disk closing the file cannot fail, too.
     os.write(file.fileno(), f"{os.getpid()} {socket.gethostname()}\n".encode())
 
 
@@ -67,7 +67,7 @@ def holder(path: Path) -> str:
 
 
 def is_at(file: TextIO, path: Path) -> bool:
-    """True if an open file still has that name."""
+    """True if an open file still has this path."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:
@@ -88,9 +88,9 @@ def entries(folder: Path) -> set[str]:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Context that names a path in errors of the disk that name none, or a temporary place.
+    """Context that adds a path to disk errors that name no file or only a temporary one.
 
-    A full disk, for example, shows when a buffered file is closed, and that error has no name.
+    An example is a full disk, noticed when a buffered file is closed.
     """
     try:
         yield
@@ -131,7 +131,7 @@ def carry_over(names: Iterable[str], source: Path, target: Path) -> set[str]:
     """Link entries of a folder into another one; copy them where links are not supported.
 
     Returns:
-        Entries carried over; a file whose name is taken by other content is not.
+        Entries carried over: all but files whose names are taken by other content.
     """
     carried = set()
     for entry in sorted(names):  # folders before their content
@@ -159,8 +159,8 @@ def delete(place: Path) -> None:
 
 
 def delete_entries(folder: Path, names: Iterable[str]) -> None:
-    """Delete entries of a folder, and the folder if it is empty then."""
-    # Only entries found in the folder: a foreign list may name "../elsewhere".
+    """Delete entries of a folder, and the folder if that leaves it empty."""
+    # Only entries found in the folder: a list from elsewhere may name "../elsewhere".
     for entry in sorted(entries(folder) & set(names), reverse=True):  # content first
         with contextlib.suppress(OSError):  # entries that cannot be deleted remain visible
             if entry.endswith("/"):
@@ -172,7 +172,7 @@ def delete_entries(folder: Path, names: Iterable[str]) -> None:
 
 
 def delete_files(folder: Path, patterns: Iterable[str]) -> bool:
-    """Delete a folder of temporary files, but no other file in it.
+    """Delete the temporary files of a folder, and the folder if no other file is in it.
 
     Args:
         folder: The folder.
@@ -199,7 +199,7 @@ class Kind:
 
     name: str
     files: tuple[str, ...] = ()
-    """Patterns of the files of a folder that can be extended; * matches / too.
+    """Patterns of the package's files, for a folder that users may extend; * matches / too.
 
     Such a folder may lack a manifest, and its foreign files are carried over. Without patterns,
     a folder that holds foreign files is not replaced.
@@ -231,8 +231,7 @@ def owned_entries(folder: Path, kind: Kind) -> set[str] | None:
         kind: Expected kind.
 
     Returns:
-        Relative paths, those of folders with "/" at the end; None for a folder of another
-        kind.
+        Relative paths; folders end in "/". None for a folder of another kind.
     """
     if not folder.is_dir():
         return None
@@ -257,13 +256,13 @@ class _Manifest:
     kind: str
     source: str = ""
     entries: list[str]
-    """All files and folders of the folder, the latter with "/" at the end."""
+    """All files and folders inside; folders end in "/"."""
     sha256: dict[str, str] = field(default_factory=dict)
     """Checksums of the files, by entry."""
 
 
 def write_manifest(folder: Path, kind: Kind, source: str) -> None:
-    """Write the manifest of a folder, whose whole content was written here."""
+    """Write the manifest of a folder whose whole content this package wrote."""
     names = sorted(entries(folder) - {MANIFEST})
     checksums = {name: _checksum(folder / name) for name in names if (folder / name).is_file()}
     manifest = _Manifest(kind=kind.name, source=source, entries=names, sha256=checksums)
@@ -306,7 +305,7 @@ def require_unchanged(folder: str | os.PathLike[str]) -> None:
 
 
 def source_of(folder: str | os.PathLike[str]) -> str:
-    """Source given by the writer of a folder; "" if there is none."""
+    """Source that the writer of a folder put into its manifest; "" if there is none."""
     manifest = _read_manifest(Path(folder))
     return "" if manifest is None else manifest.source
 
@@ -324,7 +323,7 @@ def _read_manifest(folder: Path) -> _Manifest | None:
 
 
 def _listed(folder: Path, manifest: _Manifest) -> set[str]:
-    """Entries of a manifest, and those of the manifests of the folders it lists.
+    """Entries of a manifest and, recursively, of the manifests in the folders that it lists.
 
     A foreign folder added later is not listed, whatever its own manifest says.
     """

@@ -1,8 +1,8 @@
-"""Reading of small files against schemas: JSON, TOML and messages.
+"""Small JSON and TOML files, and JSON messages, validated by schemas.
 
-A schema is a dataclass. A value of a wrong type, outside its bounds, not finite or missing is a
-`ValueError` of one line, which names the file, the field and the remedy. Fields that the schema
-does not name are ignored.
+A schema is a dataclass. A value that is missing, not finite, out of bounds or of a wrong type
+raises a one-line `ValueError` that names the file, the field and the remedy. Fields that the
+schema does not name are ignored.
 """
 
 import math
@@ -23,7 +23,7 @@ Radians = Annotated[float, Meta(ge=-1e3, le=1e3)]
 Pixels = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """Image coordinate or focal length in a file [px]."""
 Count = Annotated[int, Meta(ge=0, le=2**53)]
-"""Number of things in a file, or an index."""
+"""Count or index in a file."""
 Positive = Annotated[float, Meta(gt=0, le=1e300)]
 """Positive, finite number in a file."""
 
@@ -84,7 +84,7 @@ def parse_json[T](
 def json_text(content: object, *, indent: bool = True) -> str:
     """JSON text of any content, on many indented lines or on one.
 
-    Arrays and tensors become lists, numbers that are not finite null, other objects text.
+    Arrays and tensors become lists, non-finite numbers become null, other objects become text.
     """
     data = msgspec.json.encode(content, enc_hook=_plain)
     return (msgspec.json.format(data, indent=2) if indent else data).decode() + "\n"
@@ -98,7 +98,7 @@ def _content(path: Path, advice: str) -> bytes:
     if not path.exists():
         raise FileNotFoundError(f"there is no file {path}")
     if not path.is_file():  # a pipe would wait for ever
-        raise ValueError(f"{path} is no file")
+        raise ValueError(f"{path} is not a file")
     if path.stat().st_size > MAX_SIZE:
         raise ValueError(f"{path} is larger than {MAX_SIZE >> 20} MiB; {advice}")
     return path.read_bytes()
@@ -112,7 +112,7 @@ def _finite(text: str) -> float:
 
 
 def _complaint(error: Exception) -> str:
-    """Field and complaint of an error of msgspec."""
+    """Field and text of an error from msgspec."""
     if isinstance(error, RecursionError):
         return "nested too deeply"
     if isinstance(error, UnicodeError) or type(error) is msgspec.DecodeError:

@@ -1,7 +1,7 @@
 """Writing of files and folders that are complete or absent.
 
-A claim is the exclusive right to write a path. It replaces the content in steps from which
-`recover` completes or undoes what a killed process left.
+A claim is the exclusive right to write a path. It replaces the content in steps, so that
+`recover` can complete or undo what a killed process left.
 """
 
 import contextlib
@@ -57,7 +57,7 @@ class Claim:
             raise FileNotFoundError(f"there is no folder {self.target.parent}")
         self.workspace = workspace_of(self.target)
         self.new = self.workspace / _NEW
-        # A workspace inside another one is synced to disk together with that one.
+        # A workspace inside another one is synced to disk together with the outer one.
         self._sync = not any(_is_workspace(parent.name) for parent in self.target.parents)
         self._old = self.workspace / _OLD
         self._owned = self.workspace / _OWNED
@@ -83,11 +83,11 @@ class Claim:
             return
         try:
             self.clear()
-            # Deleted while held: a process that has opened it meanwhile notices and retries.
+            # Deleted while locked: a process that has just opened the file notices and retries.
             (self.workspace / _LOCK).unlink(missing_ok=True)
         finally:
             self._lock.close()
-        with contextlib.suppress(OSError):  # another process uses it already
+        with contextlib.suppress(OSError):  # another process may already use the workspace
             self.workspace.rmdir()
 
     def require_replaceable(
@@ -111,15 +111,15 @@ class Claim:
         owned = disk.owned_entries(path, kind)
         if owned is None:
             raise InTheWayError(
-                f"{path} is no {kind.name} of hrc_learn (one has a {MANIFEST}), so it is not "
-                f"ours to overwrite: choose another folder"
+                f"{path} is not a {kind.name} written by hrc_learn (these have a {MANIFEST}), "
+                f"so it is not overwritten: choose another folder"
             )
         others = sorted(disk.entries(path) - owned)
         if others and not (foreign or kind.files):
             more = f" and {len(others) - 1} more" if len(others) > 1 else ""
             raise InTheWayError(
-                f"{path} holds more than a {kind.name}, {others[0]}{more}, which would be "
-                f"lost: move it elsewhere, or choose another folder"
+                f"{path} holds files that are not part of the {kind.name} and would be lost, "
+                f"{others[0]}{more}: move them elsewhere, or choose another folder"
             )
 
     def commit_file(self, part: Path) -> None:
@@ -145,7 +145,7 @@ class Claim:
         if not self.new.is_dir():
             raise FileNotFoundError(f"nothing was written for {self.target}")
         try:
-            # Files added to the target meanwhile are set aside in the end.
+            # Files added to the target meanwhile are set aside by `clear`.
             self.require_replaceable(kind, overwrite, foreign=True)
         except InTheWayError as error:
             error.add_note(f"The new content is in {self.set_aside(self.new, 'new')}.")
@@ -181,12 +181,12 @@ class Claim:
         if os.path.lexists(self._old) and os.path.lexists(self.new):
             if os.path.lexists(self.target):  # created by others between the renames
                 for place, word in ((self._old, "kept"), (self.new, "new")):
-                    done.append(f"{self.set_aside(place, word)}: left from a replacement")
+                    done.append(f"{self.set_aside(place, word)}: left over from a replacement")
             else:
                 self.rename(self.new, self.target)
                 done.append(f"{name}: finished an interrupted replacement")
         if os.path.lexists(self._old):
-            with contextlib.suppress(OSError, ValueError):  # without a list nothing is ours
+            with contextlib.suppress(OSError, ValueError):  # without a list nothing is deleted
                 disk.delete_entries(self._old, map(str, read_json(self._owned, list)))
             if os.path.lexists(self._old):
                 kept = self.set_aside(self._old, "kept")
@@ -266,7 +266,7 @@ def _require_ours(workspace: Path) -> None:
         names = {"?"}
     # Checked again: another process may just have removed its lock and the workspace.
     if names and _LOCK not in names and os.path.lexists(workspace):
-        raise InTheWayError(f"{workspace} is no workspace of hrc_learn: move it elsewhere")
+        raise InTheWayError(f"{workspace} is not a workspace of hrc_learn: move it elsewhere")
 
 
 def recover(path: str | os.PathLike[str]) -> list[str]:
@@ -296,7 +296,7 @@ def settle(path: str | os.PathLike[str]) -> None:
     place = resolved(path)
     while not place.exists():
         if _is_interrupted(place):
-            # Without write access, or while it is being written, nothing is there to read.
+            # Without write access, or while another process writes, nothing can be recovered.
             with contextlib.suppress(OSError):
                 _recover_one(place)
         place = place.parent
@@ -385,7 +385,7 @@ def new_folder(
 
     Args:
         path: Path of the folder.
-        made_by: Inputs of the results, kept inside as JSON; other values as text.
+        made_by: Inputs of the results, saved in the folder as JSON; other values become text.
         overwrite: Replace an older folder of results.
 
     Yields:
@@ -424,8 +424,8 @@ def write_json(path: str | Path, content: object) -> None:
 
     Args:
         path: File to write.
-        content: Dataclass, mapping or list. Arrays and tensors become lists, numbers that are
-            not finite null, other objects text.
+        content: Dataclass, mapping or list. Arrays and tensors become lists, non-finite numbers
+            become null, other objects become text.
     """
     write_text(path, json_text(content))
 

@@ -124,7 +124,7 @@ def test_an_export_is_written_and_read(exported, tmp_path):
 
 def test_what_is_no_export_is_left_alone(exported, tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(ValueError, match="not ours to overwrite"):
+    with pytest.raises(ValueError, match="so it is not overwritten"):
         exported.save(tmp_path)
     assert (tmp_path / "thesis.tex").read_text() == "precious"
 

@@ -59,7 +59,7 @@ def test_saving_replaces_no_model_of_another_program(tmp_path):
     (tmp_path / "bert").mkdir()
     (tmp_path / "bert" / "config.json").write_text('{"architectures": ["BERT"]}')
     (tmp_path / "bert" / "model.safetensors").write_bytes(b"weeks of training")
-    with pytest.raises(ValueError, match="not ours to overwrite"):
+    with pytest.raises(ValueError, match="so it is not overwritten"):
         JointDMP.fit(TIME, POSITION).save(tmp_path / "bert")
     assert (tmp_path / "bert" / "model.safetensors").read_bytes() == b"weeks of training"
 
@@ -67,7 +67,9 @@ def test_saving_replaces_no_model_of_another_program(tmp_path):
 def test_saving_replaces_no_model_with_notes_beside_it(saved):
     _, folder = saved
     (folder / "notes.txt").write_text("good with the blue gripper")
-    with pytest.raises(ValueError, match=r"holds more than a saved model, notes\.txt"):
+    with pytest.raises(
+        ValueError, match=r"not part of the saved model and would be lost, notes\.txt"
+    ):
         JointDMP.fit(TIME, POSITION, n_basis=5).save(folder)
     assert (folder / "notes.txt").read_text() == "good with the blue gripper"
 
@@ -85,7 +87,7 @@ def test_a_save_cut_off_at_any_step_leaves_the_old_model_or_the_new(saved):
 def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(ValueError, match="not ours to overwrite"):
+    with pytest.raises(ValueError, match="so it is not overwritten"):
         JointDMP.fit(TIME, POSITION).save(tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").read_text() == "years of work"
 

@@ -24,7 +24,7 @@ def test_what_is_not_ours_is_never_overwritten(tmp_path, kind):
     precious = out if kind == "file" else out / "thesis.tex"
     precious.parent.mkdir(exist_ok=True)
     precious.write_text("years")
-    with pytest.raises(FileExistsError, match="not ours to overwrite"):
+    with pytest.raises(FileExistsError, match="so it is not overwritten"):
         fill(out, "new", overwrite=True)
     assert precious.read_text() == "years"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -39,7 +39,9 @@ def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(tmp_path, na
     precious.mkdir() if name.endswith("/") else precious.write_text("years")
     more = " and 1 more" if name.startswith("own/") else ""  # its folder is listed, too
     first = name.partition("/")[0] + "/" if more else name
-    with pytest.raises(FileExistsError, match=f"more than a cake, {first}{more}, which would"):
+    with pytest.raises(
+        FileExistsError, match=f"not part of the cake and would be lost, {first}{more}:"
+    ):
         fill(out, "new", overwrite=True)
     assert precious.exists()
     assert (out / "result").read_text() == "old"
@@ -49,7 +51,7 @@ def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(tmp_path, na
 def test_a_folder_without_a_manifest_is_not_ours(tmp_path):
     fill(tmp_path / "out", "old")
     (tmp_path / "out" / MANIFEST).unlink()
-    with pytest.raises(FileExistsError, match="not ours to overwrite"):
+    with pytest.raises(FileExistsError, match="so it is not overwritten"):
         fill(tmp_path / "out", "new", overwrite=True)
     assert contents(tmp_path) == cake("old")
     fill(tmp_path / "out", "new", overwrite=True, kind=EXTENDED)

@@ -109,10 +109,10 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
 def test_only_files_of_a_sensible_size_are_read(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no file .*none\.json"):
         read_json(tmp_path / "none.json")
-    with pytest.raises(ValueError, match="is no file"):
+    with pytest.raises(ValueError, match="is not a file"):
         read_json(tmp_path)
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ValueError, match="is no file"):
+    with pytest.raises(ValueError, match="is not a file"):
         read_json(tmp_path / "pipe")
     with (tmp_path / "large.json").open("wb") as file:
         file.truncate(64 * 2**20)

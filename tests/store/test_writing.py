@@ -184,7 +184,7 @@ def test_results_replace_older_results_only(tmp_path):
     assert store.read_made_by(out) == {"seed": 2}
     fill(tmp_path / "cake", "sweet")
     with (
-        pytest.raises(FileExistsError, match="not ours to overwrite"),
+        pytest.raises(FileExistsError, match="so it is not overwritten"),
         new_folder(tmp_path / "cake", {}, overwrite=True),
     ):
         pass
