@@ -1,4 +1,4 @@
-"""Make or extend datasets of version 3.0 from recordings, also from interrupted ones.
+"""Make or extend datasets of version 3.0 from recordings, even from interrupted ones.
 
 A recording lives in `NAME.recording/`. Its `recording.json` holds an identifier and the number
 of episodes of the dataset that it extends. The finished dataset keeps the identifier. If
@@ -52,8 +52,8 @@ def assemble(
         target: Folder of the new dataset.
         earlier: Dataset written by this package that the episodes are appended to. It is not
             changed; its files are linked into the new dataset, or copied.
-        videos: Video segments of each episode, whose files are copied; None for those recorded
-            with the episodes, which are linked where possible.
+        videos: Video segments of each episode; their files are copied. None for the videos that
+            were recorded with the episodes; these are linked where possible.
         tasks: Task texts that already have an index, in order of the index.
     """
     header = recorded.read_episode(paths[0])[0].header
@@ -107,7 +107,7 @@ class _EpisodeList:
     def row(
         self, staged: recorded.EpisodeDescription, length: int, file: int, videos: Segments
     ) -> dict:
-        """Row of the next episode, of a data file; its videos are placed."""
+        """Place the videos of the next episode, and return its row; `file` is its data file."""
         self.tasks |= dict.fromkeys(staged.tasks)
         row = {
             "episode_index": self.episodes,
@@ -172,7 +172,7 @@ def _count_files(table: pa.Table, kind: str) -> int:
 def _write_frames(
     path: Path, header: recorded.RecordingHeader, group: Sequence[Path]
 ) -> Iterator[tuple[recorded.EpisodeDescription, int]]:
-    """Write a data file, one row group per episode; each episode and its number of frames."""
+    """Write a data file, one row group per episode; yield each episode and its length."""
     path.parent.mkdir(exist_ok=True)
     schema = metadata.data_schema(recorded.read_episode(group[0])[1].schema, header.features)
     with pq.ParquetWriter(path, schema, write_page_checksum=True) as writer:
@@ -268,7 +268,7 @@ def put(source: str | Path, target: str | Path, *, link: bool = True) -> None:
 _RECORDING = "recording.json"
 _EPISODE = "episode_[0-9][0-9][0-9][0-9][0-9][0-9]."
 _FILES = (f"{_EPISODE}parquet", f"{_EPISODE}*.mp4", "*.unfinished.mp4", ".*.writing/*")
-"""Other files of a recording."""
+"""Patterns of the other files of a recording."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -386,7 +386,7 @@ def recover_all(path: str | Path) -> list[str]:
     alone.
 
     Args:
-        path: A dataset, a results folder, a model, or a folder that contains some.
+        path: A dataset, a results folder, a model, or a folder that contains any of these.
 
     Returns:
         Descriptions of the actions taken.
@@ -411,7 +411,7 @@ def recover_all(path: str | Path) -> list[str]:
 
 
 def discard(staging: Path) -> None:
-    """Remove the folder of a recording, but no foreign file in it."""
+    """Remove the folder of a recording; if it holds foreign files, rename it and keep these."""
     # The header is removed last: it identifies the folder if this is interrupted too.
     store.delete_files(staging, _FILES)
     if not store.delete_files(staging, [_RECORDING]):
@@ -420,7 +420,7 @@ def discard(staging: Path) -> None:
 
 
 def _read_header(staging: Path) -> _Recording:
-    """Read the header of a recording; create one if it was interrupted before that."""
+    """Read the header of a recording; create the header if it was not written yet."""
     path = staging / _RECORDING
     if not path.is_file():
         store.write_json(path, _Recording())
@@ -428,7 +428,7 @@ def _read_header(staging: Path) -> _Recording:
 
 
 def _is_recording(staging: Path) -> bool:
-    """True for the folder of a recording: its header is written first and removed last."""
+    """True for a folder with the header of a recording, or with only unfinished files."""
     if not staging.is_dir():
         return False
     if (staging / _RECORDING).is_file():

@@ -1,4 +1,4 @@
-"""A dataset as dashboards and pages show it: its arm, and curves in its own units."""
+"""Arm and curves of a dataset for dashboards and pages, in the units of the dataset."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FRANKA_WIDTH = 0.08
 
 @dataclass(frozen=True)
 class DatasetArm:
-    """An arm, and how a dataset's joints and gripper give its configuration."""
+    """An arm, and the conversion of a dataset's joints and gripper to its configuration."""
 
     arm: Arm
     columns: tuple[int, ...]
@@ -32,15 +32,15 @@ class DatasetArm:
     joints: UnitDecision
     """Unit of the dataset's joints."""
     gripper: UnitDecision | None = None
-    """Unit of its gripper."""
+    """Unit of the dataset's gripper."""
 
     def positions(
         self, values: Float64[np.ndarray, "frames _columns"]
     ) -> Float64[np.ndarray, "frames joints"]:
-        """Joint positions of the arm [rad], from those of a demonstration.
+        """Joint positions of the arm [rad], from the joint values of a demonstration.
 
-        Shares of a joint's range, as LeRobot's -100..100, become angles by the range of the
-        arm; ticks of an encoder count from the middle of a turn.
+        Fractions of a joint's range, such as LeRobot's -100 to 100, are mapped to the arm's
+        joint limits. For encoder ticks, the middle of a turn becomes angle zero.
         """
         lower, upper = self.arm.limits.lower.numpy(), self.arm.limits.upper.numpy()
         chosen = values[:, self.columns].copy()
@@ -73,7 +73,7 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
 
     Args:
         source: The opened dataset.
-        robot: Arm as in `ArmChoice.name`; empty: by the dataset's `robot_type`.
+        robot: Arm as in `ArmChoice.name`; if empty, the dataset's `robot_type` names it.
 
     Raises:
         DatasetError: The robot type is no registered arm, the dataset has no joint positions,

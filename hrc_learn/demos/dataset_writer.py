@@ -66,7 +66,7 @@ class DatasetWriter:
             root: Folder of the dataset; it must not exist, except with `append`.
             fps: Frame rate [1/s]. True stamps are kept in addition if frames give `time`.
             robot_type: Name of the robot in LeRobot's metadata.
-            joint_names: Joints, in the order of the values of `joint_position` and the like.
+            joint_names: Joints, in the order of the values of all joint quantities.
             features: Further features: key, such as "observation.shelf" -> component names.
             cameras: Cameras whose images are stored as videos: name -> height, width [px].
             frames: Reference frames of the poses, such as
@@ -139,7 +139,7 @@ class DatasetWriter:
                 discard(self._staging)
 
     def _kept(self) -> str:
-        """Place of the saved episodes, and the way to a dataset of them."""
+        """Note on the place of the saved episodes and on how to make a dataset of them."""
         return (
             f"The {self._new_episodes} episodes saved so far are kept in {self._staging}; "
             f"{recovery_advice(self.root)} makes a dataset of them."
@@ -288,7 +288,7 @@ class DatasetWriter:
         return self.episodes - (len(self._earlier.episodes) if self._earlier else 0)
 
     def _continue(self) -> DatasetFolder:
-        """Continue the counts of the dataset to append to."""
+        """Check the dataset to append to, continue its counts, and return its metadata."""
         folder, sidecar = open_folder(self.root), read_sidecar(self.root)
         for name, theirs, ours in (
             ("frame rate", folder.fps, self.fps),
@@ -323,7 +323,7 @@ class DatasetWriter:
         return self.episodes - 1
 
     def _write(self, episode: recorded.Episode, task: str) -> tuple[tuple[str, ...], int]:
-        """Write an episode with the images encoded so far; its quantities and length."""
+        """Write an episode with the images encoded so far; return its quantities and length."""
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
         episode = recorded.complete(episode, self.fps)
@@ -346,7 +346,7 @@ class DatasetWriter:
         return tuple(episode), frames
 
     def _header(self, columns: Sequence[recorded.RecordedColumn]) -> recorded.RecordingHeader:
-        """Properties of the dataset; those of a dataset to append to must be the same."""
+        """Properties of the recording; its features must equal those of a dataset to extend."""
         features = recorded.lerobot_features(columns) | self._video_features | INDEX_FEATURES
         earlier = features if self._earlier is None else self._earlier.info["features"]
         # LeRobot may have added properties of the videos.

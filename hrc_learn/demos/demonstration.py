@@ -1,4 +1,4 @@
-"""Demonstrations as plain arrays: one, a set from one robot, and a padded batch."""
+"""Demonstrations as plain arrays: a single demonstration, a set, and a padded batch."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -23,9 +23,9 @@ _ARRAYS = ("time", *JOINT_FIELDS, *_WIDTHS, "gripper")
 class Demonstration:
     """Recording of one demonstration of a task.
 
-    Every array has one row per frame; quantities that were not recorded are None. SI units and
-    radians; poses are those of the tool centre point in the robot's base frame. Lists and
-    tensors are converted to arrays.
+    Every array has one row per frame; quantities that were not recorded are None. Values are in
+    SI units and radians. Poses describe the tool centre point in the robot's base frame. Lists
+    and tensors are converted to arrays.
     """
 
     time: Float64[np.ndarray, " _frames"]
@@ -53,7 +53,7 @@ class Demonstration:
     command_velocity: Float64[np.ndarray, "_frames _joints"] | None = None
     """Commanded joint velocities [rad/s]."""
     task: str = ""
-    """Task shown, in words."""
+    """Task in words."""
     joint_names: tuple[str, ...] = ()
     """Joint names in the order of the columns; empty if only poses are known."""
     fps: float | int
@@ -147,10 +147,10 @@ def joint_columns(available: Sequence[str], wanted: Sequence[str]) -> list[int]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PaddedDemonstrations:
-    """Batch of demonstrations; a field is None unless all of them recorded it.
+    """Batch of demonstrations; a field is None unless all demonstrations recorded it.
 
-    After the end of a demonstration its last row is repeated, and time continues in steps of
-    the last interval, so that it increases everywhere; `mask` is False there.
+    After the end of a demonstration, `mask` is False, its last row is repeated, and time
+    continues in steps of the last interval, so that time always increases.
     """
 
     mask: Bool[Tensor, "demos frames"]
@@ -237,12 +237,12 @@ class DemonstrationSet(Sequence[Demonstration]):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Joint names of all demonstrations."""
+        """Joint names, the same for all demonstrations."""
         return self._demonstrations[0].joint_names if self._demonstrations else ()
 
     @property
     def frames(self) -> int:
-        """Number of frames of all demonstrations together."""
+        """Total number of frames of all demonstrations."""
         return sum(map(len, self._demonstrations))
 
     def select_joints(self, names: Sequence[str]) -> "DemonstrationSet":
@@ -258,7 +258,7 @@ class DemonstrationSet(Sequence[Demonstration]):
         return self._like([demo for demo in self if wanted(demo)])
 
     def map(self, change: Callable[[Demonstration], Demonstration]) -> "DemonstrationSet":
-        """Demonstrations changed one by one, such as by a step of `preprocessing`."""
+        """The set with every demonstration changed, such as by a step of `preprocessing`."""
         return self._like([change(demo) for demo in self])
 
     def padded(self) -> PaddedDemonstrations:

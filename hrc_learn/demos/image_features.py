@@ -2,8 +2,8 @@
 
     NAME.features/CAMERA.FEATURE/episode_000000.parquet    u, v, visible: one row per frame
 
-The dataset itself is never changed. Each file is complete or absent, and records which video it
-was made from, so that an interrupted extraction continues and notices new recordings.
+The dataset itself is never changed. Each file is complete or absent and records which video it
+was made from. An extraction can therefore continue after an interruption and find new videos.
 """
 
 import json
@@ -52,13 +52,13 @@ class FeatureCache:
         return self._folder / f"episode_{episode:06d}.parquet"
 
     def is_current(self, episode: int, segment: VideoSegment) -> bool:
-        """True if the file of an episode was made from this very video."""
+        """True if the file of an episode was made from this video in its present state."""
         path = self.path(episode)
         metadata = (pq.read_schema(path).metadata or {}) if path.is_file() else {}
         return metadata.get(_SOURCE) == _fingerprint(segment)
 
     def write(self, episode: int, segment: VideoSegment, track: Track) -> None:
-        """Keep the track of an episode."""
+        """Write the file of an episode."""
         path = self.path(episode)
         path.parent.mkdir(parents=True, exist_ok=True)
         pixels, visible = track
@@ -95,7 +95,7 @@ class FeatureCache:
         return replace(demo, feature=pixels, feature_visible=visible.astype(bool))
 
     def note(self, episodes: Sequence[int]) -> tuple[str, ...]:
-        """Note on the episodes from which it was not extracted; empty if there are none."""
+        """Note that lists the episodes without this feature; empty if there are none."""
         without = [episode for episode in episodes if not self.path(episode).is_file()]
         first = ", ".join(map(str, without[:5])) + ", ..." * (len(without) > 5)
         text = (
@@ -112,7 +112,7 @@ def _features_folder(root: Path) -> Path:
 
 
 def extracted_features(root: str | Path) -> list[FeatureCache]:
-    """Features that were extracted from a dataset, in whole or in part, by their names."""
+    """Features that were extracted from all or some episodes of a dataset, sorted by name."""
     folder = _features_folder(Path(root))
     names = {file.parent.name for file in folder.glob("[!.]*/episode_*.parquet")}
     return [FeatureCache(Path(root), name) for name in sorted(names)]
@@ -131,15 +131,15 @@ class Extraction:
     name: str
     """Name of the feature next to the dataset."""
     episodes: int = 0
-    """Episodes searched now."""
+    """Number of episodes searched by this call."""
     known: int = 0
-    """Episodes searched earlier."""
+    """Number of episodes searched by earlier calls."""
     frames: int = 0
-    """Frames searched now."""
+    """Number of frames searched by this call."""
     seen: int = 0
-    """Frames among them that show the feature."""
+    """Number of these frames that show the feature."""
     without_image: int = 0
-    """Frames for which the video holds no image."""
+    """Number of these frames without an image in the video."""
     left_out: dict[int, str] = field(default_factory=dict)
     """Episode index -> fault of its video."""
 
@@ -154,16 +154,16 @@ def extract_features(
 ) -> Extraction:
     """Find a feature in every image of a camera and keep it next to the dataset.
 
-    Episodes already searched, in the same videos, are skipped: call it again after an
-    interruption, or after recording more. Episodes without a sound video are left out and
-    listed in the result.
+    Episodes are skipped if their present videos were searched before: call this function again
+    after an interruption, or after recording more. Episodes without an intact video are left
+    out and listed in the result.
 
     Args:
         path: The dataset.
         name: Name of the feature, such as "marker_3".
-        detector: Factory of the detector for one episode, so that a detector that tracks the
-            feature from image to image starts afresh.
-        camera: Name of the camera ("front") or its feature; None for the only one.
+        detector: Function that makes a detector for each episode, so that a detector that
+            tracks the feature from image to image starts afresh.
+        camera: Name of the camera ("front") or its feature; None if there is only one.
         progress: Wraps the episodes to search, such as with a progress bar.
 
     Raises:
@@ -210,10 +210,10 @@ def _track(
 
 
 def camera_key(keys: Sequence[str], camera: str | None) -> str:
-    """Feature of the named camera among keys, or of the only one.
+    """Key of the named camera, or the only key if no camera is named.
 
     Raises:
-        DatasetError: There is no such camera, or several and none is named.
+        DatasetError: There is no such camera, or none is named although there are several.
     """
     wanted = [key for key in keys if camera is None or key in (camera, image_key(camera))]
     if len(wanted) == 1:
@@ -225,8 +225,8 @@ def camera_key(keys: Sequence[str], camera: str | None) -> str:
 def attach_features(demos: DemonstrationSet, name: str | None = None) -> DemonstrationSet:
     """Demonstrations with a feature that `extract_features` found in their videos.
 
-    `load_demos` and `open_demos` attach it themselves if the dataset has no image feature of
-    its own and exactly one was extracted.
+    `load_demos` and `open_demos` do this themselves if the dataset has no image feature of its
+    own and exactly one was extracted.
 
     Args:
         demos: Demonstrations read from a dataset.

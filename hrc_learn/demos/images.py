@@ -1,4 +1,4 @@
-"""Images of a dataset, decoded into tensors, one for each frame of an episode."""
+"""Images of a dataset, decoded into tensors: one image for each frame of an episode."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +23,7 @@ Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]
 (`torch.channels_last`)."""
 
 _THUMBNAIL_RATE = 5.0
-"""Thumbnails per second: a hand-guided arm moves by a few centimetres between two."""
+"""Thumbnails per second: from one to the next, a hand-guided arm moves a few centimetres."""
 _JPEG_QUANTISER = 4
 """Quality of JPEG files, 2 (best) to 31."""
 _THUMBNAIL_HEIGHT = 240
@@ -57,7 +57,7 @@ class ImageReader:
         self._segments: dict[int, Segments] = videos.read_segments(self._folder, missing=True)
 
     def available(self, episode: int) -> tuple[str, ...]:
-        """Cameras whose images of an episode exist."""
+        """Cameras that have images of an episode."""
         segments = self._segments.get(episode, {})
         return tuple(
             key
@@ -212,10 +212,10 @@ def camera_images(
 ) -> Iterator[tuple[str, CameraImages | DatasetError]]:
     """Each camera of an episode with its images, or with the error of its video.
 
-    Videos are not decoded where a viewer does that on demand; other images are thumbnails.
+    Videos stay encoded if viewers can decode them on demand; other images become thumbnails.
     """
     for camera in reader.available(demo.episode):
-        # The whole rest of the key: left.rgb and right.rgb are two cameras.
+        # Keep the whole rest of the key: left.rgb and right.rgb are two cameras.
         name = camera.removeprefix("observation.images.")
         segment = reader.segment(demo.episode, camera)
         try:
@@ -232,7 +232,7 @@ def thumbnails(
 
     Args:
         reader: Reader of the dataset.
-        demo: Demonstration with all its frames or some spread evenly over them.
+        demo: Demonstration with all frames of its episode, or with evenly spaced ones.
         camera: Feature that holds the images.
         most: Largest number of images: 200 take about 2 MB.
 
@@ -240,7 +240,7 @@ def thumbnails(
         DatasetError: The images cannot be read.
     """
     last = reader.entry(demo.episode).length - 1
-    # Evenly spread, and never more than the frames there are.
+    # Evenly spaced, and never more than the episode has.
     count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
     frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})
     size = thumbnail_size(*reader.size(camera))
@@ -252,7 +252,7 @@ def thumbnails(
 def thumbnail_size(
     height: int, width: int, tallest: int = _THUMBNAIL_HEIGHT
 ) -> tuple[int, int]:
-    """Height and width of a thumbnail [px], even because chroma is halved."""
+    """Height and width of a thumbnail [px]; both are even, as JPEG halves the chroma planes."""
     scale = min(1.0, tallest / height) / 2
     return 2 * max(1, round(scale * height)), 2 * max(1, round(scale * width))
 

@@ -1,4 +1,4 @@
-"""Issues of a dataset with their place: raised by readers, listed in validation reports."""
+"""Issues of a dataset and their places, raised by readers or listed in validation reports."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 _UNPRINTABLE = re.compile(
-    # Control characters, and those that reverse the direction of text or hide it.
+    # Control characters, and characters that hide text or reverse its direction.
     "[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
 _LONGEST_TEXT, _END = 300, 120
-"""Characters shown of a text from a file, and those of its end, where the advice stands."""
+"""Largest number of characters shown of a text from a file, and the number that a shortened
+text keeps of its end, where the advice stands."""
 _LONGEST_MESSAGE = 1000
-"""Characters shown of a message. Its commands and paths have to stay whole."""
+"""Largest number of characters shown of a message: its commands and paths must stay whole."""
 _FIGURE_OR_QUOTE = re.compile(r"[-+]?\d[\d.e+-]*|'[^']*'")
 
 
@@ -23,7 +24,7 @@ def plain_text(text: str, longest: int = _LONGEST_TEXT) -> str:
 
     Args:
         text: The text.
-        longest: Characters shown; of a longer text the beginning and the end.
+        longest: Number of characters shown; a longer text loses its middle.
     """
     shown = _UNPRINTABLE.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
     return shown if len(shown) <= longest else f"{shown[: longest - _END]} ... {shown[-_END:]}"
@@ -60,7 +61,7 @@ class Issue:
     frame: int | None = None
     """First frame concerned, counted from the start of the episode."""
     key: str | None = None
-    """Column (feature) concerned, with the component in brackets where one is to blame."""
+    """Column (feature) concerned, with the component in brackets if only one is at fault."""
     components: tuple[str, ...] = ()
     """Names of the components concerned."""
     severity: float = 0.0
@@ -69,7 +70,7 @@ class Issue:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Column and text; equal if issues differ in place, components and figures only."""
+        """Column and text; equal if issues differ only in place, components and numbers."""
         column = (self.key or "").split(" (")[0]
         words = (w for w in self.message.split() if w.strip(".,:;") not in self.components)
         text = _FIGURE_OR_QUOTE.sub("#", " ".join(words))
@@ -107,7 +108,7 @@ class UnitsWarning(UserWarning):
 
 
 _KINDS_SHOWN = 16
-"""Lines of errors, and of warnings, in a summary: both fit on one screen."""
+"""Largest number of error lines and of warning lines in a summary: both fit on one screen."""
 _PLACES_SHOWN = 8
 
 
@@ -158,7 +159,7 @@ class ValidationReport:
     def run[**P](
         self, check: Callable[P, Iterable[Issue]], *args: P.args, **kwargs: P.kwargs
     ) -> None:
-        """Run a check and file its issues."""
+        """Run a check and add its issues to the report."""
         self.attempt(lambda: [self.add(issue) for issue in check(*args, **kwargs)])
 
     def lines(self, full: bool = False) -> Iterator[str]:

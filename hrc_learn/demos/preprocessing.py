@@ -21,10 +21,10 @@ def local_polynomial(
 ) -> tuple[Float64[np.ndarray, "frames components"], Float64[np.ndarray, "frames components"]]:
     """Value and slope of a polynomial fitted around each sample by least squares.
 
-    This generalises the filter of Savitzky and Golay (1964) to uneven stamps, as robots and
-    cameras give them: each fit uses the same number of neighbours at their true times. Near the
-    ends, the first and last full windows are used. On even stamps it equals that filter; a
-    polynomial of the given degree passes unchanged.
+    This generalises the filter of Savitzky and Golay (1964) to the uneven stamps of robots and
+    cameras: each fit uses the same number of neighbours at their true times. Near the ends, the
+    first and last full windows are used. On even stamps, the result equals that of the original
+    filter. A polynomial of the given degree passes unchanged.
 
     Args:
         time: Increasing stamps [s].
@@ -59,14 +59,14 @@ def local_polynomial(
 
 _MEASURED = (name for name in JOINT_FIELDS if not name.startswith("command_"))
 _SMOOTHED = (*_MEASURED, "position", "orientation")
-"""Fields that are smoothed: commands are not."""
+"""Fields that are smoothed; commands are left as they are."""
 
 
 def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) -> Demonstration:
     """Smooth motion and efforts by polynomials around each frame; stamps may be uneven.
 
-    Orientations are filtered as quaternions of continuous sign and normalised, which does not
-    depend on their reference frame.
+    Orientations are filtered as quaternions of continuous sign, then normalised. The result
+    does not depend on the reference frame.
 
     Args:
         demo: The demonstration.
@@ -85,9 +85,9 @@ def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) ->
 def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Demonstration:
     """Smooth motion and efforts by a Butterworth low-pass, forwards and backwards: no lag.
 
-    The cut-off of each pass is raised such that both together halve the power at `cutoff`
-    (Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4). The ends
-    are extended by point reflection.
+    The cut-off of each pass is raised such that the two passes together halve the power at
+    `cutoff` (Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4).
+    The ends are extended by point reflection.
 
     Args:
         demo: Demonstration with even stamps, such as from `resample`.
@@ -129,8 +129,8 @@ def _filtered(demo: Demonstration, smooth: Callable[[np.ndarray], np.ndarray]) -
 def estimate_joint_velocity(demo: Demonstration, window: float | int = 0.1) -> Demonstration:
     """Estimate `joint_velocity` from the joint positions.
 
-    Differences of jittered stamps multiply the noise; a polynomial fitted around each frame
-    (`local_polynomial`) does not, and uses the stamps as they are.
+    A polynomial is fitted around each frame (`local_polynomial`), at the true stamps. Finite
+    differences at jittered stamps would amplify the noise.
 
     Args:
         demo: Demonstration with joint positions.
@@ -150,7 +150,7 @@ def estimate_twist(
 ) -> Float64[np.ndarray, "_frames 6"]:
     """Linear [m/s] and angular [rad/s] velocity of the end effector, in the base frame.
 
-    The angular velocity is 2 q' q*, with polynomials fitted to the quaternion's components; it
+    The angular velocity is 2 q' q*, with polynomials fitted to the quaternion's components. It
     does not depend on the choice of the base frame.
 
     Args:
@@ -165,16 +165,16 @@ def estimate_twist(
     pose = np.hstack([demo.position, demo.orientation])
     smooth, rate = local_polynomial(demo.time, pose, window=window)
     q, q_dot = torch.from_numpy(smooth[:, 3:]), torch.from_numpy(rate[:, 3:])
-    # A fitted quaternion is not exactly of unit length; the vector part ignores its growth.
+    # Fitted quaternions deviate from unit length; the vector part ignores changes in length.
     product = quaternion.multiply(q_dot, quaternion.conjugate(q))
     angular = 2 * product[:, 1:] / q.square().sum(1, keepdim=True)
     return np.hstack([rate[:, :3], angular.numpy()])
 
 
 _JOINT_REST, _LINEAR_REST = (0.01, 0.04), (0.003, 0.01)
-"""Speeds below which a rest begins and above which it ends, of the fastest joint [rad/s], and
-of the end effector [m/s]. Between them, the last state persists: a speed close to one bound
-does not split a recording."""
+"""Speeds below which a rest begins and above which it ends, for the fastest joint [rad/s] and
+for the end effector [m/s]. Between the two speeds, the last state persists: a speed close to
+one of them does not split a recording."""
 _SHORTEST_REST = 0.3
 """Shortest rest [s]; shorter ones, as at a turning point, belong to the motion."""
 _REST_WINDOW = 0.15
@@ -182,7 +182,7 @@ _REST_WINDOW = 0.15
 
 
 def resting(demo: Demonstration) -> Bool[np.ndarray, " _frames"]:
-    """Mask of frames in which the joints, or else the end effector, rest.
+    """Mask of the frames at rest, found by the joints or, without them, by the end effector.
 
     Raises:
         ValueError: The demonstration holds neither joint nor Cartesian positions, or too few
@@ -196,7 +196,7 @@ def resting(demo: Demonstration) -> Bool[np.ndarray, " _frames"]:
     speed = np.linalg.norm(rates, axis=1) if joints is None else np.abs(rates).max(1)
     low, high = _LINEAR_REST if joints is None else _JOINT_REST
     state = np.where(speed > high, 1, np.where(speed < low, -1, 0))
-    # The arm moves before the first clear state.
+    # The arm counts as moving before the first clear state.
     last = np.maximum.accumulate(np.where(state != 0, np.arange(len(demo)), -1))
     still = np.where(last >= 0, state[last], 1) < 0
     for start, stop in _runs(still):
@@ -289,7 +289,7 @@ def _with_margin(demo: Demonstration, start: int, stop: int, keep: float) -> tup
 
 
 _SMOOTH = ("joint_position", "joint_velocity", "position", "orientation")
-"""Fields with the smoothness of a body with inertia; measurements and commands may jump."""
+"""Fields that vary smoothly, because the arm has inertia; all other fields may jump."""
 
 
 def resample(demo: Demonstration, fps: float | int) -> Demonstration:
@@ -299,7 +299,7 @@ def resample(demo: Demonstration, fps: float | int) -> Demonstration:
     period, is dropped.
 
     Args:
-        demo: Demonstration of at least two frames, at any stamps.
+        demo: Demonstration of at least two frames, with even or uneven stamps.
         fps: Frame rate of the grid [1/s].
 
     Raises:
@@ -382,8 +382,8 @@ def nearest_frames(
 def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
     """Scale the duration of a demonstration; the path stays the same.
 
-    Velocities and the nominal frame rate scale with it: no frame is added or lost (`resample`
-    sets another rate). Efforts stay as measured.
+    Velocities and the nominal frame rate are scaled accordingly: no frame is added or removed
+    (`resample` sets another rate). Efforts stay as measured.
 
     Args:
         demo: Demonstration of at least two frames.
@@ -415,11 +415,11 @@ def equalise_durations(demos: DemonstrationSet) -> DemonstrationSet:
 def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demonstration:
     """Shift fields to the times at which they were measured.
 
-    An image that is stamped 40 ms after its exposure shows the arm of 40 ms ago.
+    An image that is stamped 40 ms after its exposure shows the arm as it was 40 ms before.
 
     Args:
         demo: The demonstration.
-        delays: Field -> delay behind the stamps of its frames [s], such as {"feature": 0.04}.
+        delays: Field -> time from its measurement to its stamp [s], such as {"feature": 0.04}.
             The end of the demonstration, for which no later frame exists, is cut off.
 
     Raises:
@@ -451,9 +451,9 @@ def warp(
 
     D[i, j] = cost[i, j] + min(D[i-1, j-1], D[i-1, j], D[i, j-1])
 
-    Entries of one anti-diagonal depend on earlier ones only and are computed together: exact,
-    in about 0.1 s for 1000 samples against 1000. `dtaidistance` accepts no cost matrix, and
-    `tslearn` needs numba, scikit-learn and statsmodels.
+    Entries of an anti-diagonal depend on earlier anti-diagonals only and are computed together.
+    This is exact and takes about 0.1 s for 1000 by 1000 samples. `dtaidistance` accepts no cost
+    matrix, and `tslearn` needs numba, scikit-learn and statsmodels.
 
     Args:
         cost: Cost of pairing sample i of the first with sample j of the second; infinite for
@@ -488,15 +488,15 @@ _VELOCITY_WINDOW = 0.1
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of that of median duration, by time warping.
+    """Warp every demonstration to the timing of the demonstration of median duration.
 
-    Joint motions are compared, each joint scaled by its range over all demonstrations; without
-    joints, the position and the orientation (its angle relative to the largest rotation).
-    Afterwards all have the reference's frames, and frame k of each shows the same phase of the
-    task. Recorded joint velocities are estimated anew.
+    Time warping compares the joint positions, each scaled by its range over all demonstrations.
+    Without joints, it compares the positions and the orientations of the end effector, scaled
+    likewise. Afterwards, all demonstrations have the frames of that reference, and frame k of
+    each shows the same phase of the task. Recorded joint velocities are estimated anew.
 
     Args:
-        demos: At least one demonstration, all of the same quantities.
+        demos: At least one demonstration; all must record the quantity that is compared.
 
     Raises:
         ValueError: There are no demonstrations, or nothing to compare.
@@ -513,7 +513,7 @@ def align(demos: DemonstrationSet) -> DemonstrationSet:
 
 
 def _scale(name: str, motions: list[np.ndarray]) -> np.ndarray:
-    """Range of each component over all motions, of orientations the largest rotation."""
+    """Range of each component over all motions; for orientations, the largest angle [rad]."""
     if name == "orientation":
         ranges = np.array([max(_angles(q, q[:1]).max() for q in motions)])
     else:
@@ -537,11 +537,11 @@ def _follow(
         else:
             squares += cdist(a / scale, b / scale, "sqeuclidean")
     lead = np.linspace(0, 1, len(reference))[:, None] - np.linspace(0, 1, len(demo))
-    # One step is always allowed, or there would be no path.
+    # A difference of one frame is always allowed: without it, there may be no path.
     widest = max(_BAND, 1 / max(min(squares.shape) - 1, 1))
     allowed = np.abs(lead) <= widest + 1e-12
     first, second = warp(np.where(allowed, np.sqrt(squares), np.inf))
-    # Several pairs may share a frame of the reference: their mean time counts.
+    # Several pairs may contain the same frame of the reference: use their mean time.
     times = np.bincount(first, weights=demo.time[second]) / np.bincount(first)
     if len(reference) > 2:
         # The path advances by whole frames; a line fitted around each frame interpolates.

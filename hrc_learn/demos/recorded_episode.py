@@ -20,8 +20,8 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
 
 TIME_KEY = "time"
-"""Feature of the true stamps. A policy would take `observation.time` for an input, and no robot
-has such an observation."""
+"""Feature that holds the true stamps. Policies would use an `observation.time` as an input, but
+no robot provides one."""
 _METADATA_KEY = b"hrc_learn"
 
 Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
@@ -109,8 +109,8 @@ def rotation_vectors(
 ) -> Float64[np.ndarray, "frames 3"]:
     """Rotation vectors [rad] without jumps.
 
-    A gripper that points down has turned by about pi, where the shortest rotation vector jumps
-    to its opposite; a policy can learn from the unwrapped one.
+    A gripper that points down is rotated by about pi, where the shortest rotation vector jumps
+    to its negative. A policy can learn from unwrapped rotation vectors.
     """
     shortest = quaternion.log(torch.from_numpy(orientation))
     return quaternion.unwrap_log(shortest).numpy()
@@ -124,7 +124,7 @@ def frame_row(
     Args:
         values: Quantity -> numbers.
         widths: Known quantities and their numbers of components.
-        earlier: Frames of the episode so far, of the same quantities.
+        earlier: Earlier frames of the episode, with the same quantities.
 
     Raises:
         ValueError: A quantity is unknown, missing, new, or of the wrong length.
@@ -165,7 +165,7 @@ def describe_difference(given: Collection[str], expected: Collection[str]) -> st
 def complete(episode: Episode, fps: float) -> Episode:
     """The episode with default stamps and visibility where its frames gave none.
 
-    A feature that was not visible need not be finite; it is written as zero.
+    An image feature need not be finite while it is not visible; such values become zero.
     """
     length = len(next(iter(episode.values())))
     episode = {"time": np.arange(length) / fps, **episode}
@@ -250,7 +250,7 @@ def write_episode(
         header: Properties of the recording.
         values: Feature -> numbers (frames, components), without LeRobot's index columns.
         tasks: Texts of its tasks, and the index of the task of each frame.
-        frames_before: Number of frames of the episodes before it.
+        frames_before: Total number of frames of all earlier episodes.
         others: Columns that hold no numbers, such as images and texts.
         statistics: Statistics of its images.
         provenance: Origin of an episode that was made from others, as JSON.
@@ -299,7 +299,7 @@ def staged_paths(folder: Path, first: int = 0) -> list[Path]:
 
     Args:
         folder: Folder of the recording.
-        first: Index of the first episode: the number of episodes of the extended dataset.
+        first: Index of the first episode: the length of the dataset that is extended, or 0.
 
     Raises:
         DatasetError: No episode was saved, or one in the middle is missing.
@@ -320,7 +320,7 @@ def to_table(
     features: Mapping[str, Mapping],
     others: Mapping[str, pa.Array | pa.ChunkedArray] | None = None,
 ) -> pa.Table:
-    """Arrow table of one episode: a number or a list of fixed length per frame.
+    """Arrow table of one episode, with one row per frame.
 
     Args:
         values: Feature -> numbers (frames, components).

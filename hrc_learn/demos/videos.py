@@ -1,8 +1,8 @@
 """Videos of a dataset: located, decoded, and encoded during a recording.
 
-A recording encodes one video per episode and camera as the images arrive: raw images of a few
-seconds would not fit into memory, and a file for many episodes, as LeRobot writes it, would be
-lost if the recording were interrupted.
+A recording encodes one video per episode and camera as the images arrive: raw images would soon
+fill the memory, and a file for many episodes, as LeRobot writes it, would be lost if the
+recording were interrupted.
 """
 
 import contextlib
@@ -27,9 +27,9 @@ Image = UInt8[np.ndarray, "_height _width 3"]
 _PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 """Columns of the list of episodes for each video feature."""
 _SAMPLE_PIXELS = 150
-"""Longer side of the images that enter statistics [px], about as in LeRobot."""
+"""Smallest longer side of the reduced images in statistics [px], about as in LeRobot."""
 _SKIP_SECONDS = 2.0
-"""Gap between wanted images above which the video is sought: key frames are rarely farther
+"""Gap between wanted images above which the decoder seeks: key frames are rarely farther
 apart."""
 
 
@@ -98,7 +98,7 @@ def _segments_v3(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment
 
 
 def _segments_v2(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment]]:
-    """The same for the versions 2, which keep one file per episode and camera."""
+    """The same for versions 2.0 and 2.1, which keep one file per episode and camera."""
     size = int(folder.info.get("chunks_size", 1000))
     for entry in folder.episodes:
         places = places_v2(entry.index, size)
@@ -124,19 +124,19 @@ class CameraImages:
     time: Float64[np.ndarray, " images"]
     """Times since the first image [s]."""
     samples: tuple[bytes, ...]
-    """Files, or samples of a video in the order of decoding."""
+    """JPEG files, or samples of a video in decoding order."""
 
 
 _CODECS = {"av1": "av1", "h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb", "vp9": "vp9"}
-"""Codec -> filter that makes each sample complete by itself, or the codec itself for none."""
+"""Codec -> filter that converts its samples to Annex B; the codec itself if none is needed."""
 
 
 def encoded_samples(segment: VideoSegment) -> CameraImages | None:
     """The images of a segment as they are encoded, for players that decode on demand.
 
     Returns:
-        The samples; None if the codec, or an order of images that differs from that of
-        decoding, needs decoding.
+        The samples; None if players cannot decode them: the codec is not in `_CODECS`, or the
+        display order of the images differs from their decoding order.
 
     Raises:
         DatasetError: The video cannot be read.
@@ -154,7 +154,7 @@ def encoded_samples(segment: VideoSegment) -> CameraImages | None:
             whole = None
             if _CODECS[codec] != codec:
                 whole = av.BitStreamFilterContext(_CODECS[codec], stream)
-            # Half an image before, as times are rounded; a key frame begins each episode.
+            # 1 ms later, as times are rounded: seeks the key frame that begins the episode.
             container.seek(int((segment.start + 1e-3) / stream.time_base), stream=stream)
             for packet in container.demux(stream):
                 if packet.pts is None:
@@ -186,7 +186,7 @@ def decode(
         segment: Part of a video.
         fps: Frame rate of the dataset [1/s].
         size: Height and width to scale to [px]; None keeps the size.
-        frames: Frames wanted, ascending; None for all. Those without an image are left out.
+        frames: Frames wanted, ascending; None for all. Frames without an image are left out.
 
     Raises:
         DatasetError: The file is no video that can be decoded.
@@ -199,17 +199,17 @@ def decode(
     gaps = np.flatnonzero(np.diff(numbers) > max(1, round(_SKIP_SECONDS * fps)))
     try:
         with av.open(str(segment.file)) as container:
-            # PyAV's own threads stay within an image: threads that read ahead may log while the
-            # container closes, and both then wait for Python's lock.
+            # PyAV's threads work on one image by default. Threads that read ahead may log while
+            # the container closes; both would then wait for Python's lock.
             stream = container.streams.video[0]
             for number, run in enumerate(np.split(numbers, gaps + 1)):
                 wanted, start = {*run.tolist()}, segment.start + run[0] / fps
                 if (start > 0 or number) and stream.time_base is not None:
-                    # Seeks the key frame before; images up to the start are decoded, too.
+                    # Seeks the last key frame before the start; decoding begins there.
                     container.seek(int(start / stream.time_base), stream=stream)
                 for image in container.decode(stream):
                     frame = round((float(image.time or 0.0) - segment.start) * fps)
-                    if frame in wanted:  # a second image of a frame is passed over
+                    if frame in wanted:  # a second image of a frame is skipped
                         wanted.remove(frame)
                         yield frame, rgb_image(image, size)
                     if not wanted or frame > run[-1]:
@@ -223,7 +223,7 @@ def decode(
 
 
 def image_at(segment: VideoSegment, frame: int, fps: float) -> Image:
-    """RGB image of one frame of an episode; only images after the last key frame are decoded.
+    """RGB image of one frame of an episode, decoded from the last key frame before it.
 
     Raises:
         DatasetError: The file is no video that can be decoded, or ends before the frame.
@@ -263,22 +263,22 @@ def rgb_image(image: Any, size: tuple[int, int] | None = None) -> Image:
     from av.video.reformatter import VideoReformatter
 
     height, width = size or (image.height, image.width)
-    # Not the one that PyAV keeps: its threads are missing in a process forked after its first
-    # use, such as that of a data loader, which would wait for them for ever.
+    # A new reformatter instead of PyAV's cached one: a process forked after the first use of
+    # that one, such as a data loader's, lacks its threads and would wait for them forever.
     rgb = VideoReformatter().reformat(image, width, height, "rgb24")
     return rgb.to_ndarray()
 
 
 def subsampled(image: Image) -> Image:
-    """The image reduced to about 150 pixels along its longer side."""
+    """The image reduced by a whole factor, to no less than 150 pixels along its longer side."""
     stride = max(1, max(image.shape[:2]) // _SAMPLE_PIXELS)
     return image[::stride, ::stride]
 
 
 _CODEC = {"preset": "ultrafast", "crf": "20", "g": "2"}
-"""Encoder options. The recording's own process encodes: 9 ms per 1440x1080 frame instead of
-25 ms, for twice the size. Every second frame is a key frame, as in LeRobot: policies read
-single frames."""
+"""Encoder options. As the recording process itself encodes, speed comes first: 9 ms per
+1440x1080 frame instead of 25 ms, for twice the size. Every second frame is a key frame, as in
+LeRobot: policies read single frames."""
 _SAMPLE_EVERY = 5
 """Frames per image that enters the statistics, as in LeRobot."""
 
