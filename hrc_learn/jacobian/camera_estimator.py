@@ -1,18 +1,18 @@
-"""Online estimate of a camera that may have been moved, with what the camera leaves.
+"""Online estimate of a camera that may have been moved, and of the residual image Jacobian.
 
 The state holds a window of key frames. Unknown are the camera c, thirteen numbers, and the
 weights W of the residual network. Along the path of the key frames, the pixel of the marker is
 
     x_i = pixel(c, r_i) + W Phi_i + noise,    Phi_i = sum of dr (x) theta since the first frame
 
-W enters linearly with a Gaussian prior, so it is integrated out: the errors of the frames are
-correlated by Phi_i^T P Phi_j, and the camera follows by Gauss-Newton steps of generalised least
-squares, from several turns about the optical axis at once. Given the camera, W has a closed
-form. Both together are the maximum a posteriori estimate.
+W enters linearly with a Gaussian prior, so it is integrated out: the errors of frames i and j
+have the covariance Phi_i^T P Phi_j, and the camera follows from Gauss-Newton steps of
+generalised least squares, from several rotations about the optical axis at once. Given the
+camera, W has a closed form. Camera and W together are the maximum a posteriori estimate.
 
-Optics and marker keep the posterior of the demonstrations as their prior; place and orientation
-of the camera have a wide one. Several images in a row far from where the marker should be mean
-that the camera was moved: the window is then emptied and the search begins again.
+The prior of optics and marker is their posterior from the demonstrations; the prior of the
+camera's position and orientation is wide. If several images in a row show the marker far from
+its predicted pixel, the camera was moved: the window is emptied and the search begins again.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from hrc_learn.jacobian.perspective import (
 )
 from hrc_learn.pytree import chosen, pytree
 
-# Optics and marker: components of the vector with the posterior of the demonstrations.
+# Components of c whose prior is the posterior of the demonstrations: optics and marker.
 _KNOWN = [0, 1, 2, 3, 10, 11, 12]
-# Largest turn of a Gauss-Newton step [rad], and largest change of place [m]: beyond it the
+# Largest rotation [rad] and translation [m] of a Gauss-Newton step: beyond these the
 # linearisation does not hold.
 _LONGEST_TURN, _LONGEST_MOVE = 0.4, 0.15
-# Error beyond which a frame counts less, in median errors of the window.
+# Error beyond which a frame counts less, as a multiple of the median error of the window.
 _OUTLIER = 3.0
-# Standard deviation without any information [px, px/m].
+# Variance of frames of the window that hold no image [px^2].
 _UNKNOWN = 1e6
 
 
@@ -61,28 +61,28 @@ class CameraConfig:
     min_step: float = 0.006
     """Least motion between key frames [m], rotation scaled with `rotation_scale`."""
     max_step: float = 0.1
-    """Largest motion between key frames across which the residual is followed [m]."""
+    """Largest motion between key frames over which the residual Jacobian is integrated [m]."""
     rotation_scale: float = 0.15
     """Metres per radian, a typical lever arm [m/rad]."""
     pixel_noise: float = 0.25
-    """Standard deviation of a pixel coordinate [px]: 0.1 px of the detector in blurred images,
-    and what noise of the encoders adds."""
+    """Standard deviation of a pixel coordinate [px]: 0.1 px from the detector in blurred
+    images, the rest from the noise of the encoders."""
     hypotheses: int = 8
-    """Turns about the optical axis from which the search starts."""
+    """Number of rotations about the optical axis from which the search starts."""
     tilt: float = 0.15
-    """Prior standard deviation of a tilt of the camera since the demonstrations [rad]; its turn
-    about the optical axis may be any."""
+    """Prior standard deviation of a tilt of the camera since the demonstrations [rad]; the
+    rotation about its optical axis is unrestricted."""
     place: float = 0.1
     """Prior standard deviation of a shift of the camera along each axis [m]."""
     marker: float = 1e-3
-    """Standard deviation of the marker's place on the tool since the demonstrations [m]."""
+    """Standard deviation of a marker shift on the tool since the demonstrations [m]."""
     residual: float = 8.0
     """Prior standard deviation of the mean of the residual image Jacobian [px/m]: half a
-    percent of that of ordinary cameras, as encoder zeros off by 2 mrad leave."""
+    percent of an ordinary image Jacobian, the effect of encoder zeros off by 2 mrad."""
     bump: float = 4.0
-    """Least error that counts as a sign of a moved camera [px]."""
+    """Error that indicates a moved camera [px], in addition to five standard deviations."""
     surprises: int = 3
-    """Images in a row with such an error after which the camera counts as moved."""
+    """Number of consecutive images with such an error that count as a moved camera."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=vars(self))
@@ -91,14 +91,14 @@ class CameraConfig:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class CameraState:
-    """Cameras, weights of the residual, and the window of key frames."""
+    """Hypotheses of the camera, weights of the residual, and the window of key frames."""
 
     weight: Float[Tensor, "*batch entries K"]
-    """W of the most probable camera [px/m, px/rad]."""
+    """W, given the most probable camera [px/m, px/rad]."""
     cameras: Float[Tensor, "*batch hypotheses 13"]
     """Hypotheses of the camera."""
     cost: Float[Tensor, "*batch hypotheses"]
-    """Negative log posterior of each, up to a constant."""
+    """Negative log posterior of each hypothesis, up to a constant."""
     covariance: Float[Tensor, "*batch 13 13"]
     """Covariance of a step from the most probable camera."""
     position: Float[Tensor, "*batch frames 3"]
@@ -112,9 +112,9 @@ class CameraState:
     known: Bool[Tensor, "*batch frames"]
     """True for frames of the window that hold an image."""
     surprises: Float[Tensor, "*batch"]
-    """Images in a row with the marker far from where it should be."""
+    """Number of consecutive images with the marker far from its predicted pixel."""
     moves: Float[Tensor, "*batch"]
-    """Times that the camera was found moved."""
+    """Number of camera motions detected so far."""
 
     @property
     def best(self) -> Float[Tensor, "*batch 13"]:
@@ -128,7 +128,7 @@ class CameraState:
         return torch.softmax(-self.cost, dim=-1)
 
     def spread(self) -> CameraSpread:
-        """Uncertainty of the estimate: all hypotheses, and steps of one deviation."""
+        """Uncertainty: steps of one standard deviation, and the other hypotheses."""
         best = self.best
         covariance = self.covariance / 2 + self.covariance.mT / 2
         values, vectors = torch.linalg.eigh(covariance)
@@ -142,21 +142,21 @@ class CameraState:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class CameraSpread:
-    """Cameras whose differences are the uncertainty of an estimate.
+    """Sample cameras that represent the uncertainty of an estimate.
 
-    The variance of any function is the weighted sum of the squared differences of its values
-    from that for the first camera: linearised about the most probable camera, plus what other
-    hypotheses say.
+    The variance of any function of the camera is a weighted sum over the samples: of the
+    squared differences between its values and its value for the first camera. It combines the
+    linearised variance about the most probable camera with the spread of the hypotheses.
     """
 
     samples: Float[Tensor, "*batch samples 13"]
     """The most probable camera, then the others."""
     weights: Float[Tensor, "*batch others"]
-    """Weight of each of the others."""
+    """Weight of each sample after the first."""
 
 
 class CameraEstimator(ImageJacobianEstimator):
-    """Camera and residual from a window of key frames, by maximum a posteriori estimation."""
+    """Maximum a posteriori estimate of camera and residual from a window of key frames."""
 
     def __init__(self, network: RBFImageJacobian, config: CameraConfig | None = None):
         """Prepare the prior.
@@ -199,14 +199,14 @@ class CameraEstimator(ImageJacobianEstimator):
     precision: Tensor
     """Prior precision of optics and marker, zero for the rest, (13, 13)."""
     residual: Tensor
-    """Prior covariance of the weights of either image row, (P, P)."""
+    """Prior covariance of the weights of one image row, (P, P)."""
     scale: Tensor
     """Metres per unit of each component of a twist, (6,)."""
     rolls: Tensor
-    """Turns about the optical axis of the hypotheses, (hypotheses, 4)."""
+    """Initial rotations of the hypotheses about the optical axis, (hypotheses, 4)."""
 
     def initial_state(self, *batch: int) -> CameraState:
-        """The camera of the demonstrations, turned in all ways, and an empty window."""
+        """The camera of the demonstrations, rotated by each hypothesis, and an empty window."""
         config, like = self.config, self.reference
         frames = (*batch, config.frames)
         upright = like.new_tensor([1.0, 0, 0, 0])
@@ -228,7 +228,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def jacobian(
         self, state: CameraState, r: Pose | Float[Tensor, "*batch 6"]
     ) -> Float[Tensor, "*batch rows 6"]:
-        """J_s_hat at a pose: that of the most probable camera, and the residual."""
+        """J_s_hat at a pose: the most probable camera's image Jacobian plus the residual."""
         pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
         first = camera_jacobian(state.best, pose[..., None]).squeeze(-3)
         return first + evaluate(state.weight, self.network.basis(pose))
@@ -245,7 +245,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def _rolled(
         self, camera: Float[Tensor, "*batch 13"]
     ) -> Float[Tensor, "*batch hypotheses 13"]:
-        """A camera turned about its optical axis by each hypothesis."""
+        """Copies of a camera, rotated about its optical axis by each hypothesis."""
         turn = quaternion.multiply(
             self.rolls, quaternion.exp(camera[..., ROTATION]).unsqueeze(-2)
         )
@@ -255,7 +255,7 @@ class CameraEstimator(ImageJacobianEstimator):
         return torch.cat(parts, dim=-1)
 
     def _roll_cost(self, cameras: Float[Tensor, "*batch hypotheses 13"]) -> Tensor:
-        """Preference for small turns, which decides only before there is any motion."""
+        """Small cost of rotation since the demonstrations; decides only before any motion."""
         turn = quaternion.exp(cameras[..., ROTATION])
         return 0.05 * quaternion.angle(turn, quaternion.exp(self.reference[ROTATION]))
 
@@ -268,18 +268,18 @@ class CameraEstimator(ImageJacobianEstimator):
     def _prior_error(
         self, cameras: Float[Tensor, "*batch 13"]
     ) -> tuple[Float[Tensor, "*batch 5"], Float[Tensor, "*batch 5 13"]]:
-        """Tilt and shift of the camera in prior deviations, and their derivatives by steps."""
+        """Tilt and translation in prior deviations, and their derivatives by a step."""
         config = self.config
         home = quaternion.to_matrix(quaternion.exp(self.reference[ROTATION]))
         R = quaternion.to_matrix(quaternion.exp(cameras[..., ROTATION]))
         zero = torch.zeros_like(R[..., 0])
-        # Axis of view in the camera of the demonstrations, whose own is (0, 0, 1).
+        # Optical axis in the frame of the demonstrations' camera, whose own axis is (0, 0, 1).
         tilt = (R[..., 2, :] @ home.mT)[..., :2] / config.tilt
         by_turn = torch.stack([R[..., 1, :], -R[..., 0, :], zero], dim=-1)
         by_turn = (home @ by_turn)[..., :2, :] / config.tilt
         away = (eye_of(cameras) - eye_of(self.reference)) / config.place
         t = cameras[..., SHIFT]
-        # e = -R^T t becomes e + R^T (w x t) - R^T dt.
+        # A step moves the camera position e = -R^T t to e + R^T (w x t) - R^T dt.
         cross = torch.linalg.cross(
             torch.eye(3).to(t).expand(*t.shape[:-1], 3, 3), t.unsqueeze(-2)
         ).mT
@@ -293,7 +293,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def _watched(
         self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
     ) -> CameraState:
-        """State with an empty window where the camera was moved."""
+        """State with an empty window in those elements of the batch whose camera was moved."""
         config = self.config
         expected, slope = marker_pixels(state.best, now.pose[..., None])
         error = now.feature - expected.squeeze(-2)
@@ -318,8 +318,8 @@ class CameraEstimator(ImageJacobianEstimator):
     def _with_key_frame(
         self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
     ) -> tuple[CameraState, Bool[Tensor, "*batch"]]:
-        """State with this image in the window if the tool has moved, and True where it may be
-        learned from: not while it may mean that the camera was moved.
+        """State with this image in the window if the tool has moved, and True unless recent
+        images indicate a moved camera: nothing is learned from such images.
         """
         config = self.config
         last = Pose(state.position[..., -1, :], state.orientation[..., -1, :])
@@ -348,11 +348,11 @@ class CameraEstimator(ImageJacobianEstimator):
         return chosen(add, longer, state), calm
 
     def _searched(self, state: CameraState) -> CameraState:
-        """State after a Gauss-Newton step, and the residual of the most probable camera."""
+        """State after one Gauss-Newton step and the fit of the residual to the best camera."""
         known = state.known
         newest = known.to(state.path).cumsum(-1)
         start = ((newest == 1) & known).to(state.path)
-        # Regressors since the first frame of the window.
+        # Regressors accumulated since the first frame of the window.
         path = state.path - (start[..., None] * state.path).sum(-2, keepdim=True)
         path = torch.where(known[..., None], path, 0.0)
         covaried = path @ self.residual
@@ -372,14 +372,14 @@ class CameraEstimator(ImageJacobianEstimator):
         whitened = inverse @ error
         change = (covaried.mT @ whitened).mT.unflatten(-1, (6, -1))
         weight = self.initial_weight() + (change * self.scale[:, None]).flatten(-3, -2)
-        # Errors larger than assumed make the estimate as much less certain.
+        # Errors larger than assumed increase the covariance in proportion.
         count = (2 * known.sum(-1) - SIZE + len(_KNOWN)).clamp_min(1)
         misfit = ((error * whitened).sum((-2, -1)) / count).clamp_min(1.0)
         covariance = torch.linalg.inv(gram) * misfit[..., None, None]
         return replace(learned, weight=weight, covariance=covariance)
 
     def _flat_weight(self, weight: Tensor) -> Float[Tensor, "*batch 2 P"]:
-        """Weights as factors of regressors whose rotation is scaled to metres."""
+        """Weights that multiply regressors with rotation scaled to metres."""
         return (weight.unflatten(-2, (2, 6)) / self.scale[:, None]).flatten(-2)
 
     def _information(
@@ -388,10 +388,10 @@ class CameraEstimator(ImageJacobianEstimator):
         pixel: Float[Tensor, "*batch frames 2"],
         kernel: Float[Tensor, "*batch frames frames"],
     ) -> Float[Tensor, "*batch frames frames"]:
-        """Inverse covariance of the frames; those off the most probable camera count less."""
+        """Inverse covariance of the frames; outliers of the most probable camera count less."""
         seen, _ = marker_pixels(state.best, Pose(state.position, state.orientation))
         size = torch.where(state.known, (pixel - seen).norm(dim=-1), 0.0)
-        # The median over known frames: unknown ones are first in order.
+        # The median over known frames: unknown frames have size zero and are sorted first.
         count = state.known.sum(-1, keepdim=True)
         place = size.shape[-1] - 1 - count // 2
         median = size.sort(-1).values.gather(-1, place.clamp(0, size.shape[-1] - 1))
@@ -412,7 +412,7 @@ class CameraEstimator(ImageJacobianEstimator):
         seen, slope = marker_pixels(cameras, poses)
         use = known[..., None, :, None]
         error = torch.where(use, pixel.unsqueeze(-3) - seen, 0.0)
-        # Rows u of all frames, then v: one information matrix serves both.
+        # Row u of all frames, then row v: one information matrix applies to both.
         slope = torch.where(use[..., None], slope, 0.0).transpose(-3, -2)
         error = error.mT
         information = inverse[..., None, None, :, :]
@@ -426,13 +426,13 @@ class CameraEstimator(ImageJacobianEstimator):
         pull = away @ self.precision
         towards = towards - (by_step.mT @ prior.unsqueeze(-1)).squeeze(-1) - pull
         cost = cost + prior.square().sum(-1) + (away * pull).sum(-1)
-        # Nearly flat directions, the roll before any motion, move little.
+        # Limit steps along nearly flat directions, such as the roll before any motion.
         gram = gram + 1e-2 * torch.eye(SIZE).to(gram)
         return gram, towards, cost / 2 + self._roll_cost(cameras)
 
 
 def _shortened(step: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 13"]:
-    """A step within the reach of its linearisation."""
+    """A step shortened to where its linearisation holds."""
     turn, move = step[..., ROTATION].norm(dim=-1), step[..., SHIFT].norm(dim=-1)
     factor = torch.maximum(turn / _LONGEST_TURN, move / _LONGEST_MOVE).clamp_min(1.0)
     return step / factor[..., None]

@@ -1,17 +1,17 @@
-"""Detection of camera motion: the robot's own marker is not seen where it should be.
+"""Detection of camera motion from the tool's marker, and correction of pixels for it.
 
 A camera fitted to demonstrations (`perspective`) predicts the pixel of the tool's marker
-at any tool pose. A camera that turned by w and moved by v sees the marker with the error e = L
-(w, v), to first order, where L is the interaction matrix: the derivative of the pixel by the
-camera twist. Over the last seconds, one such motion is fitted to e. Its explained displacement,
-the root mean square over the frames, is compared with the largest one in the demonstrations
-themselves, each held out of the fit. That threshold covers errors of calibration, lens and time
-stamps. Outside the region of the demonstrations these errors are unknown, and nothing is
-compared.
+at any tool pose. If the camera turns by w and moves by v, the seen pixel differs from the
+prediction by e = L (w, v), to first order, where L is the interaction matrix: the derivative of
+the pixel by the camera twist. One such motion is fitted to e over the last second. The
+displacement L (w, v) that it explains, as root mean square over the frames, is compared with a
+threshold: 2.5 times the largest one in demonstrations that were held out of the camera's fit.
+The threshold covers errors of calibration, lens and time stamps. Outside the region of the
+demonstrations these errors are unknown, so frames there are ignored.
 
-`CameraCorrection` maps the pixels of a moved camera to those of the camera before its motion:
-that of the tool's marker by the tool pose, that of an object by the plane on which the
-demonstrations found objects. All frames since the motion refine the estimate.
+`CameraCorrection` maps pixels of the moved camera to those of the camera before its motion: the
+marker's pixel by means of the tool pose, an object's pixel by means of the plane on which the
+objects of the demonstrations lay. All frames since the motion refine the estimate.
 """
 
 from __future__ import annotations
@@ -39,30 +39,31 @@ from hrc_learn.jacobian.perspective import (
     pixels_and_depth,
 )
 
-# Prior standard deviation of each component of a motion [rad, m]: that of a tripod that was
-# knocked. It resolves rotations and translations that look alike in the image.
+# Prior standard deviation of each component of a motion [rad, m], for a knocked tripod. It
+# decides between rotations and translations that look alike in the image.
 _PLAUSIBLE = 0.1
-# Largest motion in these standard deviations: beyond it, the camera would not see the table.
+# Largest motion in these standard deviations: after a larger one, the camera would not see the
+# table.
 _FARTHEST = 5.0
 FEWEST_FRAMES = 10
-"""Frames with a visible marker below which no motion is reported."""
+"""Number of frames with a visible marker needed to report a motion."""
 # Errors are clipped at this multiple of their median: a half-covered marker is off by pixels in
-# a frame or two, a moved camera in all frames.
+# one or two frames, but after a camera motion the pixels of all frames are off.
 _OUTLIER = 3.0
-# Time window for a motion [s]. A small motion counts in full after half of it, on average.
+# Time window for the fit of a motion [s].
 _WINDOW = 1.0
 # Threshold relative to the largest displacement in held-out demonstrations.
 _MARGIN = 2.5
-# Difference of camera placements, in median differences of neighbouring episodes.
+# Least difference between camera placements, in median differences of neighbouring episodes.
 _APART = 6.0
 # Gauss-Newton steps: three are enough for ten degrees.
 _REFINEMENTS = 5
 # Frames of the marker used for the motion estimate: half a minute at 20 Hz.
 _KEPT_FRAMES = 600
-# Frames needed to detect a motion. One, because wrong pixels soon guide the arm out of the
-# region of the demonstrations, where no motion can be detected.
+# Number of frames that `CameraCorrection` needs to detect a motion. One, because wrong pixels
+# soon guide the arm out of the region of the demonstrations, where no motion can be detected.
 _FEWEST = 1
-# Largest root mean square error [px] between object pixels and the positions of grasps: people
+# Largest root mean square error between object pixels and the positions of grasps [px]: people
 # grasp an object some millimetres from its marker.
 _AGREEMENT = 10.0
 # Gauss-Newton steps, enough for an offset of decimetres seen from a distance of one metre.
@@ -85,7 +86,7 @@ class CameraMotion:
         twist: Float[Tensor, "6"],
         points: Float[Tensor, "frames 3"],
     ) -> CameraMotion:
-        """Motion by a twist, with the displacement of points of the camera frame [m]."""
+        """Motion by a twist, with the displacement of points in the camera frame [m]."""
         displacement = _root_mean_square(motion_jacobian(camera, points) @ twist)
         return CameraMotion(twist=twist, displacement=displacement)
 
@@ -108,12 +109,12 @@ class CameraMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraReference:
-    """A camera as seen in demonstrations, and the threshold for its motion."""
+    """Camera fitted to demonstrations, and the threshold for its motion."""
 
     camera: tuple[float, ...]
     """Vector of the camera and its marker (see `perspective`), fitted to all demonstrations."""
     threshold: float
-    """Displacement above which the camera has moved [px]."""
+    """Explained displacement above which the camera counts as moved [px]."""
     lower: tuple[float, float, float]
     """Lower corner of the box of demonstrated marker positions, in the camera frame [m]."""
     upper: tuple[float, float, float]
@@ -129,7 +130,7 @@ class CameraReference:
         return torch.tensor(self.camera, dtype=torch.float64)
 
     def covers(self, point: Float[Tensor, "3"]) -> bool:
-        """True if a point of the camera frame is within the box of the demonstrations."""
+        """True if a point in the camera frame is within the box of the demonstrations."""
         lower, upper = point.new_tensor(self.lower), point.new_tensor(self.upper)
         return bool(((point >= lower) & (point <= upper)).all())
 
@@ -137,7 +138,7 @@ class CameraReference:
     def fit(
         demonstrations: Sequence[ImageDemonstration], fps: float, image_size: tuple[int, int]
     ) -> CameraReference:
-        """Learn the camera and the largest displacement without any motion.
+        """Fit the camera, and the threshold from displacements found without any motion.
 
         Args:
             demonstrations: Two or more demonstrations with one fixed camera; read several
@@ -197,20 +198,20 @@ def _columns(frames: _Frames) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, 
 
 
 class CameraWatch:
-    """Compares the seen pixel of a marker with the predicted one, frame by frame.
+    """Compares the seen pixel of a marker with the predicted pixel, frame by frame.
 
     Attributes:
         reference: Camera of the demonstrations.
-        displacement: Explained displacement of the last seconds [px]; 0 with too few frames.
+        displacement: Explained displacement over the last second [px]; 0 with too few frames.
     """
 
     def __init__(self, reference: CameraReference, fewest: int = FEWEST_FRAMES):
-        """Start with a camera at its place.
+        """Start without any frames.
 
         Args:
             reference: Camera of the demonstrations.
-            fewest: Number of frames needed to report a motion. Below 10, the threshold grows as
-                frames are missing.
+            fewest: Number of frames needed to report a motion. With n < 10 frames in the
+                window, the threshold is 10 / n times as high.
         """
         self.reference, self._camera = reference, reference.vector
         self.displacement = 0.0
@@ -218,7 +219,7 @@ class CameraWatch:
         self._frames: _Frames = deque()
 
     def clear(self) -> None:
-        """Forget all frames: before another episode, or after a pause."""
+        """Forget all frames. Call it before another episode and after a pause."""
         self.displacement = 0.0
         self._frames.clear()
 
@@ -233,7 +234,8 @@ class CameraWatch:
             pixel: Pixel of the marker [px].
 
         Returns:
-            The motion since the demonstrations, if it exceeds the threshold.
+            The motion since the demonstrations if its displacement exceeds the threshold, else
+            None.
 
         Raises:
             ValueError: Time or pixel are not finite, or time does not increase.
@@ -266,12 +268,12 @@ class CameraWatch:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPlacement:
-    """Episodes with the camera at one place."""
+    """Episodes recorded with one placement of the camera."""
 
     episodes: tuple[int, ...]
     """Indices into the demonstrations."""
     motion: CameraMotion
-    """Motion from the first placement."""
+    """Motion of the camera from the first placement."""
 
 
 def camera_placements(
@@ -290,8 +292,8 @@ def camera_placements(
         image_size: Width and height of the image [px].
 
     Returns:
-        One placement if the camera never moved. Episodes that hardly show the marker are in
-        none.
+        The placements: one if the camera never moved, none if fewer than two episodes show the
+        marker in ten frames. Episodes that show it less belong to no placement.
     """
     seen = {
         index: frames
@@ -336,7 +338,7 @@ def camera_placements(
 def _camera_of_episodes(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> tuple[Float[Tensor, "13"], Float[Tensor, "episodes 6"]]:
-    """Camera of the median episode, and its motion from there in each episode."""
+    """Camera of the median episode, and its motion from that pose in each episode."""
     camera, twists = fit_camera(demonstrations, image_size).camera, torch.zeros(0)
     still = torch.zeros(6, dtype=torch.float64)
     for _ in range(_REFINEMENTS):
@@ -358,7 +360,7 @@ def _camera_of_episodes(
 
 
 def _median(twists: Float[Tensor, "episodes 6"]) -> Float[Tensor, "6"]:
-    """Median of each component; the mean of the two middle ones of an even number."""
+    """Median of each component; of an even number, the mean of the two middle values."""
     return twists.quantile(0.5, dim=0)
 
 
@@ -368,12 +370,13 @@ def _explained(
     pixels: Float[Tensor, "frames 2"],
     already: Float[Tensor, "6"] | None = None,
 ) -> tuple[Float[Tensor, "6"], float]:
-    """Most plausible motion for the pixels of points, and the displacement it explains, rms
-    [px]. `already` is the motion applied so far, which the prior includes.
+    """Most probable motion given the pixels of points, and its displacement, rms [px].
+
+    `already` is the motion applied so far; the prior applies to the sum of both.
     """
     errors = pixels - pixels_and_depth(camera, points)[0]
     size = errors.norm(dim=-1)
-    # At least a tenth of a pixel, so that not all frames of exact images are outliers.
+    # At least a tenth of a pixel: otherwise all frames of exact images would be outliers.
     most = (_OUTLIER * size.quantile(0.5)).clamp(min=0.1)
     errors = errors * (most / size.clamp(min=most)).unsqueeze(-1)
     slope = motion_jacobian(camera, points)
@@ -393,14 +396,14 @@ def refined_twist(
     twist: Float[Tensor, "6"],
     steps: int = _REFINEMENTS,
 ) -> Float[Tensor, "6"]:
-    """Camera motion [rad, m] by Gauss-Newton, also for large motions."""
+    """Refine a camera motion [rad, m] by Gauss-Newton steps; also valid for large motions."""
     for _ in range(steps):
         step, _ = _explained(camera, from_moved(points, twist), pixels, twist)
-        # In the frame of the camera as moved so far.
+        # The step is in the frame of the camera as moved so far.
         turn = quaternion.exp(twist[:3])
         both = quaternion.log(quaternion.multiply(turn, quaternion.exp(step[:3])))
         twist = torch.cat([both, twist[3:] + quaternion.rotate(turn, step[3:])])
-        # Two contradictory frames would place both points behind the camera.
+        # Two contradictory frames would drive the camera beyond both points.
         twist = twist * (_FARTHEST * _PLAUSIBLE / twist.norm()).clamp(max=1.0)
     return twist
 
@@ -408,20 +411,20 @@ def refined_twist(
 def from_moved(
     points: Float[Tensor, "*batch 3"], twist: Float[Tensor, "6"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Points [m] in the frame of a camera that turned and moved (see `perspective.moved`)."""
+    """Points [m] transformed to the frame of the moved camera (see `perspective.moved`)."""
     return quaternion.rotate(quaternion.exp(-twist[:3]), points - twist[3:])
 
 
 def _displacement(
     camera: Float[Tensor, "13"], points: Float[Tensor, "frames 3"], twist: Float[Tensor, "6"]
 ) -> Float[Tensor, "frames 2"]:
-    """Change of the pixels of points by a motion of the camera [px]."""
+    """Change of the pixels of points due to a motion of the camera [px]."""
     after, _ = pixels_and_depth(camera, from_moved(points, twist))
     return after - pixels_and_depth(camera, points)[0]
 
 
 def _marker_point(camera: Float[Tensor, "13"], pose: Pose) -> Float[Tensor, "3"]:
-    """The marker in the camera frame [m] at one pose of the tool."""
+    """Position of the marker in the camera frame [m] at one pose of the tool."""
     one = Pose(pose.position.double()[None], pose.orientation.double()[None])
     return marker_points(camera, one)[0]
 
@@ -435,17 +438,17 @@ def object_height(
     places: Float[Tensor, "episodes 3"],
     pixels: Float[Tensor, "episodes 2"],
 ) -> float:
-    """Height of the horizontal plane on which objects lie, in the base frame [m].
+    """Height of the horizontal plane on which objects lie, in the camera's base frame [m].
 
-    The base frame of a fitted camera differs from the robot's by the part of the marker's
-    position on the tool that the demonstrations do not determine, so a measured height is not
-    this one. All objects have the same offset from the tool when grasped, which is found by
-    least squares on the pixels.
+    The base frame of a fitted camera is shifted from the robot's by the part of the marker's
+    position on the tool that the demonstrations do not determine. The returned height is in the
+    camera's base frame, so it differs from a height measured in the robot's. All objects have
+    the same offset from the tool when grasped; it is found by least squares on the pixels.
 
     Args:
         reference: Camera of the demonstrations.
-        places: Positions of the tool in the base frame at the grasp [m]; four or more different
-            ones.
+        places: Positions of the tool in the base frame at the grasps [m]; at least four
+            different ones.
         pixels: Pixels of the objects (u, v) before the grasp [px].
 
     Raises:
@@ -461,7 +464,7 @@ def object_height(
     for _ in range(_PLANE_STEPS):
         pixel, by_point = pixels_and_depth(camera, from_base(camera, places + offset))
         errors, jacobian = pixels - pixel, (by_point @ turn).flatten(0, 1)
-        # The pseudo-inverse: parallel views leave a direction of the offset open.
+        # The pseudo-inverse: parallel views do not determine one direction of the offset.
         offset = offset + torch.linalg.pinv(jacobian) @ errors.flatten()
     off = _root_mean_square(errors)
     if not off <= _AGREEMENT:
@@ -476,7 +479,7 @@ class CameraCorrection:
     """Estimates the motion of a camera and corrects pixels for it.
 
     Attributes:
-        motion: Motion of the camera since the demonstrations; None: no motion detected.
+        motion: Motion of the camera since the demonstrations; None if none was detected.
     """
 
     def __init__(self, reference: CameraReference):
@@ -487,7 +490,7 @@ class CameraCorrection:
         self._twist = torch.zeros(6, dtype=torch.float64)
 
     def clear(self) -> None:
-        """Prepare for another episode: the clock restarts, the camera motion is kept."""
+        """Prepare for another episode: time may restart, the camera motion is kept."""
         self._watch.clear()
         known = () if self.motion is None else self._frames
         # Frames of earlier episodes are older than any window.
@@ -497,8 +500,7 @@ class CameraCorrection:
         """Add one frame in which the marker was found; arguments as for `CameraWatch.update`.
 
         Returns:
-            The camera motion, if it is detected with this frame: the first one, and each
-            further one.
+            The camera motion if this frame reveals one, the first or a further one; else None.
         """
         point, pixel = _marker_point(self._camera, pose), pixel.double()
         corrected = self.marker(pose, pixel)
@@ -516,7 +518,7 @@ class CameraCorrection:
         if self.motion is not None and len(self._frames) < FEWEST_FRAMES:
             there = pixels_and_depth(self._camera, point[None])[0][0]
             if (pixel - there).norm() < (corrected - there).norm():
-                # The marker was wrong in the first frames: the camera has not moved.
+                # The marker was misdetected in the first frames: the camera has not moved.
                 self.motion, self._twist = None, torch.zeros_like(self._twist)
                 self._frames.clear()
             else:
@@ -553,7 +555,7 @@ class CameraCorrection:
             self._frames.popleft()
 
     def _find(self, steps: int = 5) -> float:
-        """Fit the motion to all frames; returns the error in the last window, rms [px]."""
+        """Fit the motion to all frames; returns the rms error over the last window [px]."""
         camera, (points, pixels) = self._camera, _columns(self._frames)
         self._twist = refined_twist(camera, points, pixels, self._twist, steps)
         self.motion = CameraMotion.of(camera, self._twist, points)

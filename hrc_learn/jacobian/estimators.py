@@ -1,10 +1,9 @@
 """Online estimators of the image Jacobian.
 
-`FixedEstimator` never changes the Jacobian, `PaperEstimator` follows the paper's law. The other
-estimators compare key frames: pairs of poses and images far enough apart to distinguish motion
-from noise, which `KeyFrameEstimator` selects online. Composite law and Broyden's update follow
-gradients. The Kalman filter keeps one Gaussian for both image rows, whose regressors are the
-same.
+`FixedEstimator` never changes the Jacobian; `PaperEstimator` follows the paper's law. The other
+estimators compare key frames: frames far enough apart to distinguish motion from noise, which
+`KeyFrameEstimator` selects online. The composite law and Broyden's update follow gradients. The
+Kalman filter keeps one covariance for both image rows, since they have the same regressors.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ class Measurement:
     pose: Pose
     """Pose of the tool when the image was taken."""
     feature: Float[Tensor, "*batch rows"]
-    """Image feature [px], u and v of one point or of several in turn; any value, also NaN,
-    where not `valid`."""
+    """Image feature [px], u and v of each point in turn; any value, also NaN, where not
+    `valid`."""
     valid: Bool[Tensor, "*batch"]
-    """True if the feature is visible and from an image not used before."""
+    """True if the feature is visible and its image was not used before."""
     dt: float | Float[Tensor, ""]
     """Time since the last step [s]."""
     xi_x: Float[Tensor, "*batch rows"]
@@ -49,7 +48,7 @@ class Measurement:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class WeightState:
-    """State of an estimator that consists of the weights alone."""
+    """Estimator state that consists of the weights only."""
 
     weight: Float[Tensor, "*batch entries K"]
     """W [px/m, px/rad], one matrix for each element of the batch."""
@@ -67,9 +66,9 @@ class ImageJacobianEstimator(nn.Module, ABC):
         self.network = network
 
     def initial_state(self, *batch: int) -> Any:
-        """State before the first step, for a batch of robots: the network's weights.
+        """State before the first step for a batch of robots: the network's weights.
 
-        Its tensors have the dtype and device of the network.
+        The tensors have the dtype and device of the network.
         """
         return WeightState(weight=self.initial_weight(*batch))
 
@@ -78,7 +77,7 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """State after one control step."""
 
     def restored(self, state: Any) -> Any:
-        """The state; the initial one where any number of it is not finite."""
+        """The state, replaced by the initial state where any of its numbers is not finite."""
         batch = state.weight.shape[:-2]
         numbers = [x for x in tree_leaves(state) if x.is_floating_point()]
         finite = [is_number(x.reshape(*batch, -1)).all(-1) for x in numbers]
@@ -90,8 +89,8 @@ class ImageJacobianEstimator(nn.Module, ABC):
     def resumed(self, state: Any, pause: float) -> Any:
         """State after a pause without images.
 
-        Frames before and after the pause must not be compared: the camera may have been moved
-        meanwhile.
+        Frames before and after the pause must not be compared, since the camera may have been
+        moved meanwhile.
 
         Args:
             state: State before the pause.
@@ -125,7 +124,7 @@ def evaluate(
 
 
 class FixedEstimator(ImageJacobianEstimator):
-    """Keeps the network's weights: the baseline for all other estimators."""
+    """Keeps the network's weights; the baseline for all other estimators."""
 
     def update(self, state: WeightState, measurement: Measurement) -> WeightState:
         """The same state."""
@@ -142,7 +141,7 @@ class KeyFrame:
     feature: Float[Tensor, "*batch rows"]
     """Feature at that pose [px]."""
     theta: Float[Tensor, "*batch K"]
-    """Neurons at the pose."""
+    """Activations of the neurons at the pose."""
     present: Bool[Tensor, "*batch"]
     """False until the feature is first seen."""
 
@@ -162,7 +161,7 @@ class KeyFrame:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class KeyFrameState:
-    """Weights, and the frame with which the next one is compared."""
+    """Weights, and the key frame with which the next frame is compared."""
 
     weight: Float[Tensor, "*batch entries K"]
     """W [px/m, px/rad]."""
@@ -188,9 +187,9 @@ class MotionSample:
     dr: Float[Tensor, "*batch 6"]
     """Motion of the tool with rotation scaled to metres [m]."""
     dx: Float[Tensor, "*batch rows"]
-    """Motion of the feature that the network's camera, if it has one, leaves [px]."""
+    """Motion of the feature, less that predicted by the network's camera, if any [px]."""
     theta: Float[Tensor, "*batch K"]
-    """Neurons half-way, as the mean of both ends."""
+    """Mean of the neurons' activations at both frames."""
     valid: Bool[Tensor, "*batch"]
     """True where there is a pair to learn from."""
 
@@ -204,7 +203,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
     """Base of estimators that learn from pairs of key frames."""
 
     constant: ClassVar[bool] = False
-    """True if the estimator adds constants to the Jacobian, which takes normalised neurons."""
+    """True if the estimator adds constants to the Jacobian, which needs normalised neurons."""
 
     config: Config
 
@@ -219,7 +218,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
 
         Args:
             network: Neurons and initial weights.
-            config: Choice of key frames, and settings of the estimator.
+            config: Key-frame selection and settings of the estimator.
 
         Raises:
             ValueError: The estimator needs normalised neurons, but the network's are not.
@@ -244,52 +243,53 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
 
     @abstractmethod
     def learned(self, state: Any, now: Measurement, theta: Tensor, pair: MotionSample) -> Any:
-        """State with weights that have learned from a pair, if there is one.
+        """State after learning from a pair of frames, if there is one.
 
         Args:
             state: State before.
             now: Measurement of this step.
-            theta: Neurons at its pose, (*batch, K).
+            theta: Activations of the neurons at the measured pose, (*batch, K).
             pair: Motion from the key frame.
         """
 
     def update(self, state: Any, measurement: Measurement) -> Any:
-        """State after one control step, with its weights clamped to their bound."""
+        """State after one control step, with the weights clamped to their bound."""
         theta = self.network.basis(measurement.pose)
         key, pair = self.advance(state.key, measurement, theta)
         learned = self.learned(state, measurement, theta, pair)
-        # The projection on a convex set never moves an estimate away from a truth inside it.
+        # Clamping projects on a convex set: it never moves the estimate away from a true value
+        # inside.
         return replace(learned, weight=learned.weight.clamp(-self.bound, self.bound), key=key)
 
     def along(
         self, step: Float[Tensor, "*batch rows"], pair: MotionSample
     ) -> Float[Tensor, "*batch entries 1"]:
-        """Change of the weights of a neuron by a step along the motion of a pair.
+        """Change of a neuron's weights, step dr^T, along the motion dr of a pair.
 
         Args:
-            step: Change of the motion of the feature, over the square of the motion [px/m^2].
+            step: Correction of the feature's motion, divided by a squared motion [px/m^2].
             pair: Motion from the key frame.
         """
         entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
         return entries.flatten(-2).unsqueeze(-1)
 
     def resumed(self, state: Any, pause: float) -> Any:
-        """The same weights, and no key frame."""
+        """State with the same weights and no key frame."""
         batch = state.weight.shape[:-2]
         return replace(state, key=KeyFrame.absent(self.network, *batch))
 
     def advance(
         self, key: KeyFrame, measurement: Measurement, theta: Float[Tensor, "*batch K"]
     ) -> tuple[KeyFrame, MotionSample]:
-        """Compare with the key frame, and move it here once the tool is `min_step` away.
+        """Compare with the key frame; once the tool is `min_step` away, start a new key frame.
 
-        Where the tool has moved further than `max_step`, for example while the feature was
-        lost, the key frame moves without a pair.
+        If the tool has moved further than `max_step`, for example while the feature was lost,
+        the new key frame starts without a pair.
 
         Args:
             key: Last key frame.
             measurement: Present measurement.
-            theta: Neurons at the pose of the measurement.
+            theta: Activations of the neurons at the measured pose.
         """
         config = self.config
         twist = key.pose.twist_to(measurement.pose)
@@ -308,7 +308,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
             theta=(key.theta + theta) / 2,
             valid=valid,
         )
-        # The first frame seen becomes a key frame, and so does the end of every pair.
+        # The first valid frame becomes a key frame, and so does the second frame of every pair.
         take = (moved | (measurement.valid & ~key.present)).unsqueeze(-1)
         here = KeyFrame(
             pose=Pose(
@@ -356,8 +356,8 @@ def paper_rate(
 ) -> Float[Tensor, "*batch entries K"]:
     """Rate W_dot of the paper's law.
 
-    xi_x'^T s is the outer product of xi_x and s, row by row, so d(J_s_hat)/dt =
-    -gain |theta|^2 xi_x s^T at the present pose.
+    In the law, s^T xi_x' stacks the rows of the outer product xi_x s^T, so at the present pose
+    d(J_s_hat)/dt = -gain |theta|^2 xi_x s^T.
     """
     xi_x = measurement.xi_x.unsqueeze(-1)
     s = matmul(J.mT, xi_x).squeeze(-1) + measurement.xi_r
@@ -374,7 +374,7 @@ class CompositeConfig(LearningConfig):
     prediction_gain: float = 0.5
     """Fraction of the prediction error removed by one pair, in [0, 2)."""
     noise_floor: float = 2e-3
-    """Motion at which half of that fraction is removed [m]; smaller motions are mostly
+    """Motion at which half of `prediction_gain` applies [m]; smaller motions are mostly
     noise."""
 
 
@@ -386,9 +386,9 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
 
         W <- W + gamma e (x) dr theta^T / (|theta|^2 (|dr|^2 + floor^2))
 
-    so |e| shrinks by the factor 1 - gamma |dr|^2 / (|dr|^2 + floor^2), never grows for
-    0 < gamma < 2, and pairs with little motion, mostly noise, count little. The entries of the
-    weights are bounded.
+    so e is multiplied by 1 - gamma |dr|^2 / (|dr|^2 + floor^2): |e| never grows for
+    0 < gamma < 2, and pairs with little motion, which are mostly noise, count little. The
+    entries of the weights are bounded.
     """
 
     def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
@@ -397,7 +397,7 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
     def learned(
         self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KeyFrameState:
-        """One step of dt of the paper's term, and the correction by a new pair."""
+        """State after a step dt of the paper's term and the correction by a new pair."""
         J = self.jacobian(state, now.pose)
         rate = paper_rate(J, theta, now, self.config.task_gain)
         change = now.dt * rate + self._correction(state.weight, pair)
@@ -407,8 +407,8 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
         """Normalised gradient step on the prediction error; zero without a new pair."""
         config = self.config
         motion = pair.dr.square().sum(-1) + config.noise_floor**2
-        # Normalised neurons never fade. Others do between and beyond the centres: dividing by
-        # their small activity there would change weights far too much that act elsewhere.
+        # The sum of normalised neurons is one everywhere. Other neurons fade between and beyond
+        # the centres: division by their small activity would change the weights far too much.
         least = 0.0 if self.network.normalized else 1.0
         activity = pair.theta.square().sum(-1).clamp_min(least)
         size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
@@ -421,7 +421,7 @@ class BroydenConfig(LearningConfig):
     """Step of Broyden's update."""
 
     min_step: float = 2e-3
-    """Least motion between key frames [m]; large, because the update has no noise model."""
+    """Least motion between key frames [m]; large, since the update has no noise model."""
     gain: float = 0.5
     """Fraction of the prediction error removed by one pair, in (0, 1]."""
 
@@ -429,7 +429,8 @@ class BroydenConfig(LearningConfig):
 class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     """Broyden's update,  J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997).
 
-    It applies everywhere at once: equal changes of all normalised neurons add a constant.
+    An equal change of the weights of all normalised neurons adds a constant, so one update
+    applies everywhere.
     """
 
     constant = True
@@ -440,7 +441,7 @@ class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     def learned(
         self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KeyFrameState:
-        """Update with a new pair, if there is one."""
+        """State after an update with a new pair, if there is one."""
         # dr is zero without a pair; the floor avoids 0 / 0.
         size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
@@ -449,10 +450,10 @@ class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
 
 @dataclass(frozen=True, kw_only=True)
 class KalmanConfig(LearningConfig):
-    """Prior, noise and drift."""
+    """Prior, noise and drift of the Kalman filter."""
 
     pixel_noise: float = 0.5
-    """Standard deviation of the measured feature [px]; enters twice into each pair."""
+    """Standard deviation of the measured feature [px]; each pair contains it twice."""
     bias_std: float = 1500.0
     """Prior standard deviation of the mean Jacobian [px/m]."""
     weight_std: float = 500.0
@@ -467,14 +468,14 @@ class KalmanState(KeyFrameState):
     """Mean and covariance of the weights, and the last key frame."""
 
     covariance: Float[Tensor, "*batch P P"]
-    """Covariance of either image row, in (component, neuron) order [(px/m)^2]."""
+    """Covariance of each image row, in (component, neuron) order [(px/m)^2]."""
 
 
 class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
-    """Random walk on a bias Jacobian plus the weights, observed through dx = J_s dr.
+    """Kalman filter of the weights and a drifting bias Jacobian, observed through dx = J_s dr.
 
-    With normalised neurons a bias is an equal change of all weights, so it needs no state of
-    its own, only its covariance. Both image rows have the same regressors and one covariance.
+    With normalised neurons, a bias is an equal change of all weights: it needs no state, only a
+    covariance. Both image rows have the same regressors and therefore the same covariance.
     """
 
     constant = True
@@ -482,14 +483,14 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
     first_covariance: Tensor
     """Initial covariance, (P, P)."""
     walk: Tensor
-    """Covariance of the random walk per second, (P, P)."""
+    """Covariance that the random walk adds per second, (P, P)."""
 
     def __init__(self, network: RBFImageJacobian, config: KalmanConfig | None = None):
         """Prepare the filter.
 
         Args:
-            network: Neurons and initial weights. The covariance of an offline fit is the
-                initial one of the filter.
+            network: Neurons and initial weights; also the initial covariance, if the network
+                was fitted.
             config: Prior, noise and drift.
         """
         super().__init__(network, config or KalmanConfig())
@@ -499,15 +500,15 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             bias, weight = self.config.bias_std, self.config.weight_std
             neurons = weight_covariance(network.centers, bias, weight)
             covariance = torch.block_diag(*[neurons] * 6)
-        covariance = (covariance + covariance.mT) / 2  # symmetric to the last bit
+        covariance = (covariance + covariance.mT) / 2  # exactly symmetric
         self.register_buffer("first_covariance", covariance, persistent=False)
-        # An equal drift of all neurons, independent between the six components.
+        # All neurons drift equally; the six components drift independently.
         K = len(network.centers)
         walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
         self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
 
     def initial_state(self, *batch: int) -> KalmanState:
-        """The network's weights, its posterior or the prior, and no key frame."""
+        """The network's weights with their initial covariance, and no key frame."""
         shape = self.first_covariance.shape
         return KalmanState(
             weight=self.initial_weight(*batch),
@@ -516,14 +517,14 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         )
 
     def resumed(self, state: KalmanState, pause: float) -> KalmanState:
-        """No key frame, and the drift of the pause."""
+        """State without a key frame, with the drift of the pause added to the covariance."""
         state = super().resumed(state, pause)
         return replace(state, covariance=state.covariance + pause * self.walk)
 
     def learned(
         self, state: KalmanState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KalmanState:
-        """Drift for dt, then mean and covariance conditioned on a new pair, if there is one.
+        """State after a drift for dt, conditioned on a new pair, if there is one.
 
         With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
         """
@@ -535,8 +536,7 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
         change = change.unflatten(-1, (6, -1)) * self.scale.unsqueeze(-1)  # (*batch, 2, 6, K)
         # The outer product of a vector with itself is exactly symmetric. That of the gain and
-        # P_phi is not, and forgetting amplifies the difference until the covariance is
-        # indefinite.
+        # P_phi is not: its asymmetry would grow until the covariance is indefinite.
         root = P_phi / spread.sqrt()
         return replace(
             state,

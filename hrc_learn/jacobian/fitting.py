@@ -1,11 +1,10 @@
 """Radial basis functions of the image Jacobian, and the regression of their weights.
 
-Samples are pairs of key frames of demonstrations. Their sums add up over demonstrations and
-processes, so one demonstration is in memory at a time. The paper calls each basis function a
-neuron. The weights follow from Bayesian ridge regression
+The paper calls each basis function a neuron. The weights follow from Bayesian ridge regression
 on pairs of key frames: each image row is dx = w . phi + noise with phi = dr (x) theta, a
 Gaussian prior on w and Gaussian noise. Mean and covariance of w then have a closed form in
-summed statistics.
+statistics that are summed over pairs, demonstrations and processes, so only one demonstration
+is in memory at a time.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.pytree import pytree
 
-# Least distance of outer neurons from the middle [m, rad]: with hardly any demonstrated motion
-# along a component, closer neurons could not be distinguished.
+# Least distance of outer neurons from the middle [m, rad]: along a component with hardly any
+# demonstrated motion, neurons would otherwise be too close to be distinguished.
 _LEAST_REACH = 0.05
 # Width of the neurons relative to the largest distance from the middle: wide enough to blend
 # over the whole workspace, narrow enough to distinguish its ends.
 _WIDTH_OVER_REACH = 1.5
-# Number of parts of the data, each held out in turn to measure the error on unseen data.
+# Number of folds of the data; each is held out in turn to measure the error on unseen data.
 FOLDS = 5
 
 
@@ -40,9 +39,9 @@ class KeyFrameConfig:
     """Choice of key frames, the frames that are compared."""
 
     min_step: float = 2e-4
-    """Least motion between key frames [m], rotation scaled with `rotation_scale`. Ten times the
-    noise of measured poses or more: noise shrinks the Jacobian towards zero (regression
-    dilution), at ten times by 2 %."""
+    """Least motion between key frames [m], rotation scaled with `rotation_scale`. Choose at
+    least ten times the noise of measured poses: pose noise shrinks the Jacobian towards zero
+    (regression dilution), by 2 % at ten times."""
     max_step: float = 0.05
     """Largest motion of a pair [m]; a larger one spans a gap in visibility and is left out."""
     rotation_scale: float = 0.15
@@ -96,7 +95,7 @@ class RegressionStatistics:
 @pytree
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
-    """Motion from each key frame of a demonstration to the next one, up to `max_step`."""
+    """Motion from each key frame to the next one; motions beyond `max_step` are left out."""
 
     before: Pose
     """Poses of the tool at the first frame of each pair, (pairs,)."""
@@ -146,7 +145,7 @@ class MotionSamples:
         return tree_map(lambda *parts: torch.cat(parts), MotionSamples.empty(), *motions)
 
     def thinned(self, most: int) -> MotionSamples:
-        """Evenly chosen pairs, at most `most` of them."""
+        """At most `most` pairs, evenly chosen."""
         pairs = len(self.dx)
         return self if pairs <= most else self[torch.linspace(0, pairs - 1, most).long()]
 
@@ -155,18 +154,18 @@ class MotionSamples:
         return tree_map(lambda values: values[index], self)
 
     def regressors(self, basis: Callable[[Pose], Tensor]) -> Float[Tensor, "pairs P"]:
-        """Columns phi = dr (x) theta, 6 K of them columns in (component, neuron) order [m].
+        """Regressors phi = dr (x) theta, 6 K columns in (component, neuron) order [m].
 
         Args:
-            basis: Neurons at poses, (pairs, K).
+            basis: Function from poses to activations of the neurons, (pairs, K).
         """
-        # The mean of both ends is accurate to second order, like the Jacobian half-way.
+        # The mean of both frames is accurate to second order, like the value half-way.
         theta = (basis(self.before) + basis(self.after)) / 2
         return (self.dr[:, :, None] * theta[:, None, :]).flatten(-2)
 
 
 def component_scale(like: Tensor, rotation_scale: float) -> Float[Tensor, "6"]:
-    """Metres per unit of each component of a twist: 1 per metre, `rotation_scale` per radian.
+    """Metres per unit of each component of a twist: 1 for metres, `rotation_scale` for radians.
 
     dr times the scale is in metres; a Jacobian divided by it is in px/m.
     """
@@ -218,25 +217,27 @@ def statistics_by_fold(
     demonstrations: Sequence[ImageDemonstration],
     config: KeyFrameConfig,
 ) -> list[RegressionStatistics]:
-    """Sums over each fold of the data, so that each can be held out in turn.
+    """Statistics of each fold of the data, so that each fold can be held out in turn.
 
-    Each of several processes reads a part of the demonstrations; all get all the sums.
+    In a distributed run, each process reads a part of the demonstrations, and all processes get
+    the statistics of all.
 
     Args:
-        basis: Neurons at poses, (time, neurons) float64.
-        neurons: Their number.
-        demonstrations: Read one by one.
+        basis: Function from poses to activations of the neurons, (time, neurons) float64.
+        neurons: Number of neurons.
+        demonstrations: Demonstrations, read one by one.
         config: Choice of key frames.
 
     Returns:
-        Every fifth of `recorded_parts`, from each of the first five on; some may be empty.
+        Statistics of five folds. Fold k holds the items k, k + 5, k + 10, ... of
+        `recorded_parts`; some folds may be empty.
     """
     folds = [RegressionStatistics.empty(6 * neurons) for _ in range(FOLDS)]
     with torch.no_grad():
         for i, recorded in distributed.local_items(recorded_parts(demonstrations)):
             motion, fold = recorded.motion(config), i % FOLDS
             part = RegressionStatistics.of(motion.regressors(basis), motion.dx)
-            # The first part of a fold sets its device.
+            # The first part of a fold sets the fold's device.
             folds[fold] = folds[fold] + part if folds[fold].count else part
     return [fold.over_processes() for fold in folds]
 
@@ -296,12 +297,12 @@ def paper_grid() -> Float[Tensor, "9 2"]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RBFCenters:
-    """Normalised Gaussians of selected components of the tool pose."""
+    """Normalised Gaussian neurons over selected components of the tool pose."""
 
     centers: Float[Tensor, "K n"]
-    """Centre of each neuron (row), one column an input [m, rad]."""
+    """Centre of each neuron (row), one column per input [m, rad]."""
     width: float | Float[Tensor, ""]
-    """Standard deviation of the Gaussians, one number in the same units."""
+    """Standard deviation of the Gaussians, one number for metres and radians."""
     input_indices: tuple[int, ...] = (0, 1)
     """Components of (x, y, z, rotation vector) that are inputs of the neurons."""
     reference: Float[Tensor, "4"] | None = None
@@ -309,19 +310,20 @@ class RBFCenters:
 
     @staticmethod
     def paper() -> RBFCenters:
-        """Nine over the paper's table, which see x and y (Table I)."""
+        """The paper's nine neurons, whose inputs are x and y (Table I)."""
         return RBFCenters(centers=paper_grid(), width=0.1)
 
     @staticmethod
     def around(demonstrations: Sequence[ImageDemonstration]) -> RBFCenters:
-        """Thirteen neurons about the demonstrated poses: the middle, and both ends of all axes.
+        """Thirteen neurons: one in the middle of the demonstrated poses, one at each end of the
+        six axes.
 
-        The image Jacobian of a small workspace is nearly linear in position and rotation, which
-        these represent; a grid over six inputs would need hundreds.
+        In a small workspace the image Jacobian is nearly linear in position and rotation, which
+        these neurons can represent; a grid over six inputs would need hundreds.
 
         Args:
-            demonstrations: Demonstrations, read one by one, twice. Each of several processes
-                reads a part of them.
+            demonstrations: Demonstrations, read twice, one by one. In a distributed run, each
+                process reads a part of them.
         """
         reference = _mean_orientation(demonstrations)
         low, high = _range(demonstrations, reference)
@@ -334,8 +336,9 @@ class RBFCenters:
         )
 
     def basis(self) -> Callable[[Pose], Tensor]:
-        """Function from poses (time,) to activations (time, K); differentiable in the centres
-        and the width.
+        """Function from poses (time,) to activations (time, K).
+
+        It is differentiable in the centres and the width.
         """
 
         def activation(pose: Pose) -> Tensor:
@@ -349,7 +352,7 @@ class RBFCenters:
 def pose_inputs(pose: Pose, reference: Float[Tensor, "4"] | None) -> Float[Tensor, "*batch 6"]:
     """Position [m] and rotation vector from the reference to the orientation [rad].
 
-    A rotation vector jumps at half turns: choose the reference in the middle of the tool's
+    A rotation vector jumps at 180 degrees: choose the reference in the middle of the tool's
     orientations.
     """
     if reference is None:
@@ -360,7 +363,9 @@ def pose_inputs(pose: Pose, reference: Float[Tensor, "4"] | None) -> Float[Tenso
 
 
 def _mean_orientation(demonstrations: Sequence[ImageDemonstration]) -> Float[Tensor, "4"]:
-    """Largest eigenvector of the summed outer products (Markley et al. 2007); either sign."""
+    """Mean orientation of either sign: the principal eigenvector of the summed outer products
+    of quaternions (Markley et al. 2007).
+    """
     total = torch.zeros(4, 4, dtype=torch.float64)
     for _, demonstration in distributed.local_items(demonstrations):
         orientation = demonstration.pose.orientation.double()
@@ -387,8 +392,8 @@ class ImageJacobianFitConfig(KeyFrameConfig):
     """Choice of key frames, noise and prior of a fit."""
 
     pixel_noise: float = 0.5
-    """Standard deviation of the measured feature [px]; enters twice into each difference. A
-    larger held-out error, from a network that is too coarse, replaces it."""
+    """Standard deviation of the measured feature [px]; each difference contains it twice. If
+    the network is too coarse and its held-out error larger, that error replaces it."""
     bias_std: float = 1500.0
     """Prior standard deviation of the mean Jacobian of the workspace [px/m]."""
     weight_std: float = 500.0
@@ -396,9 +401,10 @@ class ImageJacobianFitConfig(KeyFrameConfig):
 
     @classmethod
     def of_residual(cls) -> ImageJacobianFitConfig:
-        """Settings for what a fitted camera leaves: some thousandths of the image Jacobian.
+        """Settings for the residual of a fitted camera, some thousandths of the image Jacobian.
 
-        Pairs are a centimetre apart: over less, the noise of a detector exceeds the residual.
+        Key frames are a centimetre apart: for smaller motions, the noise of the marker detector
+        exceeds the residual.
         """
         return cls(pixel_noise=0.1, bias_std=5.0, weight_std=2.0, min_step=0.01)
 
@@ -413,14 +419,14 @@ class ImageJacobianFitReport:
     pairs: int
     """Number of pairs of key frames."""
     motion: float
-    """Motion of the feature, the error of predicting no motion [px]."""
+    """Motion of the feature, which is also the error of predicting no motion [px]."""
     error: float
     """Error over the fitted pairs [px]."""
     held_out_error: float
-    """Cross-validation error by demonstrations, or by fifths of a single one [px]. NaN if all
-    pairs belong to one part."""
+    """Cross-validation error over folds of demonstrations, or over fifths of a single one [px].
+    NaN if all pairs belong to one fold."""
     noise: float
-    """Standard deviation of each coordinate of dx that the posterior assumes [px]."""
+    """Standard deviation of each coordinate of dx, as assumed by the posterior [px]."""
 
 
 def weight_covariance(
@@ -430,14 +436,14 @@ def weight_covariance(
 ) -> Float[Tensor, "K K"]:
     """Prior covariance between neurons for a single entry of the Jacobian.
 
-    The entry is a bias, common to all neurons, plus a deviation of each. With normalised
-    neurons, which sum to one, that is a constant Jacobian plus a network: an observation at one
+    Each weight is a bias, common to all neurons, plus a deviation of its own. With normalised
+    neurons, which sum to one, this is a constant Jacobian plus a network: an observation at one
     place applies everywhere until other places are observed.
 
     Args:
-        centers: Centres of the neurons; give their number, dtype and device.
+        centers: Centres of the neurons; only their number, dtype and device matter.
         bias_std: Standard deviation of the bias [px/m].
-        weight_std: Standard deviation of the deviations [px/m].
+        weight_std: Standard deviation of each deviation [px/m].
     """
     K = len(centers)
     eye = torch.eye(K, dtype=centers.dtype, device=centers.device)
@@ -457,10 +463,10 @@ def fit_weights(
     precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P P"], ImageJacobianFitReport]:
-    """Fit to all folds; each in turn is held out to measure the error on unseen data.
+    """Fit to all folds; hold out each in turn to measure the error on unseen data.
 
     Args:
-        folds: Statistics of separately recorded parts of the data.
+        folds: Statistics of the folds of the data.
         precision: Prior precision (see `prior_precision`).
         config: Noise of the feature.
 
@@ -470,14 +476,14 @@ def fit_weights(
     folds = [fold for fold in folds if fold.count]
     if not folds:
         raise ValueError(
-            "no two visible key frames are within reach of each other: the feature was not "
-            "seen, or the tool moved less than min_step or more than max_step at a time."
+            "no two visible key frames form a pair: the feature was not seen, or the tool "
+            "moved less than min_step, or more than max_step between key frames."
         )
     total = reduce(add, folds)
-    noise = 2 * config.pixel_noise**2  # of a difference of two measurements
+    noise = 2 * config.pixel_noise**2  # variance of a difference of two measurements
     held_out = _held_out_square(folds, precision, noise)
-    # A network that is too coarse for the data has an error that acts as noise on the weights.
-    # Half of it, as the square sums two coordinates. (NaN, with one fold, keeps the noise.)
+    # The error of a network that is too coarse for the data acts as noise on the weights.
+    # The squared error sums two coordinates, hence the half. NaN (one fold) keeps the noise.
     noise = max(noise, held_out / 2)
     mean, covariance = solve(total, precision, noise)
     report = ImageJacobianFitReport(
@@ -495,7 +501,7 @@ def solve(
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P P"]]:
     """Posterior mean and covariance of the weights [px/m] for a zero-mean prior.
 
-    The mean has one column for each image row; both rows have one covariance.
+    The mean has one column for each image row; the covariance is the same for both rows.
 
     Args:
         statistics: Statistics of the data.
@@ -510,7 +516,7 @@ def solve(
 def _held_out_square(
     folds: Sequence[RegressionStatistics], precision: Tensor, noise: float
 ) -> float:
-    """Mean squared error over all pairs, each predicted without its own fold."""
+    """Mean squared error over all pairs, each predicted from the other folds."""
     if len(folds) == 1:
         return float("nan")
     error = 0.0

@@ -1,9 +1,9 @@
 """Held-out prediction of image motion, and evidence maximisation over neurons, noise and prior.
 
-For given neurons the weights have a closed form, and so has the probability of the demonstrated
-image motion with the weights integrated out (type-II maximum likelihood; MacKay 1992, "Bayesian
-interpolation"). L-BFGS maximises it over neurons, noise and prior; the error on held-out
-demonstrations decides when to stop.
+For given neurons, the weights have a closed form. So has the evidence: the probability of the
+demonstrated image motion with the weights integrated out (type-II maximum likelihood; MacKay
+1992, "Bayesian interpolation"). L-BFGS maximises it over neurons, noise and prior; the error on
+held-out demonstrations decides when to stop.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ class EvidenceConfig:
     rounds: int = 15
     """Largest number of rounds of L-BFGS."""
     iterations: int = 5
-    """Iterations of a round."""
+    """Iterations of L-BFGS in a round."""
     patience: int = 3
     """Rounds without a better held-out error after which to stop."""
     min_improvement: float = 1e-3
-    """Fraction by which the held-out error has to fall to count as better."""
+    """Fraction by which the held-out error must fall to count as better."""
     hold_out: int = 4
     """Every n-th demonstration is held out to decide when to stop."""
     max_samples: int = 20_000
     """Largest number of pairs per process, evenly chosen."""
     learn_centers: bool = True
-    """True if the centres are learned; width, noise and prior always are."""
+    """True if the centres are learned; width, noise and prior are always learned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class EvidenceRound:
     """Neurons, noise and prior after a round, and their errors."""
 
     evidence: float
-    """Negative log probability of the image motion, per pair."""
+    """Negative log probability of the training pairs' image motion, per pair."""
     held_out_error: float
     """Root mean square error over the pairs of held-out demonstrations [px]."""
     neurons: RBFCenters
@@ -76,10 +76,10 @@ class EvidenceRound:
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceResult:
-    """All rounds; the best one is the result."""
+    """All rounds of an evidence maximisation, and the index of the best round."""
 
     rounds: tuple[EvidenceRound, ...]
-    """Rounds; the first describes the start."""
+    """State after each round; the first entry is the state before any round."""
     best: int
     """Index of the best round."""
 
@@ -98,19 +98,19 @@ def maximize_evidence(
 ) -> EvidenceResult:
     """Learn neurons, noise and prior for a fit.
 
-    Each of several processes learns from a part of the demonstrations; all return the same
-    result.
+    In a distributed run, each process learns from a part of the demonstrations, and all
+    processes return the same result.
 
     Args:
-        demonstrations: At least `hold_out` demonstrations; read one by one.
+        demonstrations: At least `hold_out` demonstrations, read one by one.
         neurons: Initial neurons.
         config: Initial noise and prior.
         learning: Stopping rules.
         on_round: Called with the number and result of each round.
 
     Raises:
-        ValueError: There are too few demonstrations, or one of the two sets has no pair of key
-            frames.
+        ValueError: There are too few demonstrations, or the training or held-out demonstrations
+            have no pair of key frames.
     """
     config, learning = config or ImageJacobianFitConfig(), learning or EvidenceConfig()
     training, held_out = _motions(demonstrations, config, learning)
@@ -133,7 +133,7 @@ def maximize_evidence(
         try:
             optimiser.step(loss)
         except torch.linalg.LinAlgError:
-            break  # the step was too long to solve; the best round so far is the result
+            break  # a step was too long to evaluate; the best round so far is the result
         rounds.append(model.evaluate(training, held_out))
         on_round(len(rounds) - 1, rounds[-1])
         limit = (1 - learning.min_improvement) * rounds[best].held_out_error
@@ -164,7 +164,7 @@ class NegativeLogEvidence(nn.Module):
         self.log_weight = logarithm(config.weight_std)
 
     def forward(self, motion: MotionSamples) -> Float[Tensor, ""]:
-        """The value over the pairs of all processes, each of which passes its own pairs."""
+        """Value over the pairs of all processes; each process passes its own pairs."""
         total = self.statistics(motion)
         # Variance of a difference of two measurements, each with this deviation.
         noise = 2 * (2 * self.log_noise).exp()
@@ -180,19 +180,19 @@ class NegativeLogEvidence(nn.Module):
         return (misfit + volume) / total.count
 
     def statistics(self, motion: MotionSamples) -> RegressionStatistics:
-        """Sums over the pairs of all processes, for the present neurons."""
+        """Statistics of the pairs of all processes, for the present neurons."""
         phi = motion.regressors(self.neurons(attached=True).basis())
         return RegressionStatistics.of(phi, motion.dx).over_processes()
 
     def neurons(self, *, attached: bool = False) -> RBFCenters:
-        """The present neurons; `attached` to the graph, so that gradients reach them."""
+        """The present neurons; if `attached`, in the graph, so that gradients reach them."""
         centers, width = self.centers, self.log_width.exp()
         if not attached:
             centers, width = centers.detach().clone(), float(width.detach())
         return replace(self._neurons, centers=centers, width=width)
 
     def fit_config(self) -> ImageJacobianFitConfig:
-        """Present noise and prior, with the choice of key frames."""
+        """Configuration with the present noise and prior."""
         return replace(
             self._config,
             pixel_noise=float(self.log_noise.detach().exp()),
@@ -202,7 +202,7 @@ class NegativeLogEvidence(nn.Module):
 
     @torch.no_grad()
     def evaluate(self, training: MotionSamples, held_out: MotionSamples) -> EvidenceRound:
-        """Evidence of the training pairs, and the error on pairs held out."""
+        """Evidence of the training pairs, and the error on held-out pairs."""
         config = self.fit_config()
         precision = prior_precision(self.centers, config)
         noise = 2 * config.pixel_noise**2
@@ -226,7 +226,7 @@ def _motions(
     config: ImageJacobianFitConfig,
     learning: EvidenceConfig,
 ) -> tuple[MotionSamples, MotionSamples]:
-    """Training pairs of this process, and its held-out pairs."""
+    """Training pairs and held-out pairs of this process."""
     if len(demonstrations) < learning.hold_out:
         raise ValueError(
             f"every {learning.hold_out}th demonstration is held out, but there are only "
@@ -234,16 +234,16 @@ def _motions(
         )
     sets: tuple[list[MotionSamples], list[MotionSamples]] = ([], [])
     for i, demonstration in distributed.local_items(demonstrations):
-        # Numbered over all demonstrations, so that the set does not depend on the processes.
+        # Counted over all demonstrations, so that the choice does not depend on the processes.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))
     for motions in sets:
         pairs = torch.tensor(sum(len(motion.dx) for motion in motions))
         if not distributed.sum_over_processes(pairs):
             raise ValueError(
-                "no two visible key frames are within reach of each other in "
-                f"{'every ' if motions is sets[1] else 'those but every '}"
-                f"{learning.hold_out}th demonstration: there is nothing to "
+                "no two visible key frames form a pair in the "
+                f"{'held-out' if motions is sets[1] else 'training'} demonstrations "
+                f"(every {learning.hold_out}th is held out): there is nothing to "
                 f"{'judge' if motions is sets[1] else 'learn'} from."
             )
     training, held_out = (MotionSamples.joined(motions) for motions in sets)
@@ -253,14 +253,14 @@ def _motions(
 @pytree
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOutSamples:
-    """Pairs of key frames, each predicted without its fold of the data."""
+    """Pairs of key frames, each predicted from the other folds of the data."""
 
     position: Float[Tensor, "pairs 3"]
-    """Position of the tool half-way [m]."""
+    """Position of the tool half-way between the two frames [m]."""
     motion: Float[Tensor, "pairs 2"]
     """Motion of the feature [px]."""
     error: Float[Tensor, "pairs 2"]
-    """Motion less its prediction [px]."""
+    """Measured minus predicted motion [px]."""
 
     def by_cell(self, cells: int = 3) -> CellErrors:
         """Errors over a grid on the horizontal plane.
@@ -292,7 +292,7 @@ class CellErrors:
     pairs: Int[Tensor, "cells cells"]
     """Number of pairs in each cell, x first."""
     relative: Float[Tensor, "cells cells"]
-    """Root mean square error relative to that of the motion; NaN in an empty cell."""
+    """Root mean square error relative to the root mean square motion; NaN in an empty cell."""
 
 
 def cross_validate(
@@ -303,16 +303,17 @@ def cross_validate(
 ) -> HeldOutSamples:
     """Predict every pair with camera and weights fitted to the other folds of the data.
 
-    Each of several processes predicts the pairs of its own demonstrations.
+    In a distributed run, each process predicts the pairs of its own demonstrations.
 
     Args:
         demonstrations: Demonstrations that the network was fitted to.
-        network: Network just fitted.
+        network: Network as returned by `fit`, not loaded from a file.
         config: Settings of that fit.
-        image_size: Width and height of the image [px]; for a network with a camera.
+        image_size: Width and height of the image [px]; needed for a network with a camera.
 
     Raises:
-        ValueError: The network was loaded, there is only one fold, or `image_size` is missing.
+        ValueError: The network was loaded, fewer than two folds have pairs, or `image_size` is
+            missing.
     """
     report = network.report
     if report is None:
@@ -327,7 +328,7 @@ def cross_validate(
         others, left = [parts[i] for i in range(len(parts)) if i % FOLDS != fold], parts
         if network.camera is not None:
             if image_size is None:
-                raise ValueError("image_size is missing: a camera is fitted to each fold.")
+                raise ValueError("image_size is missing: cross-validation fits cameras.")
             camera = fit_camera(others, image_size).camera
             others, left = unexplained(others, camera), unexplained(parts, camera)
         total = reduce(add, statistics_by_fold(basis, K, others, config))
@@ -346,7 +347,7 @@ def _predicted(
     weights: Float[Tensor, "P 2"],
     config: ImageJacobianFitConfig,
 ) -> HeldOutSamples:
-    """Pairs of a demonstration, `left` with the feature that a camera leaves of it."""
+    """Pairs of a demonstration; `left` is the same one with the camera's residual feature."""
     motion = left.motion(config)
     return HeldOutSamples(
         position=(motion.before.position + motion.after.position) / 2,

@@ -1,6 +1,6 @@
-"""The image Jacobian: that of a camera, plus a network of radial basis functions.
+"""Image Jacobian of a fitted camera plus a network of radial basis functions.
 
-Without a camera the network is the whole image Jacobian, as in the paper.
+Without a camera, the network is the whole image Jacobian, as in the paper.
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ _UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixel
 
 
 class RBFImageJacobian(nn.Module):
-    """Estimate J_s_hat of the Jacobian from the tool's twist to the motion of its image
-    feature.
+    """Estimate J_s_hat of the image Jacobian, which maps the tool's twist to the motion of its
+    image feature.
 
         x_dot = J_s(r) r_dot,   vec(J_s_hat(r)^T) = vec(J_camera(r)^T) + W theta(r)
 
-    The first term is the image Jacobian of a camera found from demonstrations. The second, the
-    network, represents the rest: lens, misalignment and unmodelled kinematics. Without a camera
-    the first term is zero and the second is the paper's (approxNN_vec).
+    The first term is the image Jacobian of a camera fitted to demonstrations. The second term,
+    the network, represents the residual: lens, misalignment and unmodelled kinematics. Without
+    a camera, the first term is zero and the second is the paper's (approxNN_vec).
 
     r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear, angular)
     in the base frame, *not* the derivative of the rotation vector, so J_s J is the Jacobian
-    from joint velocities to pixels per second. vec stacks columns, for J_s^T the rows of J_s.
+    from joint velocities to pixels per second. vec stacks columns: those of J_s^T are the rows
+    of J_s.
     """
 
     weight: nn.Parameter
@@ -60,12 +61,12 @@ class RBFImageJacobian(nn.Module):
     centers: Tensor
     """Centres of the neurons, (K, n), in the units of the chosen components of r."""
     width: Tensor
-    """Standard deviation of the neurons, one number in the same unit."""
+    """Standard deviation of the neurons, one number in the same units."""
     reference: Tensor | None
-    """Orientation (w, x, y, z) to which rotation is relative; None: that of the base."""
+    """Orientation (w, x, y, z) to which the rotation vector is relative; None: the base's."""
     covariance: Tensor | None
-    """Posterior covariance of one image row of W, (6 K, 6 K) in (component, neuron) order,
-    with rotation scaled to metres (`rotation_scale`); None if not fitted."""
+    """Posterior covariance of the weights of one image row, (6 K, 6 K) in (component, neuron)
+    order, with rotation scaled to metres (`rotation_scale`); None if not fitted."""
     camera: Tensor | None
     """Vector of the camera and its marker (see `perspective`), (13,); None: no camera."""
     camera_covariance: Tensor | None
@@ -85,15 +86,15 @@ class RBFImageJacobian(nn.Module):
         """Build a network with the dtype and device of `centers`.
 
         Args:
-            centers: Centre of each neuron (row), one column an input.
+            centers: Centre of each neuron (row), one column per input.
             width: Standard deviation of the neurons.
             weight: W; None: zero.
             input_indices: Components of r = (x, y, z, rotation vector) that are inputs. A
                 rotation vector jumps at half turns; prefer positions, or give a reference.
-            reference: Orientation in the middle of those expected: the last three inputs are
-                then the rotation vector from it (see `pose_inputs`).
+            reference: Orientation in the middle of the expected ones: the rotation vector of r
+                is then relative to it (see `pose_inputs`).
             normalized: Divide the neurons by their sum (see `radial_basis`).
-            camera: Camera whose image Jacobian comes first; None: none.
+            camera: Camera whose image Jacobian is the first term; None: no camera.
 
         Raises:
             ValueError: Centres and indices do not match, or the width is not positive.
@@ -127,10 +128,10 @@ class RBFImageJacobian(nn.Module):
         *,
         input_indices: Sequence[int] = (0, 1),
     ) -> RBFImageJacobian:
-        """Network that equals one guess of the image Jacobian everywhere.
+        """Network whose image Jacobian is the same initial guess everywhere.
 
         Args:
-            jacobian: J_s0 [px/m, px/rad].
+            jacobian: The guess J_s0 [px/m, px/rad].
             centers: Centres of the neurons.
             width: Standard deviation of the neurons.
             input_indices: Components of r that are inputs of the neurons.
@@ -147,7 +148,7 @@ class RBFImageJacobian(nn.Module):
         config: ImageJacobianFitConfig | None = None,
         camera: CameraFit | None = None,
     ) -> RBFImageJacobian:
-        """Fit to demonstrations, which are read one by one.
+        """Fit a network to demonstrations, which are read one by one.
 
         In a distributed run, each process reads a part of them.
 
@@ -155,8 +156,8 @@ class RBFImageJacobian(nn.Module):
             demonstrations: Demonstrations in memory, or a sequence that reads them on access.
             neurons: Neurons of the network; their centres give its dtype and device.
             config: Noise, prior and the choice of key frames.
-            camera: Camera fitted to these demonstrations; the network then learns what it
-                leaves, and the prior should be that of a residual. None: none.
+            camera: Camera fitted to these demonstrations: the network then learns the residual,
+                so choose `ImageJacobianFitConfig.of_residual`. None: no camera.
 
         Returns:
             The network, with `report` and `covariance` set; the same in all processes.
@@ -205,7 +206,7 @@ class RBFImageJacobian(nn.Module):
 
     @property
     def camera_fit(self) -> CameraFit | None:
-        """The camera with its uncertainty; None: there is none."""
+        """The camera with its uncertainty; None without a camera."""
         if self.camera is None or self.camera_covariance is None:
             return None
         return CameraFit(
@@ -239,11 +240,11 @@ class RBFImageJacobian(nn.Module):
     def uncertainty(
         self, r: Pose | Float[Tensor, "*batch 6"], rotation_scale: float = 0.15
     ) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of the columns of J_s_hat, the larger of both rows.
+        """Posterior standard deviation of each column of J_s_hat, the larger of its two rows.
 
         Args:
             r: Pose, as for `forward`.
-            rotation_scale: Scale of the fit's configuration [m/rad].
+            rotation_scale: `rotation_scale` of the fit's configuration [m/rad].
 
         Raises:
             ValueError: The network was not fitted.
@@ -329,14 +330,14 @@ def _saved_camera(saved: SavedModel) -> CameraFit | None:
 
 
 def _frames(r: Pose | Float[Tensor, "*batch 6"]) -> tuple[Pose, tuple[int, ...]]:
-    """Poses in one axis of frames, and their batch shape."""
+    """Poses flattened to one axis of frames, and their batch shape."""
     pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
     flat = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
     return flat, tuple(pose.position.shape[:-1])
 
 
 def _components(vector: Tensor, indices: tuple[int, ...]) -> Tensor:
-    """Some components; a slice where they are adjacent, which is far faster than indexing."""
+    """Some components of a vector; adjacent ones as a slice, far faster than indexing."""
     first, after = indices[0], indices[0] + len(indices)
     if indices == tuple(range(first, after)):
         return vector[..., first:after]

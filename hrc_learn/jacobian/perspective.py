@@ -1,14 +1,15 @@
-"""A pinhole camera that sees a marker on the tool, found from motion alone.
+"""A camera that sees a marker on the tool, calibrated from the tool's motion alone.
 
-Thirteen numbers describe camera and marker, as a vector c:
+A vector c of thirteen numbers describes camera and marker:
 
     log f, (u0, v0), k1, rotation vector w and shift t from base to camera, marker m on the tool
 
-A tool at position p with rotation T has its marker at x = exp(w) (p + T m) + t in the camera
-frame, which is seen at  f xi (1 + k1 |xi|^2) + (u0, v0)  with xi = (x, y) / z. Camera and
-marker are found together, so they absorb errors of the tool centre point and of the base.
+If the tool is at position p with rotation T, its marker is at x = exp(w) (p + T m) + t in the
+camera frame, and its pixel is  f xi (1 + k1 |xi|^2) + (u0, v0)  with xi = (x, y) / z. Camera
+and marker are fitted together, so they absorb errors of the tool centre point and of the base.
 
-Functions of c take any leading batch and one further axis of frames.
+Most functions of c take any leading batch axes, and poses or points with one further axis of
+frames.
 """
 
 from __future__ import annotations
@@ -30,52 +31,52 @@ from hrc_learn.jacobian.fitting import ImageDemonstration
 
 FOCAL, CENTER, RADIAL = slice(0, 1), slice(1, 3), slice(3, 4)
 ROTATION, SHIFT, MARKER = slice(4, 7), slice(7, 10), slice(10, 13)
-"""Parts of the vector of a camera and its marker."""
+"""Components of the vector c."""
 SIZE = 13
-"""Length of that vector."""
+"""Length of the vector c."""
 
-# Prior standard deviation of the logarithm of the focal length, about the image width: lenses
-# of 30 to 80 degrees are within one standard deviation.
+# Prior standard deviation of the logarithm of the focal length; its mean is the image width.
+# Fields of view of 34 to 79 degrees are within one standard deviation.
 _FOCAL_SPREAD = 0.5
-# Prior standard deviation of the principal point about the middle, relative to the image width:
-# assembled cameras are off by some tens of pixels in two thousand.
+# Prior standard deviation of the principal point from the image centre, relative to the image
+# width: in assembled cameras of two thousand pixels it is off by some tens of pixels.
 _CENTER_SPREAD = 0.02
-# Prior standard deviation of the radial coefficient: all lenses except fish eyes are within it.
+# Prior standard deviation of the radial coefficient: all lenses except fisheyes are within it.
 _RADIAL_SPREAD = 0.2
-# Prior standard deviations of a camera's orientation and place, which anything may be [rad, m],
-# and of the marker about the tool centre point [m].
+# Prior standard deviations of the camera's rotation [rad] and shift [m], so wide that any value
+# is possible, and of the marker's offset from the tool centre point [m].
 _ANY_TURN, _ANY_PLACE, _MARKER_SPREAD = 10.0, 10.0, 0.2
-# Focal lengths from which the search starts, relative to the image width.
+# Initial focal lengths of the search, relative to the image width.
 _FOCAL_STARTS = (0.6, 1.0, 1.7)
-# Least standard deviation of a pixel [px]: exact images would make all frames outliers.
+# Lower bound of the pixel noise [px]: without it, all frames of exact images would be outliers.
 _LEAST_NOISE = 0.02
 # Least depth of a point [m].
 _NEAREST = 1e-3
 _TINY = 1e-12
-# Steps of the fixed-point iteration that removes lens distortion. Each leaves a fraction
-# 2 |k1| xi^2 of the error, a tenth at the edge of a wide image.
+# Steps of the fixed-point iteration that removes lens distortion. Each step multiplies the
+# error by about 2 |k1| |xi|^2: by 0.3 at the edge of a 79-degree image with k1 = 0.2.
 _LENS_STEPS = 20
-# Approximate number of frames fitted to: the noise averages out well before.
+# Approximate number of frames used: fewer already average out the noise.
 _FRAMES = 2000
-# Rounds of robust weights, and steps in each.
+# Rounds of robust reweighting, and Levenberg-Marquardt steps in each round.
 _ROUNDS, _STEPS = 8, 6
-# The first search: its frames, its rounds of steps, and the cameras that go on from it.
+# Initial search: number of frames, number of rounds, and number of best cameras refined after.
 _FEW_FRAMES, _SEARCHES, _FINALISTS = 100, 5, 3
-# Least depth of all frames at the start of the search [m].
+# Least depth of the marker in any frame, for the initial cameras of the search [m].
 _CLEAR = 0.2
-# Residual, in robust standard deviations, beyond which a frame counts less.
+# Residual beyond which a frame counts less, in robust standard deviations.
 _OUTLIER = 2.5
-# Steps of a bundle adjustment: it settles within twenty.
+# Steps of a bundle adjustment; twenty are enough to converge.
 _ADJUSTMENTS = 30
-# Frames in a row whose errors are summed to measure how far neighbours share their errors.
+# Length of the blocks of consecutive frames whose summed errors reveal their correlation.
 _BLOCK = 25
 
 
 def pixels_and_depth(
     camera: Float[Tensor, "*batch 13"], points: Float[Tensor, "*batch frames 3"]
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 3"]]:
-    """Pixels of points of the camera frame [px], and their derivatives by the points [px/m]."""
-    # Points behind the camera are never a solution: keep them far off, yet finite.
+    """Pixels of points in the camera frame [px], and their derivatives by the points [px/m]."""
+    # Points behind the camera are wrong: their pixels get far off, yet finite.
     z = points[..., 2:].clamp_min(_NEAREST)
     xi = points[..., :2] / z
     focal, radial = camera[..., None, FOCAL].exp(), camera[..., None, RADIAL]
@@ -91,7 +92,7 @@ def pixels_and_depth(
 def marker_points(
     camera: Float[Tensor, "*batch 13"], pose: Pose
 ) -> Float[Tensor, "*batch frames 3"]:
-    """The marker in the camera frame [m] at poses of the tool."""
+    """Positions of the marker in the camera frame [m] at poses of the tool."""
     lever = quaternion.rotate(pose.orientation, camera[..., None, MARKER])
     return from_base(camera, pose.position + lever)
 
@@ -99,7 +100,7 @@ def marker_points(
 def from_base(
     camera: Float[Tensor, "*batch 13"], points: Float[Tensor, "*batch frames 3"]
 ) -> Float[Tensor, "*batch frames 3"]:
-    """Points of the base frame in the camera frame [m]."""
+    """Transform points from the base frame to the camera frame [m]."""
     turn = quaternion.exp(camera[..., None, ROTATION])
     return quaternion.rotate(turn, points) + camera[..., None, SHIFT]
 
@@ -107,7 +108,7 @@ def from_base(
 def marker_pixels(
     camera: Float[Tensor, "*batch 13"], pose: Pose
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 13"]]:
-    """Pixels of the marker [px], and their derivatives by steps (see `stepped`)."""
+    """Pixels of the marker [px], and their derivatives by a step of c (see `stepped`)."""
     points = marker_points(camera, pose)
     pixel, by_point = pixels_and_depth(camera, points)
     offset = pixel - camera[..., None, CENTER]
@@ -138,7 +139,7 @@ def camera_jacobian(
 def stepped(
     camera: Float[Tensor, "*#batch 13"], step: Float[Tensor, "*#batch 13"]
 ) -> Float[Tensor, "*batch 13"]:
-    """Camera after a step: its rotation turns about the camera's axes, all else adds."""
+    """Camera after a step: the rotation is composed in the camera frame, the rest is added."""
     turn = quaternion.multiply(
         quaternion.exp(step[..., ROTATION]), quaternion.exp(camera[..., ROTATION])
     )
@@ -149,7 +150,7 @@ def stepped(
 
 
 def eye_of(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3"]:
-    """Place of the camera in the base frame [m]."""
+    """Position of the camera's optical centre in the base frame [m]."""
     back = quaternion.conjugate(quaternion.exp(camera[..., ROTATION]))
     return -quaternion.rotate(back, camera[..., SHIFT])
 
@@ -157,7 +158,7 @@ def eye_of(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3"]:
 def rays(
     camera: Float[Tensor, "*batch 13"], pixel: Float[Tensor, "*batch 2"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Directions in the base frame in which a camera sees pixels, of depth 1."""
+    """Base-frame directions of pixels, with depth 1 along the optical axis."""
     distorted = (pixel - camera[..., CENTER]) / camera[..., FOCAL].exp()
     xi = distorted
     for _ in range(_LENS_STEPS):
@@ -171,7 +172,7 @@ def on_plane(
     pixel: Float[Tensor, "*batch 2"],
     height: float | Float[Tensor, ""],
 ) -> Float[Tensor, "*batch 3"]:
-    """Points of a horizontal plane seen at pixels, in the base frame [m].
+    """Points of a horizontal plane that the camera sees at pixels, in the base frame [m].
 
     Args:
         camera: Camera.
@@ -185,7 +186,10 @@ def on_plane(
 def unexplained(
     demonstrations: Sequence[ImageDemonstration], camera: Float[Tensor, "13"]
 ) -> Sequence[ImageDemonstration]:
-    """Demonstrations whose feature is what a camera leaves of it, read on access."""
+    """Demonstrations whose feature is the residual pixel, seen minus predicted by a camera.
+
+    They are read on access.
+    """
     return LazyMap(demonstrations, partial(_left_by, camera))
 
 
@@ -201,16 +205,16 @@ class CameraFit:
     camera: Float[Tensor, "13"]
     """Most probable camera."""
     covariance: Float[Tensor, "13 13"]
-    """Covariance of a step from it (see `stepped`)."""
+    """Covariance of a step from that camera (see `stepped`)."""
     noise: float
     """Robust standard deviation of a pixel coordinate [px]."""
 
     def deviation(self, part: slice) -> float:
-        """Largest standard deviation of a part of the vector, such as `FOCAL`."""
+        """Largest standard deviation of the step among some components, such as `FOCAL`."""
         return float(self.covariance.diagonal()[part].max().clamp_min(0).sqrt())
 
     def __str__(self) -> str:
-        """Where the camera is and how it sees, in words."""
+        """Position, viewing direction, focal length and marker of the camera, as text."""
         x, y, z = eye_of(self.camera).tolist()
         matrix = quaternion.to_matrix(quaternion.exp(self.camera[ROTATION]))
         tilt = float(torch.rad2deg(torch.acos((-matrix[2, 2]).clamp(-1, 1))))
@@ -232,7 +236,8 @@ def fit_camera(
     """Fit camera and marker by robust maximum a posteriori estimation.
 
     A Levenberg-Marquardt search starts from several orientations and focal lengths.
-    Neighbouring frames share errors of calibration; their number counts accordingly.
+    Errors of neighbouring frames are correlated, so each frame counts less than an independent
+    one.
 
     Args:
         demonstrations: Demonstrations in which the tool moved, read one by one.
@@ -287,7 +292,7 @@ def fit_camera(
 
 
 def _prior(image_size: tuple[int, int]) -> tuple[Float[Tensor, "13"], Float[Tensor, "13"]]:
-    """Mean and standard deviation of a camera before any image of this size [px]."""
+    """Prior mean and standard deviation of c for an image size [px]."""
     width, height = image_size
     spread = [_FOCAL_SPREAD, *[_CENTER_SPREAD * width] * 2, _RADIAL_SPREAD]
     spread += [*[_ANY_TURN] * 3, *[_ANY_PLACE] * 3, *[_MARKER_SPREAD] * 3]
@@ -308,9 +313,9 @@ def adjust_bundle(
     complement of the points leaves ten equations for the camera (Triggs et al. 2000).
 
     Args:
-        cameras: The same camera with each of the points as its marker.
+        cameras: Copies of one camera, each with another of the points as its marker.
         pose: Poses of the link, (frames,).
-        pixel: Pixels of the points [px]; NaN: not seen.
+        pixel: Pixels of the points [px]; NaN where a point is not seen.
         image_size: Width and height of the image [px].
         reach: Error r beyond which a pixel counts less [px].
     """
@@ -352,7 +357,7 @@ def _bundle_step(
     spread: Float[Tensor, "13"],
     damping: float,
 ) -> Float[Tensor, "points 13"]:
-    """Damped Gauss-Newton step of one camera and of each point, the points eliminated."""
+    """Damped Gauss-Newton step of one camera and its points; eliminates the points first."""
     pull = -_from_prior(cameras, prior) / spread.square()
     gram = torch.einsum("pf,pfij,pfik->pjk", weight, slope, slope)
     towards = torch.einsum("pf,pfij,pfi->pj", weight, slope, error)
@@ -378,7 +383,7 @@ def _searched(
     prior: Float[Tensor, "13"],
     spread: Float[Tensor, "13"],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cameras, dampings and information after Levenberg-Marquardt steps."""
+    """Cameras, dampings and information matrices after Levenberg-Marquardt steps."""
 
     def cost_of(candidates: Tensor) -> Tensor:
         seen, _ = pixels_and_depth(candidates, marker_points(candidates, pose))
@@ -408,7 +413,7 @@ def _searched(
 
 
 def _from_prior(camera: Float[Tensor, "*batch 13"], prior: Float[Tensor, "13"]) -> Tensor:
-    """Distance from the prior mean; zero for the rotation, whose prior is flat."""
+    """Difference from the prior mean; zero for the rotation, which has no preferred value."""
     away = camera - prior
     return torch.cat([away[..., :4], 0 * away[..., ROTATION], away[..., 7:]], dim=-1)
 
@@ -416,7 +421,7 @@ def _from_prior(camera: Float[Tensor, "*batch 13"], prior: Float[Tensor, "13"]) 
 def _inflation(
     error: Float[Tensor, "starts frames 2"], noise: Float[Tensor, " starts"]
 ) -> Float[Tensor, " starts"]:
-    """Factor by which sums over neighbouring frames vary more than independent errors would."""
+    """Variance of error sums over blocks of frames, relative to that of independent errors."""
     whole = error[:, : error.shape[1] // _BLOCK * _BLOCK]
     if not whole.shape[1]:
         return torch.ones_like(noise)
@@ -427,7 +432,9 @@ def _inflation(
 def _starts(
     pose: Pose, pixel: Float[Tensor, "frames 2"], prior: Float[Tensor, "13"], width: int
 ) -> Float[Tensor, "starts 13"]:
-    """Cameras in all orientations, each at the best place for the marker at the tool."""
+    """Initial cameras in 24 orientations at three focal lengths, each with the best shift for a
+    marker at the tool centre point.
+    """
     rotations = _cube_rotations().to(pixel)
     turned, marker = quaternion.log(quaternion.from_matrix(rotations)), pixel.new_zeros(24, 3)
     starts = []
@@ -442,11 +449,12 @@ def _starts(
 def _shifts(
     point: Float[Tensor, "starts frames 3"], xi: Float[Tensor, "frames 2"]
 ) -> Float[Tensor, "starts 3"]:
-    """Shifts t with (x + t)_12 = xi (x + t)_3 by least squares, a camera in front of it all."""
+    """Least-squares shifts t of (x + t)_12 = xi (x + t)_3; all points are before the camera."""
     eye = torch.eye(2, dtype=xi.dtype).expand(len(xi), 2, 2)
     rows = torch.cat([eye, -xi[..., None]], dim=-1).reshape(-1, 3)
     right = (xi * point[..., 2:] - point[..., :2]).flatten(1)
-    # Without perspective the depth is unknown: a metre, as weak as a pixel in a thousand.
+    # Without perspective the depth is undetermined: a weak prior puts it at one metre, with a
+    # millionth of the weight of the pixels.
     depth = 1.0 - point[..., 2].mean(1)
     ridge = 1e-6 * len(xi) * torch.diag(xi.new_tensor([0.0, 0.0, 1.0]))
     towards = right @ rows + ridge.diagonal() * depth[:, None]
@@ -456,7 +464,7 @@ def _shifts(
 
 
 def _cube_rotations() -> Float[Tensor, "24 3 3"]:
-    """Rotations that map a cube to itself: no rotation is more than 63 degrees from one."""
+    """Rotations that map a cube to itself: any rotation is within 63 degrees of one of them."""
     signed = [
         torch.eye(3)[list(order)] * torch.tensor(signs)[:, None]
         for order in permutations(range(3))
@@ -468,25 +476,23 @@ def _cube_rotations() -> Float[Tensor, "24 3 3"]:
 def motion_jacobian(
     camera: Float[Tensor, "13"], points: Float[Tensor, "frames 3"]
 ) -> Float[Tensor, "frames 2 6"]:
-    """Derivative of pixels by a twist of the camera in its own frame [px/rad, px/m].
+    """Derivative of pixels by a twist of one camera in its own frame [px/rad, px/m].
 
-    Three columns of rotation, then three of translation: the interaction matrix of Espiau,
-    Chaumette and Rives (1992) for points, times the lens.
+    This is the interaction matrix of points of Espiau, Chaumette and Rives (1992), times the
+    derivative of the lens; three columns for rotation, then three for translation.
 
     Args:
         camera: Camera.
         points: Points in the camera frame [m].
     """
     _, by_point = pixels_and_depth(camera, points)
-    # For a camera that turns by w and moves by v, points move by p x w - v.
+    # If the camera turns by w and moves by v, a point p moves by p x w - v in its frame.
     turned = torch.linalg.cross(by_point, points[:, None].expand(by_point.shape))
     return torch.cat([turned, -by_point], dim=-1)
 
 
 def moved(camera: Float[Tensor, "13"], twist: Float[Tensor, "6"]) -> Float[Tensor, "13"]:
-    """The camera turned by a rotation vector [rad] about its own axes, then moved along the
-    axes it had before the turn [m].
-    """
+    """Camera turned about its own axes [rad], then moved [m] along its axes before the turn."""
     back = quaternion.exp(-twist[:3])
     turn = quaternion.log(quaternion.multiply(back, quaternion.exp(camera[ROTATION])))
     shift = quaternion.rotate(back, camera[SHIFT] - twist[3:])
@@ -496,7 +502,7 @@ def moved(camera: Float[Tensor, "13"], twist: Float[Tensor, "6"]) -> Float[Tenso
 def _sampled(
     demonstrations: Sequence[ImageDemonstration],
 ) -> tuple[Pose, Float[Tensor, "frames 2"]]:
-    """Poses and pixels of frames with a visible marker, evenly over all demonstrations."""
+    """Poses and pixels of frames with a visible marker, evenly from all demonstrations."""
     every = -(-len(demonstrations) // _FRAMES)
     each = -(-_FRAMES // len(demonstrations))
     positions, orientations, pixels = [], [], []
