@@ -17,9 +17,10 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState
 from hrc_learn.skills.person_watch import PersonWatch
 
-# Mean angular speed on a straight line, where that takes longer than the translation [rad/s].
+# Mean angular speed on a straight line whose rotation takes longer than its translation
+# [rad/s].
 _TURNING_SPEED = 0.6
-# Steps of Newton's method, which doubles the digits each time: from 1 cm to below 1e-9 m.
+# Steps of Newton's method, each of which doubles the correct digits: from 1 cm to below 1e-9 m.
 _ITERATIONS = 4
 
 
@@ -40,7 +41,7 @@ class StraightLine:
         """
         self._start, self._twist = start, start.twist_to(goal)
         distance, turn = float(self._twist[:3].norm()), float(self._twist[3:].norm())
-        # Not below 0.3 s: a short motion would need accelerations beyond the safety filter's.
+        # At least 0.3 s: the safety filter limits the accelerations that less would need.
         self.duration = max(distance / speed, turn / _TURNING_SPEED, 0.3)
 
     def at(self, time: float) -> tuple[Pose, Float[Tensor, "6"]]:
@@ -74,12 +75,12 @@ def joint_line(
 def joints_near(
     chain: SerialChain, pose: Pose, near: Float[Tensor, " joints"]
 ) -> Float[Tensor, " joints"]:
-    """Joint positions with the end effector at a pose, the nearest to given ones [rad].
+    """Joint positions with the end effector at a pose, close to given ones [rad].
 
     Args:
         chain: Kinematics of the arm.
         pose: Pose of the end effector. If it is out of reach, the result only comes closer.
-        near: Joint positions about a centimetre away [rad].
+        near: Joint positions whose end effector is about a centimetre away [rad].
     """
     q = near
     for _ in range(_ITERATIONS):
@@ -106,13 +107,13 @@ class PositionServoConfig:
 class PositionServo:
     """Tracks joint positions by velocities within the limits.
 
-    Targets that keep the limits are reached when the next one is due. Other targets are
-    tracked as `MotionFilter` does, so that a jump of the target is none of the arm.
+    Targets that keep the limits are reached when the next one is due. Others are smoothed by
+    `MotionFilter`, so that the arm does not jump when the target does.
 
     Attributes:
         config: Settings of the tracking.
         safety: State of the safety filter, with its counts of interventions.
-        limits: Limits within which targets are reached when the next one is due.
+        limits: Limits that targets have to keep to be reached in time.
     """
 
     def __init__(
@@ -130,11 +131,12 @@ class PositionServo:
             arm: Driver of the arm.
             dt: Time between targets [s].
             config: Settings of the tracking.
-            watch: Tracks people, before whom the arm slows down and waits; None: people are not
-                tracked.
+            watch: Distances from tracked people, near whom the arm slows down or waits; None:
+                people are not tracked.
 
         Raises:
-            ValueError: dt is longer than the safety filter can guarantee its limits for.
+            ValueError: dt is longer than the longest step for which the safety filter
+                guarantees its limits.
         """
         self._chain, self._arm, self._dt = chain, arm, dt
         self.config = config = config or PositionServoConfig()
@@ -146,7 +148,7 @@ class PositionServo:
                 f"targets must come within {config.safety.longest_step:g} s of each other, but "
                 f"dt is {dt:g} s: raise the rate of frames."
             )
-        # Tighter than the safety filter, which then has nothing to do.
+        # Tighter than the limits of the safety filter, which then need not intervene.
         limits, margin = chain.limits, 1.5 * config.safety.margin
         self.limits = replace(
             limits,

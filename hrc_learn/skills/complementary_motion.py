@@ -37,7 +37,7 @@ _LIMIT_MARGIN = 0.05
 _EFFORT = 0.9
 # Time after which joints that find no way back in the null space return directly [s].
 _DIRECT_RETURN_AFTER = 5.0
-# Distance of joints from their posture below which they are on it [rad].
+# Distance of the joints from the policy's posture below which they are on it [rad].
 _SAME = 1e-6
 # Distance of postures below which a policy counts as waiting for the motion [rad].
 _MET_AGAIN = 0.02
@@ -46,20 +46,20 @@ _ROUNDING = 1e-3
 
 
 class ComplementaryMotion:
-    """Joint positions with the end effector of a policy and the null space of a person.
+    """Joint positions whose end effector follows a policy, and whose null space a person.
 
-    The policy asks for joint positions, its own posture. Without a push they are handed on
-    unchanged. Pushed aside, the joints keep the end effector where the policy's posture has it,
-    within their limits and clear of obstacles: the law is `ArmLoop`, on an arm that follows
-    ideally. After the push they return to the policy's posture, or stay aside
-    (`YieldingConfig.after_push`). Where the arm, pushed aside, cannot follow, the motion waits
-    and goes on from there.
+    The policy requests joint positions, its posture. Without a push, they are passed on
+    unchanged. While a person pushes the joints aside, the end effector stays where the policy's
+    posture has it, within the joint limits and clear of obstacles: `ArmLoop` moves an ideal arm
+    that way. After the push, the joints return to the policy's posture, or stay aside
+    (`YieldingConfig.after_push`). Where the arm that was pushed aside cannot follow, the motion
+    waits, and later continues from there.
 
     Attributes:
         human: Person that pushes the arm.
-        posture: Joint positions of the policy now [rad]; None before the first step.
+        posture: Present joint positions of the policy [rad]; None before the first step.
         joints: Joint positions commanded instead [rad].
-        offset_velocity: Rate of change of their difference [rad/s].
+        offset_velocity: Rate of change of `offset` [rad/s].
     """
 
     posture: Float[Tensor, " joints"] | None
@@ -82,8 +82,8 @@ class ComplementaryMotion:
             dt: Time between two steps [s].
             limits: Limits within which the arm follows the positions exactly.
             config: Response of the null space to a push.
-            clearance: Distance of the arm from itself and its surroundings; None: a push can
-                move it anywhere within its limits.
+            clearance: Distance of the arm at given joint positions from itself and its
+                surroundings [m]; None: a push can move the arm anywhere within its limits.
         """
         self._chain, self.human, self._dt = chain, human, dt
         self._steps = max(1, math.ceil(dt / _STEP - 1e-9))
@@ -94,10 +94,10 @@ class ComplementaryMotion:
             dt=dt / self._steps,
             command_delay=0.0,
             limit_margin=_LIMIT_MARGIN,
-            # The policy cannot be made to go back.
+            # The motion of a policy cannot be retraced.
             back_after=math.inf,
             direct_return_after=_DIRECT_RETURN_AFTER,
-            # The policy may use all of its limits.
+            # The policy may use the whole range within the limits.
             safety=SafetyConfig(
                 margin=0.0, velocity_margin=0.0, braking=_EFFORT, tcp_speed=math.inf
             ),
@@ -106,7 +106,7 @@ class ComplementaryMotion:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew, without a push, at the next step."""
+        """Start again without a push at the next step."""
         still = torch.zeros(len(self._chain.joint_names), dtype=torch.float64)
         self._feedback = PersonFeedback(self._chain)
         self.posture = self.joints = None
@@ -119,7 +119,7 @@ class ComplementaryMotion:
 
     @property
     def nullspace_input(self) -> Float[np.ndarray, " joints"]:
-        """Push of the person, without jumps [N m]."""
+        """Push of the person, smoothed [N m]."""
         return (self._loop.config.damping * self._state.null_velocity).numpy()
 
     @property
@@ -140,9 +140,9 @@ class ComplementaryMotion:
         """Joint positions to be reached when the next step is due.
 
         Args:
-            state: Newest reading of the arm, for the person.
-            wish: Joint positions of the policy at that time [rad].
-            width: Opening of the gripper at that time [m]; it waits with the motion.
+            state: Newest reading of the arm, passed on to the person.
+            wish: Joint positions of the policy for that time [rad].
+            width: Gripper opening of the policy for that time [m]; it waits with the motion.
 
         Returns:
             Joint positions [rad] and opening of the gripper [m].
@@ -183,7 +183,7 @@ class ComplementaryMotion:
         self._wishes.append((wish, width))
 
     def _go_on(self, steps: float) -> None:
-        """Go on by so many steps of the policy."""
+        """Advance by a number of steps of the policy."""
         self._progress += steps
         while self._progress >= 1.0 and len(self._wishes) > 1:
             self._wishes.popleft()
@@ -192,7 +192,7 @@ class ComplementaryMotion:
             self._progress = 0.0
 
     def _wished(self, ahead: float = 0.0) -> tuple[Float[Tensor, " joints"], float]:
-        """Posture and gripper opening some steps of the policy from now."""
+        """Posture and gripper opening of the policy, some of its steps from now."""
         at = self._progress + ahead
         k = min(int(at), len(self._wishes) - 1)
         joints, width = self._wishes[k]
@@ -201,7 +201,7 @@ class ComplementaryMotion:
         return joints, width
 
     def _yield(self, push: Float[Tensor, " joints"]) -> None:
-        """One step in which the joints leave, or are off, the policy's posture."""
+        """Take a step in which the joints leave the policy's posture or are already off it."""
         joints, state = self.joints, self._state
         assert joints is not None  # set by the first step
         request = self._request()
@@ -228,7 +228,7 @@ class ComplementaryMotion:
             (self._wishes, self._progress), q = queue, joints
             state = self._stopped(state)
         if state.path.direct_return.blocked:
-            # Tried again later: until then the person can push the arm clear.
+            # The return is tried again later; until then the person can push the arm clear.
             direct, none = DirectReturn.none(q), torch.zeros_like(state.path.waited)
             state = replace(state, path=replace(state.path, direct_return=direct, waited=none))
         back = float((q - self._wished()[0]).abs().max()) < _SAME and not state.aside
@@ -239,7 +239,7 @@ class ComplementaryMotion:
         fractions = [k / self._steps for k in range(self._steps + 3)]
         position = torch.stack([self._wished(at)[0] for at in fractions])
         velocity = position.diff(dim=0) / self._loop.config.dt
-        # The policy's own motion, from before the queue has more than the present posture.
+        # A velocity is a difference of two postures: the last posture has none.
         position = position[:-1]
         ends = torch.stack([position[0], position[0] + 0.2 * velocity[0]])
         narrow, ahead = smallest_singular_value(self._chain, ends) < NARROW

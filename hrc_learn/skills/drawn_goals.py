@@ -26,13 +26,13 @@ class DrawnGoalsConfig:
     """Effect of a person's drawing on the goals."""
 
     rate: float = 4.0
-    """Rate at which the end effector returns over the walls of a region [1/s], equal to that of
-    the planned box. Arms with a delay of 30 ms follow it without overshoot."""
+    """Rate at which the end effector returns into a region [1/s], equal to that of the planned
+    box. Arms with a delay of 30 ms return without overshoot."""
     target_half_size: float = 0.003
-    """Half edges of the box about a drawn target [m]; equal to the height of the planned
+    """Half edges of the box around a drawn target [m]; equal to the half height of the planned
     box."""
     wall: float = 0.02
-    """Depth behind the walls of a region over which vision feedback fades in [m]: the distance
+    """Depth inside the walls of a region over which vision feedback fades in [m]: the distance
     covered at full speed, 0.25 m/s, during the delay of images and servos, 80 ms."""
     largest_turn: float = 0.5
     """Largest turn relative to the planned orientation [rad]. The marker on the end effector is
@@ -72,14 +72,14 @@ def drawn_position(
 ) -> PositionRegion:
     """Position region of the controller for a drawing.
 
-    It has the vertical walls of the drawn box, less a margin over which vision feedback fades.
-    The image shows little about height, so the box stays as flat as planned, at the planned
-    height or the nearest to it within the drawn one. A target has a small box of its own,
-    within the region.
+    Its vertical walls are those of the drawn box, moved inwards by the margin over which vision
+    feedback fades. The image shows little about height, so the region stays as flat as planned,
+    at the planned height or the nearest one within the drawn box. A target gets a small box of
+    its own, within the region.
 
     Args:
         drawing: Drawn region, target or both.
-        planned: Region without the person.
+        planned: Region without a drawing.
         config: Rate and sizes.
     """
     centre, half_size = planned.centre, planned.half_size
@@ -108,12 +108,12 @@ def vision_scale(
 ) -> float:
     """Scale of vision feedback, 0 to 1: zero at the vertical walls of a box and outside.
 
-    So a feature outside the box cannot draw the end effector out of it.
+    Thus a visual target outside the box cannot pull the end effector out of it.
 
     Args:
         box: Drawn box.
         position: Position of the end effector [m].
-        config: Depth behind the walls at which the scale reaches 1.
+        config: Settings, with the depth inside the walls from which the scale is 1.
     """
     middle, half = position.new_tensor(box.centre), position.new_tensor(box.half_size)
     behind = half[:2] - (position - middle)[:2].abs()
@@ -151,16 +151,16 @@ class DrawnGoalsState:
 
 
 class DrawnGoals:
-    """Applies a person's drawing where the arm can go there, and their turn."""
+    """Applies a person's turn, and their drawing if the arm can go there."""
 
     def __init__(
         self, config: DrawnGoalsConfig, refusal: Callable[[Pose], str] = lambda pose: ""
     ):
-        """Prepare.
+        """Set the effect of drawings, and the check of them.
 
         Args:
             config: Effect of drawings.
-            refusal: Reason why the arm cannot go to a pose; empty if it can.
+            refusal: Function that returns why the arm cannot go to a pose; empty if it can.
         """
         self._config, self._refusal = config, refusal
 
@@ -202,8 +202,8 @@ class DrawnGoals:
     ) -> tuple[Goals, DrawnGoalsState]:
         """The goals with the active drawing in place of the planned region.
 
-        Within a region, vision feedback acts (`vision_scale`); a target is approached without
-        it. A joint-space approach that ends elsewhere is left out.
+        Vision feedback acts within a region (`vision_scale`), but not on the way to a target.
+        A joint-space approach that would end elsewhere is omitted.
 
         Args:
             state: State after `read`.

@@ -4,8 +4,9 @@
       ^         |                    |
       +---------+---- start over ----+
 
-Detect and servo are the paper's approach and vision-based control; interact is time for a
-person, where a task gives it. Recoveries from failures are noted in the job:
+In servo, the arm approaches in joint space and then follows the paper's vision-based control.
+In interact, it keeps servoing while a person pulls the elbow, if the job gives time for it.
+Recoveries from failures are noted in the job:
 
 - occluded marker of the end effector: the controller holds the end effector until the marker is
   detected again; after a timeout the arm goes home and starts over;
@@ -43,21 +44,20 @@ from hrc_learn.skills.work_cell import (
 OPEN, CLOSED = 0.08, 0.0
 """Commanded gripper widths [m]: the full stroke; and zero, which squeezes the object."""
 JOINT_SPEED = 0.6
-"""Largest joint speed between postures [rad/s]: a quarter of the slowest joint's limit."""
+"""Largest joint speed between postures [rad/s]: about a quarter of the Panda's lowest limit."""
 DESCENT_SPEED = 0.08
 """Mean speed of the last centimetres down to an object [m/s]."""
 CLOSING_TIME = 0.7
 """Shortest time for the fingers to close and the grip to settle [s]."""
 INTERACT = "interact"
-"""Phase in which a person reaches under the arm."""
+"""Phase in which a person pulls the elbow aside."""
 
 Mishap = Literal[
     "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
 ]
 """Kinds of failures from which a job recovers."""
 
-# Delays and occlusions up to this do not count as a recovery [s]: a few lost images, or a
-# blink.
+# Longest delay or occlusion that does not count as a recovery [s]: a few lost images.
 _NEGLIGIBLE = 0.3
 
 # Shortest time for the fingers to open before the arm leaves [s].
@@ -65,8 +65,9 @@ _OPENING_TIME = 0.3
 # Timeout of a finger motion [s]: 3.2 s for the Franka Hand's full stroke at a quarter of its
 # speed, half a second to start, and a margin.
 _LONGEST_FINGER_MOTION = 4.0
-# The fingers have moved if the opening changed by more than the first value [m]. They rest if
-# it changes by less than a tenth of that in the second [s]. Grippers report it at 50 Hz.
+# The fingers count as moved if their opening changed by more than _FINGERS_MOVED [m], and as at
+# rest if it changes by less than a tenth of that within _FINGERS_REST [s]. Grippers report the
+# opening at 50 Hz.
 _FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
 # Distance by which the marker plate protrudes from the arm's capsules [m].
 _PLATE_CLEARANCE = 0.06
@@ -77,10 +78,11 @@ _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
 UNMARKED = CameraConfig(pixel_noise=0.4, bump=6.0)
-"""Features of a tool without markers are found less exactly than corners of a marker: with this
-noise the predicted error above the object is that which they cause (bench_markerless.py)."""
-# Fractions of the height of a probe that are tried, and distance from joint limits there [rad]:
-# nearer to one the arm is slow.
+"""Settings for a tool without markers, whose features are found less exactly than the corners
+of a marker. With this noise, the predicted error above the object agrees with the true one
+(bench_markerless.py)."""
+# Fractions of the probe height to try, and required distance of the joints from their limits
+# [rad]: the arm is slow close to a limit.
 _PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
 # Uncertainty of the table height before and after the fingers touch it [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
@@ -102,9 +104,9 @@ class GraspingConfig:
     detection_timeout: float = 5.0
     """Give up after an object is undetected for this long [s]."""
     lift: float = 0.20
-    """Height by which an object is lifted [m]; lower in proportion for a smaller hand."""
+    """Height by which an object is lifted [m], for the Franka hand; scaled to other hands."""
     attempts: int = 3
-    """Largest number of grasps."""
+    """Largest number of starts, including those that end before the fingers close."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +128,7 @@ class GraspJob:
     item: GraspObject
     """Object to grasp."""
     time_for_person: float = 0.0
-    """Time to keep servoing while a person reaches under the arm [s]."""
+    """Time to keep servoing while a person pulls the elbow [s]."""
     servo_time: float = float("nan")
     """Duration of the last visual servoing [s]."""
     pixel_error: float = float("nan")
@@ -162,9 +164,9 @@ class Grasping:
 
         Args:
             cell: Arm, gripper, camera and person.
-            workplace: Region above the table, and home. Its hover pose sets the orientation of
-                the end effector; the simulator's `Workplace.approached` takes it from the
-                demonstrations.
+            workplace: Hover pose above the table, region of the objects, and home. The hover
+                pose sets the orientation of the end effector; in the simulator,
+                `Workplace.approached` returns a workplace with the demonstrated orientation.
             skill: Learned image Jacobian and visual target.
             config: Settings of grasping.
             check: Function that raises if a plan must not be executed.
@@ -202,7 +204,7 @@ class Grasping:
         self.servo = VisualServo(cell, law)
 
     def grasp(self, job: GraspJob) -> None:
-        """Grasp an object and lift it, in as many attempts as are allowed.
+        """Grasp an object and lift it; start over after a failure, up to `attempts` starts.
 
         Args:
             job: Object, and record of the grasp.
@@ -239,13 +241,13 @@ class Grasping:
         job.recoveries.append(Recovery(time=self._cell.time, mishap=mishap, what=what))
 
     def _aim(self, job: GraspJob, target: ServoTarget) -> None:
-        """Bring the end effector above the object, with time for the person if there is any."""
+        """Servo to the object, then keep servoing for the time that the job gives a person."""
         self._servo(job, target)
         if job.time_for_person > 0:
             self._cell.begin_phase(INTERACT)
             self.servo.hold(target, job.time_for_person)
             job.time_for_person = 0.0
-            # A push may leave up to twice the tolerance; beyond that the target is lost.
+            # After a push, up to twice the tolerance is accepted; otherwise servo again.
             on_target = self.servo.error(target) < 2 * self._config.servo.tolerance
             target = replace(target, posture=None)
             if not on_target:
@@ -253,7 +255,7 @@ class Grasping:
         job.pixel_error = self.servo.error(target)
 
     def _servo(self, job: GraspJob, target: ServoTarget) -> None:
-        """Visual servoing to a target; an occlusion of the marker is noted."""
+        """Servo to a target, and note an occlusion of the marker as a recovery."""
         cell, start = self._cell, self._cell.time
         cell.begin_phase("servo")
         cell.tracked_markers = (self._workplace.tool_marker,)
@@ -306,10 +308,10 @@ class Grasping:
         return seen[item.marker.id]
 
     def _posture(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table with free paths from here and to home.
+        """Joint positions above the table with free paths from here and to home [rad].
 
-        Without such a posture the arm goes home first. The positions of objects on the table
-        are unknown so far, so the path avoids the whole region of the objects.
+        If there are none, the arm goes home first. The positions of objects on the table are
+        not known yet, so the path avoids the whole region of the objects.
         """
         posture = self._via(self._size * _PLATE_CLEARANCE)
         if posture is None:
@@ -318,7 +320,7 @@ class Grasping:
         return posture
 
     def _via(self, clearance: float | None) -> Float[Tensor, " joints"] | None:
-        """The first posture above the table with free paths from here and to home."""
+        """The first posture above the table with free paths from here and to home, if any."""
         here, home = self._cell.joints, self._workplace.home_joints()
         for posture in self._workplace.hover_postures():
             if self._free(here, posture, clearance) and self._free(posture, home):
@@ -368,8 +370,9 @@ class Grasping:
     def _touch_table(self, item: GraspObject) -> None:
         """Touch the table with the fingers around an object, and update the table height.
 
-        An object that is taller than expected makes the table seem higher, and is grasped at
-        the right distance below its top. Without contact, the estimate does not change.
+        If the object is taller than expected, the palm touches it and the table seems higher:
+        the object is then grasped at about the right distance below its top. Without contact,
+        the estimate does not change.
         """
         # First contact: the fingers with the table, or the palm with the top of a tall object.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
@@ -401,7 +404,7 @@ class Grasping:
         """
         self._cell.begin_phase("home")
         here, home = self._cell.joints, self._workplace.home_joints()
-        # With clearance if any path has it, else without.
+        # Paths with a clearance are tried first.
         for clearance in (self._size * _PLATE_CLEARANCE, None):
             if self._free(here, home, clearance):
                 break
@@ -452,11 +455,13 @@ class Grasping:
 
 
 def _reachable_probe(workplace: Workplace, probe: float) -> float:
-    """Height of a probe at which the arm reaches all over the objects [m].
+    """Largest height of a probe from which the arm reaches the whole region of the objects [m].
+
+    If no fraction of the wanted height allows that, the smallest one is returned.
 
     Args:
         workplace: Workplace with the region of the objects.
-        probe: Wanted height above that of servoing [m].
+        probe: Wanted height of the probe above the hover height [m].
     """
     robot, hover = workplace.robot, workplace.hover()
     _, half = workplace.object_region()
@@ -515,8 +520,8 @@ def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
 def holds(cell: WorkCell, item: GraspObject) -> bool:
     """True if the opening of the fingers matches an object held between them.
 
-    The thresholds lie midway between the object's width and the openings of closed and of open
-    fingers.
+    For the stroke of the Franka hand, the thresholds lie midway between the object's width and
+    the openings of closed and of open fingers.
     """
     half = item.half_size[0]
     return half < cell.state.gripper_width < half + OPEN / 2

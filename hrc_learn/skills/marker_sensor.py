@@ -1,4 +1,4 @@
-"""A fixed camera as a sensor of tool and objects, by markers or without; delay and loss."""
+"""Fixed camera that finds tool and objects with or without markers; delayed and lost images."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -33,7 +33,7 @@ class SeenFeature(NamedTuple):
 
 
 class FeatureSensor(ABC):
-    """Camera that finds tool and objects, by the numbers that their markers would have."""
+    """Camera that finds tool and objects, identified by marker number even without markers."""
 
     def __init__(self, camera: Camera):
         """Take images from a camera."""
@@ -45,7 +45,7 @@ class FeatureSensor(ABC):
         return self._camera.age if isinstance(self._camera, TimedCamera) else 0.0
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Take an image to be shown to people, RGB."""
+        """Take an RGB image for display."""
         return self._camera.read()
 
     @abstractmethod
@@ -86,15 +86,15 @@ class MarkerSensor(FeatureSensor):
 
 
 class LandmarkSensor(FeatureSensor):
-    """Finds tool and objects without markers, from landmarks of demonstrations."""
+    """Finds tool and objects without markers, by landmarks learned from demonstrations."""
 
     def __init__(self, camera: Camera, landmarks: Landmarks, names: Mapping[int, str]):
         """Set up the search.
 
         Args:
             camera: Source of the images.
-            landmarks: What is known of tool and objects.
-            names: Landmark of each number.
+            landmarks: Landmarks of tool and objects.
+            names: Names of the landmarks, by marker number.
         """
         super().__init__(camera)
         self._names, self._detector = names, LandmarkDetector(landmarks)
@@ -102,7 +102,7 @@ class LandmarkSensor(FeatureSensor):
         self._is_fresh = False  # searched since the last image was shown
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Take an image, with what was found since the last one drawn over it."""
+        """Take an image for display; draw the landmarks found since the last one on it."""
         image = self._camera.read().copy()
         for finding in self._found.values() if self._is_fresh else ():
             draw_finding(image, finding)
@@ -110,10 +110,10 @@ class LandmarkSensor(FeatureSensor):
         return image
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
-        """Take an image; landmarks found in it with a certain place, by number."""
+        """Take an image; return the landmarks located in it with certainty, by number."""
         wanted = [i for i in (self._names if ids is None else ids) if i in self._names]
         found = self._detector.find(self._camera.read(), [self._names[i] for i in wanted])
-        # An object is looked for before the tool comes over it, and still shown with the tool.
+        # Objects are located before the tool covers them, and still drawn while it does.
         gone = {self._names[i] for i in wanted} - set(found)
         self._found = {k: v for k, v in self._found.items() if k not in gone} | found
         self._is_fresh = True
@@ -127,13 +127,13 @@ class LandmarkSensor(FeatureSensor):
 def feature_sensor(
     camera: Camera, landmarks: Landmarks | None, tool: int, objects: Iterable[int]
 ) -> FeatureSensor:
-    """Sensor of markers, or without them if there are landmarks.
+    """Sensor of landmarks if there are any, else of markers.
 
     Args:
         camera: Source of the images.
         landmarks: Landmarks of a model fitted without markers; None: markers.
-        tool: Number of the end effector.
-        objects: Numbers of the objects; landmarks know one kind of object.
+        tool: Marker number of the end effector.
+        objects: Marker numbers of the objects; landmarks describe one kind of object only.
     """
     if landmarks is None:
         return MarkerSensor(camera, [tool, *objects])
@@ -159,7 +159,7 @@ class LatencyConfig:
 
     delay: float = 0.0
     """Time from the exposure of an image until its markers are available [s]. Markers are held
-    back until then; those of a camera with time stamps (`TimedCamera`) have its own delay."""
+    back until then; the age that a `TimedCamera` reports for its image counts towards it."""
     frame_loss: float = 0.0
     """Fraction of lost images."""
 
@@ -167,8 +167,8 @@ class LatencyConfig:
         check_settings(self, not_negative=["delay"], below_one=["frame_loss"])
 
 
-# Images closer than this are one image whose age was read from another clock; and memory of
-# joint positions, longer than any camera's delay [s].
+# Difference in time below which two images are the same one, with its age read from another
+# clock [s]. Time for which joint positions are stored, longer than any camera's delay [s].
 _SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
 
 
@@ -196,7 +196,7 @@ class DelayedDetection:
         self._joints: deque[tuple[float, np.ndarray]] = deque(maxlen=round(_REMEMBERED / dt))
 
     def image(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """An image taken now, to be shown to people; None without a camera."""
+        """An image taken now, for display; None without a camera."""
         return None if self._sensor is None else self._sensor.read()
 
     def remember(self, time: float, joints: Float[np.ndarray, " joints"]) -> None:
@@ -275,7 +275,7 @@ def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialCha
     return float(steps.max()) * dt if len(steps) else 0.0
 
 
-# Images averaged for the first pixel of a held marker: half a second.
+# Number of images averaged for the reference pixel of a held marker: those of half a second.
 _AVERAGED_IMAGES = 12
 
 
@@ -283,8 +283,8 @@ _AVERAGED_IMAGES = 12
 class MarkerConsistency:
     """Test whether a marker moves with the end effector or is half hidden.
 
-    The corners of a half-hidden marker are detected at the edge of what hides it, off by some
-    pixels. The value holds the state of the test; `updated` returns the next one.
+    The corners of a half-hidden marker are detected at the edge of the occluding object, some
+    pixels off. An instance holds the state of the test; `updated` returns the next state.
     """
 
     tolerance: float

@@ -19,17 +19,17 @@ from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
-# Time in which an arm comes to rest [s]: a joint of a Panda from 0.8 rad/s with 0.7 of its
-# acceleration, as drivers plan. Without this rule up to 7 of 60 jobs near a worker came too
-# close.
+# Time in which an arm comes to rest [s]: a joint of a Panda brakes from 0.8 rad/s with 0.7 of
+# its highest acceleration, as drivers plan. Without the speed scale that this time defines, the
+# arm came too close to a worker in up to 7 of 60 jobs.
 _COMING_TO_REST = 0.15
 
 NEAR_PEOPLE = ConstraintConfig(distance_weight=0.1)
-"""Constraint layer of an arm near people. An arm may always come to rest before them, so it
-need not leave its path: the path comes before the distance, and the arm brakes on it within the
-reaction time that the protective distance allows for. The end effector then leaves its path by
-0.5 mm, and by 6 mm if the distance comes first. The solver may stop early, as steps are not
-compiled."""
+"""Constraint layer of an arm near people. The arm can always stop, so it need not leave its
+path: the path has priority over the distance, and the arm brakes on the path within the
+reaction time that the protective distance includes. The end effector then deviates from its
+path by 0.5 mm; with priority for the distance, by 6 mm. In steps that are not compiled, the
+solver stops once it has converged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,15 +41,15 @@ class PersonWatchConfig:
     with 1 to 2 m/s^2; a hand that reaches for an object near the arm accelerates with up to
     9 m/s^2. With 3 m/s^2, 3 of 1000 jobs near such hands came too close."""
     pairs: int = 8
-    """Number of pairs of a part of the arm and a part of a person that are kept apart: the most
+    """Number of pairs (a part of the arm, a part of a person) that are kept apart: the most
     urgent ones."""
     contact: float = 0.03
-    """Observed distance below which a person may touch the arm [m], three standard deviations
-    of a tracker's noise. The arm stops, as the direction away from the person is not known;
-    where contact is allowed it only stops to approach the person."""
+    """Observed distance below which a person may already touch the arm [m]: three standard
+    deviations of a tracker's noise. The arm stops, as the direction away from the person is
+    unknown. Where contact is allowed, only the limits of lasting contacts apply."""
     fastest: float = 0.5
-    """Speed from which the arm is taken to need its full time to come to rest [m/s], for
-    the speed cap."""
+    """Speed from which the arm is assumed to need 0.15 s to come to rest [m/s], for the speed
+    cap."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
@@ -138,35 +138,36 @@ def watched_people(
 ) -> WatchedPeople:
     """Distances to keep from people, and limits of the speed near them.
 
-    The protective distance limits the speed towards people only. An arm that moves past
-    them, or makes way, approaches them as soon as they have come near; so it comes to rest
-    by the time at which they may touch any part of it, if they accelerate all the while.
-    People who recede count as at rest: a hand turns round faster than a tracker, which
-    averages over some images, can show.
+    The protective distance limits only the speed towards people. An arm that moves past people
+    or makes way for them could still move when they reach it. Therefore a speed scale brings it
+    to rest by the time at which people who keep accelerating may touch any part of it. People
+    who move away count as at rest: a hand can reverse its motion faster than a tracker, which
+    averages over several images, can show.
 
-    Where contact is allowed, the cap takes the place of the scale: by that time the arm is
-    at rest, or no faster than a contact in any direction allows.
+    Where contact is allowed, a speed cap replaces the speed scale: by that time the arm is at
+    rest, or slow enough for a contact in any direction.
 
     Args:
-        found: Distances of the arm as it is now from people as they were observed.
-        velocity: Velocities of the ends of their capsules [m/s].
+        found: Distances between the arm as it is now and people as they were observed.
+        velocity: Velocities of the ends of the people's capsules [m/s].
         age: Age of the observation [s].
-        separation: Protective distance, by which the urgency of pairs is judged.
+        separation: Settings of the protective distance, which decides how urgent a pair is.
         config: Assumptions about people.
         contact: Highest relative speeds of contacts; None: no contact is allowed.
     """
     a, rate = config.acceleration, found.person_rate(velocity)
     late = (age + separation.reaction_time)[..., None, None]
-    # Speed that people may have gained since, and gain until the arm reacts.
+    # Speed of people towards the arm, with what they may gain from the observation until the
+    # arm reacts.
     towards = (a * late - rate).clamp(min=0).flatten(-2)
     distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
-    # A contact that has begun may last, so that quasi-static limits hold.
+    # A contact that has begun may last, so the quasi-static limits apply to it.
     near, speed = found.distance < config.contact, None
     if contact is not None:
         speed = torch.where(near, contact.lasting, contact.first).flatten(-2)
         near = near & (contact.first <= 0)
     allowed = separation.allowed_speed(distance, towards, speed)
-    # Among pairs that allow no approach the nearest are the most urgent.
+    # Among pairs that allow no approach, the nearest are the most urgent.
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
     touching = near.flatten(-2).any(-1, keepdim=True)

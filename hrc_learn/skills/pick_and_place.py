@@ -4,9 +4,9 @@
       ^      |         |
       +------+---------+-- put back -> over
 
-Picking is `Grasping.grasp`, or the hand-over by a person; home to release is the placing. Each
-phase is a method that does its work and returns the next phase. Recoveries from failures are
-logged and counted, besides those of grasping:
+Picking is `Grasping.grasp`, or a hand-over by a person; home to release is the placing. Each
+phase is a method that does its work and returns the next phase. In addition to the recoveries
+of grasping, these are noted in the job:
 
 - object dropped over the table: the arm starts over from home;
 - blocked path: another height, via point or arm angle, then waiting; finally the object is put
@@ -48,8 +48,8 @@ RECEIVE, HOME, TRANSFER, RELEASE = "receive", "home", "transfer", "release"
 """Phases that other modules look up in the log."""
 RELEASE_TIME = 0.8
 """Shortest time for the fingers to open and the released object to come to rest [s]."""
-# Straight retreat along the end effector's own axis until the object is out of the fingers [m],
-# and its speed [m/s]: at the usual speed the shoulder comes near its limits.
+# Length of the straight retreat along the end effector's own axis that frees the fingers [m],
+# and its speed [m/s]: at the usual speed, the shoulder comes near its limits.
 _CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
 
 
@@ -84,9 +84,9 @@ class PickAndPlaceConfig:
     grasping: GraspingConfig = field(default_factory=GraspingConfig)
     """Settings of grasping."""
     interaction: float = 11.0
-    """Time for which the robot keeps servoing while the person reaches under its arm [s]."""
+    """Time for which the robot keeps servoing while a person pulls its elbow [s]."""
     interactions: int = 1
-    """Number of first objects at which the person has that time."""
+    """Number of objects, from the first one on, for which the person gets that time."""
     speed: float = 1.5
     """Speed of the transfer relative to the demonstration."""
     waits: int = 3
@@ -103,12 +103,12 @@ def place_along(
     Args:
         cell: Arm, gripper and person.
         plan: Plan to the goal.
-        goal: Pose of the end effector where it starts to put down, in the arm's readings.
-        lowering: Distance to go down without a contact [m].
+        goal: Pose of the end effector, as the arm reads it, from which the object is lowered.
+        lowering: Largest distance to lower the object, if there is no contact [m].
         size: Size of the hand relative to the Franka hand, to which the retreat is scaled.
 
     Returns:
-        Time at which it started to put down [s].
+        Time at which the lowering began [s].
     """
     cell.begin_phase(TRANSFER)
     cell.follow_path(plan.path)
@@ -184,7 +184,7 @@ class PickAndPlace:
 
         Args:
             orders: Objects, each with the name of its shelf.
-            before: Called with the number of each object, from 0, before its start.
+            before: Called before each object with its number, from 0.
 
         Raises:
             ValueError: There is no such shelf, or the arm cannot reach it.

@@ -61,7 +61,7 @@ class GraspObject(Protocol):
 
 @runtime_checkable
 class Workplace(Protocol):
-    """Poses of a task: table, home and shelves, known roughly, in the base frame."""
+    """Approximate poses of a task in the base frame: table, home and shelves."""
 
     @property
     def robot(self) -> Arm:
@@ -89,15 +89,18 @@ class Workplace(Protocol):
         ...
 
     def lowering(self, half_size: tuple[float, float, float]) -> float:
-        """Largest distance that an object of a half size [m] may be lowered at its release [m].
+        """Largest distance by which an object may be lowered at its release [m].
 
-        Beyond it, the gripper itself would touch the shelf.
+        Lowered further, the gripper itself would touch the shelf.
+
+        Args:
+            half_size: Half edges of the object [m].
         """
         ...
 
     @property
     def hover_turns(self) -> tuple[float, float]:
-        """Smallest and largest turn of the end effector about the vertical there [rad]."""
+        """Smallest and largest turn of the hover pose about the vertical [rad]."""
         ...
 
     def hover(self) -> Pose:
@@ -132,7 +135,11 @@ class Workplace(Protocol):
         ...
 
     def shelf(self, name: str, half_size: tuple[float, float, float] | None = None) -> Pose:
-        """Pose of the end effector at the release of an object of a half size [m] on a shelf.
+        """Pose of the end effector at the release of an object on a shelf.
+
+        Args:
+            name: Name of the shelf.
+            half_size: Half edges of the object [m]; None: those of the scene's first object.
 
         Raises:
             ValueError: There is no such shelf.
@@ -147,9 +154,11 @@ class CollisionChecker(Protocol):
     def collisions_along(
         self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> Sequence[Touch]:
-        """Contacts along a path of joint positions [rad], with an object carried along.
+        """Contacts along a path of joint positions [rad]; their times are sample indices.
 
-        Their times are indices of the samples.
+        Args:
+            path: Joint positions [rad].
+            carried: Name of the object in the gripper; None: none.
         """
         ...
 
@@ -182,9 +191,9 @@ class Plan:
 class PlaceCorrection:
     """Difference between the readings of an arm and the known pose of a place.
 
-    Errors of base, tool and encoders are nearly equal at all places in one orientation.
-    Measured once at a known place, to which a person guides the arm, they can be corrected; the
-    arm's repeatability remains.
+    Errors of base, tool and encoders are nearly equal at all places with the same orientation
+    of the tool. A person guides the arm to a known place once, and the difference measured
+    there corrects all places, except for the arm's repeatability.
     """
 
     read: Pose
@@ -208,8 +217,8 @@ class PlacingSkill:
     joint: JointDMP
     """Motion of the joints."""
     pose: PoseDMP
-    """Motion of the end effector with the arm angle, which describes the null-space posture of
-    arms that have one."""
+    """Motion of the end effector and, for arms that have one, of the arm angle: the posture in
+    the null space."""
     robot: Arm
     """Arm of the primitives."""
 
@@ -387,17 +396,17 @@ def plan_candidates(
     dt: float,
     speed: float,
 ) -> Iterator[Plan]:
-    """Candidate plans to a shelf, the learned one first; planned on demand.
+    """Candidate plans to a shelf, the learned one first; each is planned on demand.
 
-    The others end a little higher, for an object that sits low in the gripper, or start at
-    another via point or arm angle. The primitive returns to the learned pose and arm angle near
-    its goal, so the path into the shelf stays the same.
+    The others end a little higher, for an object that sits low in the gripper, or first go to
+    a via point or another arm angle near home. Near its goal, the primitive returns to the
+    learned pose and arm angle, so the path into the shelf stays the same.
 
     Args:
         goal: Pose of the end effector at the release.
         start: Present joint positions [rad].
         skill: Learned motion.
-        workplace: Workplace with the home near which the other candidates start.
+        workplace: Workplace with the home near which the via points lie.
         dt: Control step [s].
         speed: Speed relative to the demonstration.
     """

@@ -35,8 +35,9 @@ class ReceivingConfig:
     window: float = 0.3
     """Time window over which motion of a hand is detected [s]: nine images."""
     motion_threshold: float = 0.06
-    """Displacement within the window above which a hand moves, and below which a body stands
-    [m]: four times the apparent one of a hand at rest with a tracker noise of 1 cm."""
+    """Displacement within the window above which the hand counts as moving, and below which the
+    body counts as standing [m]: four times the apparent displacement of a hand at rest, with a
+    tracker noise of 1 cm."""
     noise: float = 0.012
     """Standard deviation of each coordinate of the hand [m]: tracker noise and human
     variation."""
@@ -49,7 +50,8 @@ class ReceivingConfig:
     tolerance: float = 0.06
     """Standard deviation of the meeting point at which the speed is halved [m]."""
     near: float = 0.09
-    """Largest distance of the hand from its demonstrated place at the end effector [m]."""
+    """Largest distance of the hand from its demonstrated place relative to the end effector
+    [m]."""
     still: float = 0.5
     """Time for which the hand has to be there before the fingers close [s]."""
     attempts: int = 3
@@ -75,7 +77,7 @@ class Receipt:
     attempts: int = 0
     """Number of times that the fingers closed."""
     passed_over: int = 0
-    """Number of other movements before."""
+    """Number of earlier movements that were not hand-overs."""
 
 
 class MovementWatch:
@@ -94,7 +96,7 @@ class MovementWatch:
         self.times: list[float] = []
         """Times of the images of the present movement [s]; empty: the hand rests."""
         self.hand: list[Float[np.ndarray, "3"]] = []
-        """Positions of the hand in them, middle of the capsule's axis [m]."""
+        """Positions of the hand in these images: middle of the capsule's axis [m]."""
 
     def see(self, seen: PersonObservation) -> bool:
         """Add an image; returns True if it belongs to a movement."""
@@ -222,7 +224,7 @@ class Receiving:
             goal, deviation = _end(estimate)
             scale = config.tolerance**2 / (config.tolerance**2 + deviation.square().max())
             velocity = _eased(at, velocity, goal, float(scale) * config.speed, config, dt)
-            # Wait for an arm that a person slows down.
+            # Wait for the arm if a person slows it down.
             lag = float((at - cell.pose.position).norm())
             if lag > _LARGEST_LAG:
                 velocity = velocity * 0.0
@@ -287,8 +289,8 @@ class Receiving:
         return True
 
 
-# Lag of the arm behind its command above which the command waits [m]; speed of an end effector
-# at rest [m/s].
+# Lag of the arm behind its command above which the command waits [m]; speed below which the end
+# effector counts as at rest [m/s].
 _LARGEST_LAG, _REST_SPEED = 0.04, 0.01
 
 

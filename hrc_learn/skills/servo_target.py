@@ -1,11 +1,11 @@
 """Target of visual servoing in the image, learned from demonstrations, and the goals for it.
 
-Demonstrations end with the end effector right above an object. The target is the place of the
-object's marker in the tool frame there, learned from the pixels of both markers. In a new scene
-the camera, as estimated then, turns the object's pixel into a ray; the ray meets the height
-at which the demonstrations found objects; and the end effector belongs where the object has the
-learned place. The target in the image is the pixel of the end effector's marker there, so
-errors of calibration that move both markers alike cancel.
+Demonstrations end with the end effector right above an object. The position of the object's
+marker in the tool frame at that moment is learned from the pixels of both markers. In a new
+scene, the estimated camera turns the object's pixel into a ray, which is intersected with the
+plane at the demonstrated height of objects. The end effector has to go where this point has
+the learned position in the tool frame. The target in the image is the pixel that the end
+effector's marker will have there, so calibration errors that move both markers alike cancel.
 """
 
 import math
@@ -29,13 +29,15 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 LONGEST_OFFSET = 0.4
 """Longest offset of the object's marker from the tool centre point [m]. Demonstrations at one
-place hardly show the height of the object: without this bound it could be metres."""
+place contain little information on the object's height: without this bound, the offset could
+become metres long."""
 
-# Steps of the fit of the offset, each from a closed form: perspective changes it slightly.
+# Iterations of the fit of the offset; each solves the linearised projection in closed form.
 _STEPS = 8
 # Offset from which the fit starts: below the end effector [m].
 _BELOW = (0.0, 0.0, 0.1)
-# Distance in the image along a marker's direction whose ends are followed to the table [px].
+# Half length of the segment along a marker's direction in the image whose ends are projected
+# onto the plane of the marker [px].
 _ALONG = 20.0
 
 
@@ -75,7 +77,7 @@ class VisualTarget:
             )
         offset, error = np.array(_BELOW), math.nan
         for _ in range(_STEPS):
-            # The camera sees the object as a marker on the tool.
+            # The object is treated as a marker on the tool.
             carrying = torch.cat([camera[: MARKER.start], torch.from_numpy(offset)])
             seen, slope = marker_pixels(carrying, poses)
             design = slope[..., MARKER].numpy()
@@ -127,9 +129,9 @@ class VisualTarget:
         pixel: Float[Tensor, "2"],
         above: Pose,
     ) -> float:
-        """Standard deviation of the tool's place above the object, root of both axes [m].
+        """Standard deviation of the tool's position above the object, both axes combined [m].
 
-        The image closes the loop, so what counts is the error of the target pixel.
+        The loop is closed through the image, so only the error of the target pixel counts.
 
         Args:
             cameras: Estimate of the camera.
@@ -163,8 +165,7 @@ class VisualTarget:
 def _solved(
     design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
 ) -> tuple[Float[np.ndarray, " unknowns"], float]:
-    """Least-squares solution for pixels, two equations a demonstration, and leave-one-out
-    error.
+    """Least-squares solution with two equations per demonstration, and its leave-one-out error.
 
     A solution longer than `LONGEST_OFFSET` is shortened by the smallest sufficient ridge
     penalty.
@@ -180,7 +181,7 @@ def _solved(
     low, high = 0.0, 0.0
     if too_long(0.0):
         high = float(s[0] * np.linalg.norm(along)) / LONGEST_OFFSET
-        # Bisection: the length falls with the penalty.
+        # Bisection: the length decreases as the penalty grows.
         while high - low > 1e-6 * high:
             middle = (low + high) / 2
             low, high = (middle, high) if too_long(middle) else (low, middle)
@@ -189,7 +190,7 @@ def _solved(
     if len(pixels) < 5:
         return solution, float("nan")
     residuals = pixels - (design @ solution).reshape(-1, 2)
-    # From blocks of the hat matrix, one for each demonstration (Allen 1974, PRESS).
+    # Errors of left-out demonstrations, from blocks of the hat matrix (PRESS, Allen 1974).
     hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
     own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
     press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
@@ -234,21 +235,22 @@ class VisualServoConfig:
     """Predicted error above the object below which the gripper may descend [m], one standard
     deviation in the plane; until then the end effector probes."""
     probe: float = 0.06
-    """Height from which a probe comes down to the box, which shows the camera how the marker
-    moves in height [m]."""
+    """Height above the box from which a probe descends [m]. The descent shows how the marker's
+    pixel depends on height."""
     probe_tolerance: float = 30.0
-    """Distance of the feature from the target at which a probe comes down [px]."""
+    """Distance of the feature from the target at which a probe begins its descent [px]."""
     max_probes: int = 6
     """Largest number of probes."""
     border: float = 80.0
-    """Distance of the target from the border of the image [px]; within 50 px, a marker is cut
-    off."""
+    """Smallest distance of the target from the border of the image [px]; a marker closer than
+    50 px is cut off."""
     turn_border: float = 60.0
-    """Distance of the marker from the border below which turns of the gripper wait that would
-    reduce it further [px]."""
+    """Distance of the marker from the border below which the gripper does not turn if the turn
+    would reduce the distance [px]."""
     turn_rate: float = 0.8
-    """Highest speed of a turn of the gripper for the object [rad/s]. The marker swings by 0.15
-    m per radian while the delayed camera guides it, and follows within 10 px."""
+    """Highest angular speed at which the gripper turns for the object [rad/s]. A turn moves the
+    marker by 0.15 m per radian; at this speed, and with images delayed, it stays within 10 px
+    of its target."""
     marker_tolerance: float = 1.5
     """Deviation of the marker from its predicted pixel, while the end effector is held, above
     which it counts as half hidden [px]: three times the noise of pixel and prediction."""
@@ -272,7 +274,7 @@ class VisualServoConfig:
     """Effect of a person's drawing on the goals."""
 
     def scaled(self, size: float) -> "VisualServoConfig":
-        """The same with the lengths over the table in proportion to a hand.
+        """The same settings, with the lengths above the table scaled to a hand.
 
         Args:
             size: Size of the hand relative to the Franka hand.
@@ -297,9 +299,9 @@ class VisualServoConfig:
 
         Args:
             above: Middle of the box above the table, and orientation of the end effector.
-            target: Target of the end effector's marker [px]. A target outside the image is
-                moved to the border: the motion towards it corrects the image Jacobian whose
-                error may have placed it outside.
+            target: Target of the end effector's marker [px]. A target outside the image may be
+                due to a wrong image Jacobian. It is moved to the border, and the motion towards
+                it corrects the image Jacobian.
             detected: False until the end effector's marker is first detected.
         """
         half_size = self.half_size if detected else self.acquisition_half_size
@@ -309,9 +311,9 @@ class VisualServoConfig:
             torch.from_numpy(self.within(target)),
             half_size=half_size,
         )
-        # Near the wall of a region its excess decays at 4 k_c / h^2 and k_o (alpha_o / 2)^2.
-        # With the paper's 4e-4, the arm would follow a marker that has left the image until it
-        # is stretched.
+        # Close to the wall of a region, the distance beyond it decays at the rate 4 k_c / h^2
+        # for positions and k_o (alpha_o / 2)^2 for orientations. With the paper's k_c = 4e-4,
+        # the arm would follow a marker that has left the image until it is fully stretched.
         walls = tuple(self.rate / 4 * h**2 for h in half_size)
         sharpness = 2 / self.angle
         return replace(
@@ -335,8 +337,8 @@ class ServoTarget:
     above: Pose
     """Middle of the box above the table, and orientation of the end effector."""
     posture: Float[Tensor, " joints"] | None
-    """Joint positions there, approached in joint space [rad]; None: approached by the
-    Cartesian regions."""
+    """Joint positions at `above`, approached in joint space [rad]; None: the Cartesian regions
+    guide the approach."""
     visual: VisualTarget
     """Place of the object's marker in the tool frame."""
     item: Float[np.ndarray, "2"]
@@ -350,10 +352,10 @@ class ServoTarget:
     rest: Float[Tensor, " joints"] | None = None
     """Posture to which the null space returns [rad]; None: it stays where it is."""
     raised: float = 0.0
-    """Present height above the box [m]."""
+    """Height of the goal above the box [m], for probes."""
     kept_camera: Float[Tensor, "13"] | None = None
-    """Camera of a target that stays where it is while an estimate learns; None: it follows the
-    estimate."""
+    """Camera that places the target, to keep it in place while the estimate learns; None: the
+    present estimate places it."""
 
     def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool = True) -> Goals:
         """Goals from an estimate of the camera, for the present pose of the end effector."""
@@ -366,8 +368,8 @@ class ServoTarget:
     def pixel(self, camera: Float[Tensor, "13"], pose: Pose) -> Float[np.ndarray, "2"]:
         """Target of the marker with the end effector at its present height [px].
 
-        Right above the object at any height, so that millimetres of remaining height do not
-        move the gripper sideways.
+        At any height, the target is right above the object, so that a height error of some
+        millimetres does not move the gripper sideways.
         """
         camera = camera if self.kept_camera is None else self.kept_camera
         lower_wall = float(self.above.position[2]) - self.config.half_size[2]
@@ -379,7 +381,7 @@ class ServoTarget:
     def uncertainty(
         self, cameras: CameraSpread, image_jacobian: Float[np.ndarray, "2 6"]
     ) -> float:
-        """Predicted error above the object, standard deviation in the plane [m]."""
+        """Predicted error above the object: standard deviation in the horizontal plane [m]."""
         item = torch.from_numpy(self.item)
         return self.visual.uncertainty(cameras, image_jacobian, item, self.demonstrated)
 

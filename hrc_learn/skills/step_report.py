@@ -18,10 +18,10 @@ from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reaso
 from hrc_learn.store import read_toml
 
 # Fraction of a motion above which it counts as followed: late servos and the curvature of the
-# null space leave no more of it either.
+# null space alone leave no more than this.
 _FOLLOWED = 0.97
-# Distance from a joint limit that is reported [rad]: pushes end 0.12 rad before it, by the
-# margins of the safety filter and of the task.
+# Distance from a joint limit below which it is reported [rad]. Pushes end 0.12 rad before the
+# limit, which is the margin of the safety filter plus that of the task.
 _NEAR_LIMIT = 0.15
 # Time between two updates of contacts and joint limits [s]: no device shows them faster.
 _UPDATE_EVERY = 0.1
@@ -37,7 +37,7 @@ _INTERVENTIONS: Mapping[str, Hindrance] = _TABLES["interventions"]
 
 
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
-    """Cause by which a safety filter may have reduced a motion; None: at most a delay."""
+    """Reason why a safety filter may have reduced a motion; None: it delayed it at most."""
     acted = {INTERVENTIONS[int(k)] for k in report.flags.nonzero()}
     return next(
         (hindrance for kind, hindrance in _INTERVENTIONS.items() if kind in acted), None
@@ -66,9 +66,9 @@ def contact_force(
 class PersonFeedback:
     """Feedback of each step to the person who guides an arm.
 
-    Causes that keep the arm from following the person are collected over one step. Each
-    leaves a fraction of what the causes before it have left; the product of all fractions is
-    what the arm follows.
+    Causes that keep the arm from following the person are collected over one step. Each cause
+    keeps a fraction of the motion that the previous causes have left; the arm follows the
+    product of all fractions.
     """
 
     def __init__(self, chain: SerialChain):
@@ -95,8 +95,8 @@ class PersonFeedback:
 
         Args:
             cause: Cause of the limitation.
-            kept: Fraction of the motion that it leaves, 0 to 1.
-            mention: Report the cause even if it takes nothing from the motion.
+            kept: Fraction of the motion that remains, 0 to 1.
+            mention: Report the cause even if it does not reduce the motion.
             details: Values for its text.
         """
         self._followed *= kept
@@ -105,11 +105,11 @@ class PersonFeedback:
             self._causes[cause] = before * kept, details
 
     def note_step(self, report: ArmReport, *, filtered: bool = True) -> None:
-        """Note what the loop of an arm took from a push.
+        """Note the causes for which the arm loop reduced a push.
 
         Args:
             report: Report of the step, for a single arm.
-            filtered: Note what the safety filter took as well.
+            filtered: Include the reduction by the safety filter.
         """
         self.note_limitations(report.limitations)
         if not filtered or report.null_motion is None:
@@ -119,7 +119,7 @@ class PersonFeedback:
             self.note(cause, float(fraction_kept(*report.null_motion)))
 
     def note_limitations(self, limitations: Iterable[Limitation]) -> None:
-        """Note what limits a push."""
+        """Note limitations of a push."""
         for cause, kept, joint, distance, mentioned in limitations:
             details: dict[str, Detail] = {}
             if joint is not None:
@@ -144,15 +144,15 @@ class PersonFeedback:
 
         Args:
             state: Reading of the arm.
-            jacobian: Jacobian of its end effector there; None: computed where it is needed.
+            jacobian: Jacobian of its end effector; None: computed when needed.
             pushed: True if the person asks for a motion.
             person_distance: Distance of the nearest person [m], NaN while it is not known;
                 None: people are not tracked.
             pace: Speed scale imposed on the task, 0 to 1.
             load: Object in the gripper; None: none.
-            contact_expected: True while the task feels for a contact.
+            contact_expected: True while, or shortly after, the task probes for contact.
         """
-        # A clock that is set back belongs to a simulation that begins anew.
+        # The clock jumps back if a simulation is restarted.
         if not 0 <= state.time - self._updated < _UPDATE_EVERY:
             self._update(state, jacobian)
         if load is not self._load:
@@ -227,7 +227,7 @@ def step_columns(
     report: ArmReport,
     feedback: Feedback,
 ) -> dict[str, Any]:
-    """Columns of the arm, of its loop, and of the feedback to the person.
+    """Log columns of the arm, of its loop, and of the feedback to the person.
 
     The components of "hindered" are `HINDRANCES`, those of "safety" `INTERVENTIONS`.
 
@@ -261,12 +261,13 @@ def separation_columns(
     velocity: Float[Tensor, " joints"],
     people_scale: float,
 ) -> dict[str, float]:
-    """Columns of the distance from people, and of the protective one at this speed, which is
-    zero for contacts that power and force limiting allows.
+    """Log columns of the distance from people and of the protective distance at this speed.
+
+    The protective distance is zero for contacts that power and force limiting allows.
 
     Args:
         watched: People near the arm.
-        separation: Protective distance.
+        separation: Settings of the protective distance.
         velocity: Joint velocity sent to the arm [rad/s].
         people_scale: Speed scale imposed by people, 0 to 1.
     """

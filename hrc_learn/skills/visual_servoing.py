@@ -1,7 +1,7 @@
 """Image-based visual servoing to an object with an uncalibrated camera.
 
-`ServoStep` is a pure step `(state, reading, target) -> (command, state)` round the adaptive
-controller; `VisualServo` runs it in a work cell until the marker is at its target.
+`ServoStep` is a pure step `(state, reading, target) -> (command, state)` that calls the
+adaptive controller; `VisualServo` runs it in a work cell until the marker is at its target.
 """
 
 from collections.abc import Callable
@@ -34,10 +34,10 @@ from hrc_learn.skills.visual_skill import MarkerAngle
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
-# Fractions of the probe's height, tried until its upper end is well within the image.
+# Fractions of the probe height, tried until the marker's target there is well within the image.
 _PROBE_FRACTIONS = np.array([1.0, 0.75, 0.5])
-# Predicted error above the object beyond which the gripper does not turn for it yet [m]: the
-# camera may be turned in a wholly different way.
+# Largest predicted error above the object with which the gripper turns for the object [m]: with
+# a larger one, the camera's estimated orientation may be entirely wrong.
 _LOST = 0.03
 _NOT_SEEN = np.full(2, np.nan)
 _NOT_FOUND = SeenFeature(_NOT_SEEN, np.nan)
@@ -62,7 +62,7 @@ class ServoReading:
     return_speed: float
     """Highest speed at which the null space returns to its posture [rad/s]."""
     distances: Distances | None = None
-    """Distances that the controller keeps."""
+    """Distances from people that the controller keeps; None: people are not tracked."""
 
     @property
     def effort(self) -> Float[np.ndarray, " joints"]:
@@ -86,15 +86,15 @@ class ServoState:
     camera: Float[Tensor, "13"]
     """Estimate of the camera and its marker (see `jacobian.perspective`)."""
     image_jacobian: Float[np.ndarray, "2 6"]
-    """Estimate at the pose of the newest image [px/m, px/rad]."""
+    """Estimated image Jacobian at the pose of the newest image [px/m, px/rad]."""
     chosen_turn: float | None = None
-    """Chosen turn of the present motion [rad]; None: none so far."""
+    """Turn chosen for the present target [rad]; None: none so far."""
     image_jacobian_time: float = np.nan
-    """Time of the image of that estimate [s]."""
+    """Time of the image to which `image_jacobian` belongs [s]."""
     wanted_orientation: Float[Tensor, "4"] | None = None
-    """Orientation that the newest image asks for; None: that of the target."""
+    """Orientation that suits the object in the newest image; None: the target's orientation."""
     goal_orientation: Float[Tensor, "4"] | None = None
-    """Present goal, on the way to the wanted orientation; None: that of the target."""
+    """Present goal, on the way to `wanted_orientation`; None: the target's orientation."""
     last_image: float = -np.inf
     """Time of the last image used [s]."""
     last_detection: float = -np.inf
@@ -106,7 +106,7 @@ class ServoState:
     arrived: bool = False
     """True once the joint-space approach is over."""
     held: MarkerConsistency | None = None
-    """Test of the marker against the motion of a held end effector; None: not held."""
+    """Test that the marker moves with the held end effector; None: it is not held."""
     posture_gain_scale: float = 1.0
     """Scale of the speed at which the null space returns, 0 while a person pushes it."""
 
@@ -161,8 +161,8 @@ class ServoStep:
             marker: ArUco number of the end effector's marker.
             config: Tolerances and regions.
             angle: Demonstrated turn relative to the object; None: the gripper does not turn.
-            refusal: Reason why the arm cannot go to a pose requested by a person, in words for
-                them; empty if it can.
+            refusal: Function that returns why the arm cannot go to a pose requested by a
+                person, as a text for that person; empty if it can.
 
         Raises:
             ValueError: The controller estimates no camera.
@@ -193,7 +193,8 @@ class ServoStep:
         Args:
             state: State at the end of the last motion.
             time: Present time [s].
-            motion: Motion of the arm now, as commanded by the loop that led it since.
+            motion: Present motion of the arm, from the safety filter of the loop that has moved
+                it since the last target.
         """
         controller, pause = state.controller, time - state.last_image
         if 0 < pause < np.inf:
@@ -283,7 +284,7 @@ class ServoStep:
         return float(np.linalg.norm(self.feature(reading) - pixel))
 
     def uncertainty(self, state: ServoState, target: ServoTarget) -> float:
-        """Predicted error above the object, standard deviation in the plane [m]."""
+        """Predicted error above the object: standard deviation in the horizontal plane [m]."""
         spread: CameraSpread = state.controller.estimator.spread()
         return self.tool_target(state, target).uncertainty(spread, state.image_jacobian)
 
@@ -293,7 +294,7 @@ class ServoStep:
         return float(quaternion.angle(pose.orientation, goal))
 
     def probe_height(self, state: ServoState, target: ServoTarget) -> float:
-        """Largest height of a probe with its marker well within the image [m]."""
+        """Largest height of a probe at which its marker is well within the image [m]."""
         turned = self.tool_target(state, target)
         for height in self.config.probe * _PROBE_FRACTIONS:
             up = torch.tensor([0.0, 0.0, float(height)], dtype=torch.float64)
@@ -368,7 +369,7 @@ class ServoStep:
     def _goals(
         self, state: ServoState, reading: ServoReading, target: ServoTarget
     ) -> tuple[Goals, ServoState, str]:
-        """Goals of the target, the resting posture and the drawing; and a remark."""
+        """Goals from target, resting posture and drawing; next state; message to the person."""
         target = self._oriented(state, target, state.goal_orientation)
         if state.arrived:
             # A person's pull, or a turn for the object, moves the joints far from the posture:
@@ -395,7 +396,7 @@ class ServoStep:
     def _oriented(
         self, state: ServoState, target: ServoTarget, orientation: Tensor | None
     ) -> ServoTarget:
-        """The target in an orientation, by default its own, with the turn of the person."""
+        """The target in an orientation (None: its own), turned further by the person."""
         tool = replace(target, orientation=orientation).tool_orientation
         return replace(target, orientation=quaternion.multiply(state.drawn.turn, tool))
 
@@ -426,13 +427,13 @@ class VisualServo:
             Duration [s].
 
         Raises:
-            MissedGraspError: It takes too long, the marker stays undetected, or the error above
-                the object stays too uncertain.
+            MissedGraspError: The timeout is over, the marker stays undetected, or the predicted
+                error above the object stays too large.
         """
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
         for _ in range(config.max_probes):
-            # From higher up first, while the gripper turns, unless the camera is known.
+            # Unless the camera is known well, the gripper first passes a point higher up.
             self._read()
             if self._law.uncertainty(self.state, target) > config.object_error:
                 raised = replace(target, raised=self._law.probe_height(self.state, target))
@@ -505,7 +506,10 @@ class VisualServo:
         return reached
 
     def _near(self, target: ServoTarget, tolerance: float) -> bool:
-        """True if marker and height are at the target, within pixels [px]."""
+        """True if the marker is within a tolerance [px] of its target, at the right height.
+
+        It is False while a person's drawing keeps the end effector away.
+        """
         reading = self._read()
         height = float(reading.pose.position[2] - target.above.position[2])
         at_height = abs(height - target.raised) < self._config.height_tolerance
@@ -513,7 +517,7 @@ class VisualServo:
         return at_height and on_target and not self.state.drawn.away
 
     def _step_within(self, target: ServoTarget, start: float) -> None:
-        """Step; raise if that takes too long or the marker stays undetected."""
+        """Take a step; raise if the timeout is over or the marker stays undetected."""
         if self._law.out_of_view(self.state, self._cell.time):
             self.state = replace(self.state, detected=False)
         self._step(target)
@@ -548,7 +552,7 @@ class VisualServo:
             self._override_time += cell.task_time - clock
 
     def _read(self) -> ServoReading:
-        """Present reading of the cell; the state follows its newest image."""
+        """Present reading of the cell; also updates the state from the newest image."""
         cell = self._cell
         reading = ServoReading(
             time=cell.time,
@@ -565,5 +569,5 @@ class VisualServo:
 
     @property
     def _clock(self) -> float:
-        """Time of the task without that guided by a person [s]."""
+        """Task time, without the time in which a person guided the end effector [s]."""
         return self._cell.task_time - self._override_time

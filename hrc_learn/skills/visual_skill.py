@@ -27,17 +27,18 @@ ANGLE_FEATURE = "observation.marker_angle"
 """Dataset column with the directions of both markers in the image [rad]."""
 ANGLE_FEATURE_NAMES = ("tool", "object")
 HALF_TURN = math.pi
-"""Period of the turn of a parallel grasp [rad]."""
+"""Turn after which a parallel gripper grasps an object in the same way [rad]."""
 
-# Distance from the range within which a chosen turn is kept [rad]: the error of its estimate
+# Distance outside the range up to which a chosen turn is kept [rad]: the error of its estimate
 # while the camera is uncertain.
 _KEPT = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerAngle:
-    """Demonstrated turn of the end effector relative to the object's marker; the fields are
-    those of its file.
+    """Demonstrated turn of the end effector relative to the object's marker.
+
+    The JSON file of `save` has the same fields.
     """
 
     version: Literal[2] = 2
@@ -88,11 +89,11 @@ class MarkerAngle:
             heading: Heading of the object's marker (see `object_heading`) [rad].
             reference: Orientation of a tool that is not turned.
             now: Present turn of the tool [rad].
-            turn_range: Smallest and largest turn [rad]. Of turns that differ by half turns, the
-                nearest one in the range is chosen, and kept while it is not far out of the
-                range: near an end of the range, noise would otherwise turn the tool back and
-                forth.
-            chosen: Turn chosen before; None: none.
+            turn_range: Smallest and largest turn [rad]. Among the turns that differ by half
+                turns, the one in the range that is nearest to `now` is chosen. It is kept until
+                it is well outside the range: otherwise noise would turn the tool back and forth
+                near an end of the range.
+            chosen: Turn chosen before [rad]; None: none.
         """
         turn, (low, high) = heading + self.offset_rad - _heading(reference), turn_range
         candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
@@ -109,7 +110,7 @@ class MarkerAngle:
 
     @classmethod
     def load(cls, path: Path) -> "MarkerAngle":
-        """Read a saved direction.
+        """Read a saved turn.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -135,13 +136,14 @@ class VisualServoSkill:
     approach: Approach | None = None
     """Approach direction; None if the demonstrations show no object."""
     angle: MarkerAngle | None = None
-    """Marker direction; None if it was not recorded: the gripper does not turn."""
+    """Demonstrated turn of the gripper; None if marker directions were not recorded, so that
+    the gripper does not turn."""
     learned: EvidenceResult | None = None
-    """Learning of RBF centres, noise and prior; None if they were given."""
+    """Learned RBF centres, noise and prior; None if they were given."""
     landmarks: Landmarks | None = None
-    """Landmarks of tool and objects; None: they carry markers."""
+    """Landmarks of tool and objects; None if they carry markers."""
     cells: CellErrors | None = None
-    """Held-out errors by cell of a grid; None for a loaded skill."""
+    """Held-out errors of each cell of a grid; None for a loaded skill."""
 
     def save(self, folder: Path) -> None:
         """Write the image Jacobian, and whatever else was learned with it."""

@@ -45,17 +45,17 @@ from hrc_learn.skills.step_report import (
     step_columns,
 )
 
-# Time for joints to return at the end of a path [s].
+# Longest time for the joints to return at the end of a path [s].
 _LONGEST_RETURN = 5.0
 # Time at the end of a straight line for the pose error to decay by pose_gain [s].
 _SETTLING_TIME = 0.4
-# Time for which a straight line waits for an end effector that lags behind [s]. A goal out of
-# reach must not be waited for without end.
+# Longest total delay of a straight line that waits for a lagging end effector [s]: the goal may
+# be out of reach.
 _LONGEST_LAG = 5.0
-# Torque readings that are averaged, and steps in which an arm gets under way against friction.
+# Number of torque readings that are averaged, and of steps until the arm has overcome friction.
 _AVERAGED, _GETTING_UNDER_WAY = 5, 25
-# Time after feeling for a contact in which one is still expected: the fingers open and the
-# gripper leaves. Time in which an arm that is stopped comes to rest [s].
+# Time after a search for contact in which contacts are still expected [s]: the fingers open and
+# the gripper leaves. Longest time for a stopped arm to come to rest [s].
 _LEAVING, _COMING_TO_REST = 1.0, 1.0
 _STILL = torch.zeros(6, dtype=torch.float64)
 
@@ -101,8 +101,8 @@ class WorkCell:
     """Control loop of a work cell: read, command, let time pass, detect, log.
 
     The law is `ArmLoop`; this class connects it to drivers, a clock, a camera, a person and a
-    log. Skills act through it and know protocols only. Time passes by a callable: a simulator's
-    physics, or a clock that waits for real hardware.
+    log. Skills move the arm through it and know protocols only. A callable lets time pass: it
+    steps a simulator, or waits for real hardware.
 
     Attributes:
         chain: Kinematics of the arm.
@@ -111,7 +111,7 @@ class WorkCell:
         state: Newest reading of the arm.
         loop_state: State of the control loop: safety filter, pace, null space, path.
         human: Person near the arm; may be replaced between two steps.
-        human_input: Newest input of that person, its null-space part smoothed.
+        human_input: Newest input of that person, with its null-space effort smoothed.
         observation: Newest detection of markers that has arrived.
         load: Object in the gripper, which must keep its distance from people as well.
         tracked_markers: Markers detected every `detect_every` steps; empty: none.
@@ -154,9 +154,9 @@ class WorkCell:
             on_phase: Called with the name of each phase of the task and its start time [s].
             rng: Source of lost images.
             clearance: Distance of the arm at given joint positions from itself and its
-                surroundings [m]; None: a push can move it anywhere within its limits.
-            watch: Tracks people, before whom the arm slows down, waits, and goes on where it
-                was; None: people are not tracked.
+                surroundings [m]; None: a push can move the arm anywhere within its limits.
+            watch: Distances from tracked people, near whom the arm slows down or waits; None:
+                people are not tracked.
         """
         self.config = config or WorkCellConfig()
         self.chain, self.gripper, self.human = chain, gripper, human
@@ -176,7 +176,7 @@ class WorkCell:
         self.images: list[KeptImage] = []
         self.remarks: list[Event] = []
         self._stopping = False
-        # Time until which the task may meet something that it has felt for [s].
+        # Time until which contacts are expected, because the task searches for one [s].
         self._contact_expected = -math.inf
         state = arm.read()
         asked = human.read(state)
@@ -215,7 +215,7 @@ class WorkCell:
 
     @property
     def pace(self) -> TaskPace:
-        """Speed of the task, as people near the arm and pauses allow."""
+        """Pace of the task, which people near the arm and pauses slow down."""
         return self.loop_state.pace
 
     @property
@@ -230,7 +230,7 @@ class WorkCell:
     # Messages and images.
 
     def begin_phase(self, phase: str) -> None:
-        """Begin another phase of the task: an event of the log."""
+        """Begin another phase of the task, and log it as an event."""
         self.log.event(self.time, phase)
         self._on_phase(phase, self.time)
 
@@ -239,7 +239,11 @@ class WorkCell:
         self.remarks.append(Event(self.time, words))
 
     def detect(self, ids: Collection[int] | None = None) -> None:
-        """Take an image and detect markers in it, all by default; it may be late, or lost."""
+        """Take an image and detect markers in it; the result may arrive late, or be lost.
+
+        Args:
+            ids: Markers to detect; None: all.
+        """
         self._markers.detect(self.time, self.joints, ids)
         self.observation = self._markers.newest(self.time) or self.observation
 
@@ -271,13 +275,13 @@ class WorkCell:
         Args:
             command: Command of the controller.
             region: Region of the end effector's position.
-            explained: Tell the person what the safety filter takes from a push.
+            explained: Tell the person how much the safety filter reduces a push.
             columns: Columns of the controller for the log.
         """
         self._act(command, explained=explained, region=region, columns=columns)
 
     def track_pose(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
-        """One step of tracking a moving pose; the null space yields to the person.
+        """Track a moving pose for one step; the null space yields to the person.
 
         Args:
             goal: Pose that the end effector should have.
@@ -286,14 +290,14 @@ class WorkCell:
         self._act(TrackPose(pose=goal, twist=twist))
 
     def hold_pose(self, duration: float) -> None:
-        """Keep the end effector where it is for a while [s]; the null space yields."""
+        """Hold the pose of the end effector for a duration [s]; the null space yields."""
         self._settle(self.pose, duration)
 
     def move_straight(self, goal: Pose, speed: float = 0.15) -> None:
         """Move the end effector to a pose on a straight line, and let it settle.
 
-        The line slows down where the end effector falls behind, as at a joint limit to which
-        the arm was pushed, for 5 s at most.
+        The motion slows down where the end effector falls behind, for example at a joint limit
+        to which a person pushed the arm; this may cost 5 s in all.
 
         Args:
             goal: Pose at the end.
@@ -315,18 +319,18 @@ class WorkCell:
     ) -> Pose | None:
         """Move on a straight line until the end effector meets something.
 
-        The motion waits while a person pushes the null space: friction turns with the joints,
-        and that feels like a contact.
+        The motion waits while a person pushes the null space: friction then changes with the
+        direction of the joints, and would look like a contact.
 
         Args:
             goal: Pose at the end, if nothing is met.
-            speed: Mean speed [m/s]: an object gives way by as much as the stop takes.
-            force: Contact force against the motion [N]. Friction and an unknown load are
-                measured too, so the change since the start of the motion counts.
+            speed: Mean speed [m/s]: the object is pressed further while the arm stops.
+            force: Contact force against the motion [N], as a change since the arm got under
+                way: the estimate also contains friction and an unknown load.
 
         Returns:
-            Pose of the end effector at the contact; None without one, and for an arm without
-            an estimate of external torques.
+            Pose of the end effector at the contact; None if there was none, or if the arm does
+            not estimate external torques.
 
         Raises:
             TaskFailedError: The null space was pushed for longer than `longest_wait`.
@@ -351,16 +355,16 @@ class WorkCell:
             force_now = contact_force(self.jacobian, self.state)
             felt.append(0.0 if force_now is None else -float(force_now @ along))
             before.append(self.pose)
-            # An arm that waits for people gets under way again.
+            # After a wait for people, the arm has to overcome friction again.
             moving = moving + 1 if self.pace.at_full_speed else 0
             if moving <= _AVERAGED + _GETTING_UNDER_WAY:
                 free = None
                 continue
-            # Friction turns with the motion: the force while under way is the reference.
+            # Friction opposes the motion, so the reference is the force while moving.
             now = float(np.mean(felt))
             free = now if free is None else free
             if now - free > force:
-                # The arm has gone on and pushed for as long as the average takes.
+                # The arm pressed on while readings were averaged: the pose before that counts.
                 self.hold_pose(_AVERAGED * self.config.dt)
                 return before[0]
         return None
@@ -371,22 +375,23 @@ class WorkCell:
         """Move the joints along a path sampled at the control step, yielding to the person.
 
         While a person pushes, the end effector keeps to the poses of the path, and the null
-        space yields. The path waits where the arm, pushed aside, cannot follow: where it would
-        meet something, before a singularity of the path, and where the joints might not find
-        back. After a push the joints return to the path, at its end too, or stay off it
+        space yields. The path waits where an arm that was pushed aside cannot follow: where it
+        would collide, before a singularity of the path, and where the joints might be unable to
+        return. After a push the joints return to the path, even at its end, or stay off it
         (`WorkCellConfig.after_push`).
 
         Args:
             path: Joint positions [rad].
-            until: Asked before each step whether to stop there.
+            until: Function called before each step; the motion ends if it returns True.
 
         Returns:
             Number of samples that were tracked.
 
         Raises:
-            BlockedPathError: The arm, pushed aside, does not find back to a path that waits.
-            TaskFailedError: A person holds the arm aside for longer than `longest_wait` while
-                the path waits, or blocks it for as long.
+            BlockedPathError: The arm was pushed aside and cannot return to the waiting path
+                without a collision.
+            TaskFailedError: A person holds the arm aside while the path waits, or blocks the
+                arm, for longer than `longest_wait`.
         """
         if not len(path):
             return 0
@@ -413,7 +418,7 @@ class WorkCell:
     def _track_line(
         self, line: StraightLine, passed: float, rate: float = 1.0
     ) -> tuple[Pose, Float[Tensor, "6"]]:
-        """One step along a line of which so much time has passed [s]; its pose and twist."""
+        """Take one step along a line, a time after its start [s]; return its pose and twist."""
         now = min(passed + self.config.dt, line.duration)
         pose, _ = line.at(now)
         _, twist = line.at(min(now + self.config.command_delay, line.duration))
@@ -435,13 +440,13 @@ class WorkCell:
         region: PositionRegion | None = None,
         columns: dict[str, Any] = NO_VISION,
     ) -> None:
-        """Send what the loop makes of a request, let one step pass, and read again.
+        """Turn a request into a joint velocity, send it, let one step pass, and read again.
 
         Args:
-            request: Motion to make.
-            explained: Tell the person what the safety filter takes from a push.
+            request: Requested motion.
+            explained: Tell the person how much the safety filter reduces a push.
             region: Region of the controller's command.
-            columns: For the log.
+            columns: Further columns for the log.
         """
         reading = self._reading
         velocity, self.loop_state, report = self._loop.act(self.loop_state, reading, request)
@@ -468,7 +473,7 @@ class WorkCell:
         self._read()
 
     def _read(self) -> None:
-        """Read arm, people and person, take images, and obey a stop."""
+        """Read the arm, its person and tracked people, take images, and stop if requested."""
         state = self._arm.read()
         self._markers.remember(state.time, state.joint_position)
         asked = self.human.read(state)
@@ -490,7 +495,7 @@ class WorkCell:
         self._give_up_after(held, "while its path waited, the arm was held aside", "let it go")
 
     def _sense(self, state: ArmState, asked: HumanInput) -> None:
-        """Take in a reading with its kinematics, and the people near the arm."""
+        """Store a reading of the arm with its kinematics and the people near it."""
         joints = torch.from_numpy(state.joint_position)
         people = None
         if self._watch is not None:
@@ -510,7 +515,7 @@ class WorkCell:
         )
 
     def _take_images(self) -> None:
-        """Detect markers and keep images in the steps meant for it."""
+        """Detect markers and keep images at their configured intervals."""
         step = len(self.log)
         if self.tracked_markers and step % self.config.detect_every == 0:
             self.detect(self.tracked_markers)
@@ -519,7 +524,7 @@ class WorkCell:
             self.images.append(KeptImage(time=self.time, image=image))
 
     def _give_up_if_blocked(self) -> None:
-        """Raise where people block the arm for too long, or obstacles its way back."""
+        """Raise if people block the arm for too long, or obstacles block its return."""
         blocked = "a person has been in the way of the arm"
         self._give_up_after(float(self.pace.blocked_for), blocked, "clear its path")
         if self.loop_state.path.direct_return.blocked:
@@ -544,7 +549,7 @@ class WorkCell:
         self._stopping = False
 
     def _tell_of_pause(self, pause: bool, before: Tensor) -> None:
-        """Tell the person that the task waits or goes on."""
+        """Notify the person that the task waits or goes on."""
         full, now = self.config.speed, self.pace.speed_override
         if pause and before == full:
             self.tell("The task waits.")
