@@ -25,11 +25,7 @@ from hrc_learn.cli.arguments import (
 )
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment, Pulls
 from hrc_learn.experiments.collaboration_trial import Disturbances
-from hrc_learn.experiments.experiment import (
-    Experiment,
-    RunOptions,
-    run_experiment,
-)
+from hrc_learn.experiments.experiment import Experiment, RunOptions, run_experiment
 from hrc_learn.experiments.grasping_experiment import GraspingExperiment
 from hrc_learn.experiments.placing_experiment import PlacingExperiment, dataset_of
 from hrc_learn.experiments.real_arm import ArmSite, Task, run_on_arm, task_of

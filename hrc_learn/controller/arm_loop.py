@@ -46,12 +46,7 @@ from hrc_learn.controller.null_space_motion import (
     limiting_joint,
 )
 from hrc_learn.controller.path_law import PathLaw, twist_of
-from hrc_learn.controller.task_pace import (
-    TaskPace,
-    capped_scale,
-    closes_in,
-    null_space_input,
-)
+from hrc_learn.controller.task_pace import TaskPace, capped_scale, closes_in, null_space_input
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain

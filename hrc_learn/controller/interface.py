@@ -12,11 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hrc_learn.controller.constraint_layer import (
-    ConstraintConfig,
-    ConstraintReport,
-    Distances,
-)
+from hrc_learn.controller.constraint_layer import ConstraintConfig, ConstraintReport, Distances
 from hrc_learn.controller.contact_limits import SeparationConfig
 from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import TaskSpace

@@ -25,12 +25,7 @@ from hrc_learn.dmp.linear_primitive import LinearPrimitive, check_names
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.response import Response, response_of
 from hrc_learn.dmp.samples import Samples, check_samples, densified, padded, smoothed
-from hrc_learn.dmp.solvers import (
-    REGULARIZATION,
-    fit_samples,
-    normal_products,
-    solve_normal,
-)
+from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples, normal_products, solve_normal
 from hrc_learn.dmp.trajectory import Trajectory
 
 LIMIT_SAMPLES = 2001

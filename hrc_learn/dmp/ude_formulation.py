@@ -23,12 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp import orientation_error
-from hrc_learn.dmp._arguments import (
-    Scalars,
-    Times,
-    normalised_time,
-    to_tensor,
-)
+from hrc_learn.dmp._arguments import Scalars, Times, normalised_time, to_tensor
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dynamics import SpringDamper
 from hrc_learn.dmp.joint_dmp import JointDMP

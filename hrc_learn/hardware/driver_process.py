@@ -27,11 +27,7 @@ from jaxtyping import Float
 
 from hrc_learn.distributed import ByValue
 from hrc_learn.protocols import Arm, ArmState, Gripper
-from hrc_learn.watchdog import (
-    Watchdog,
-    WatchdogError,
-    bring_to_rest,
-)
+from hrc_learn.watchdog import Watchdog, WatchdogError, bring_to_rest
 
 _STARTUP = 60.0
 """Longest that connecting may take [s]."""

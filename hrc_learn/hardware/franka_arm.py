@@ -26,12 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import VelocityStep, WantedVelocity
-from hrc_learn.deploy import (
-    EagerRunner,
-    PackageRunner,
-    StepRunner,
-    export_step,
-)
+from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, export_step
 from hrc_learn.distributed import ByValue
 from hrc_learn.hardware.driver_process import Connected, DriverError, checked_velocity
 from hrc_learn.hardware.franka_loop import import_pylibfranka, serve

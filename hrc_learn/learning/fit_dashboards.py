@@ -24,11 +24,7 @@ from hrc_learn.learning.visual_servo_fitting import Demonstrations, feature_traj
 from hrc_learn.log import JointRanges
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import palette
-from hrc_learn.viz.figures import (
-    DEMO_LOOK,
-    JointCurves,
-    joint_grid_figure,
-)
+from hrc_learn.viz.figures import DEMO_LOOK, JointCurves, joint_grid_figure
 from hrc_learn.viz.panels import Plot, Tab, joint_plot, joints_title, several, single, slug
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
 from hrc_learn.viz.rerun_stream import (

@@ -28,13 +28,7 @@ from hrc_learn.skills.grasping import (
     move_fingers,
     raised,
 )
-from hrc_learn.skills.placing import (
-    GraspObject,
-    PlacingSkill,
-    Plan,
-    Workplace,
-    plan_candidates,
-)
+from hrc_learn.skills.placing import GraspObject, PlacingSkill, Plan, Workplace, plan_candidates
 from hrc_learn.skills.receiving import Receipt, Receiving
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import (

@@ -14,12 +14,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.headset import (
-    PEDESTAL,
-    body_meshes,
-    body_shape,
-    held_joint,
-)
+from hrc_learn.teleoperation.headset import PEDESTAL, body_meshes, body_shape, held_joint
 from hrc_learn.teleoperation.page_operator import HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 

@@ -23,13 +23,7 @@ from hrc_learn.demos.read.dataset_files import open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder, recorded_statistics
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
-from hrc_learn.demos.videos import (
-    Segments,
-    VideoSegment,
-    decode_image,
-    image_at,
-    subsampled,
-)
+from hrc_learn.demos.videos import Segments, VideoSegment, decode_image, image_at, subsampled
 from hrc_learn.store import DATASET, replacing
 
 NO_TASK = "unnamed task"

@@ -9,11 +9,7 @@ from typing import Any, Protocol, overload, runtime_checkable
 
 import numpy as np
 
-from hrc_learn.demos.demonstration import (
-    Demonstration,
-    DemonstrationSet,
-    joint_columns,
-)
+from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet, joint_columns
 from hrc_learn.demos.image_features import extracted_features
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read import profiles
@@ -27,12 +23,7 @@ from hrc_learn.demos.read.dataset_folder import (
     open_folder,
     select_episodes,
 )
-from hrc_learn.demos.read.frames import (
-    RawEpisode,
-    frame_timestamps,
-    raising,
-    read_quantities,
-)
+from hrc_learn.demos.read.frames import RawEpisode, frame_timestamps, raising, read_quantities
 from hrc_learn.demos.read.kinematic_evidence import agreement, known_arm
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand
