@@ -31,7 +31,7 @@ from hrc_learn.controller.resolved_rate import (
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.controller.task_pace import WayMakingConfig, null_space_input
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import ArrayLike, check_settings, is_number
+from hrc_learn.geometry.numerics import ArrayLike, check_settings, has_numbers, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import Arm, SerialChain, TaskSpace, task_basis, task_rank
 from hrc_learn.kinematics.inverse import TASK_ROWS
@@ -377,6 +377,8 @@ class AdaptiveController(nn.Module):
 
     def _restored(self, state: ControllerState) -> ControllerState:
         """The state with invalid values replaced by those of the start."""
+        if has_numbers(state):
+            return replace(state, safety=self.safety.restored(state.safety))
         return ControllerState(
             blending=self.blending.restored(state.blending),
             task_level=state.task_level.masked_fill(~is_number(state.task_level), 0),

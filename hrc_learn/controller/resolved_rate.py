@@ -24,6 +24,7 @@ from hrc_learn.controller.interface import Goals, Observation
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import (
     Constant,
+    everywhere,
     inverse_norm,
     is_number,
     matmul,
@@ -159,6 +160,8 @@ def saturate_in_null_space(
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
     free = cut == task
+    if everywhere(free):
+        return task
     left = twist - torch.linalg.vecdot(J, cut.masked_fill(free, 0).unsqueeze(-2))
     J_free = J * free.unsqueeze(-2)
     others = matmul(J_free.mT, solve_positive(_damped_gram(J_free), left.unsqueeze(-1)))
@@ -198,6 +201,8 @@ def scale_task(
         The velocity, scaled down at most until no limit acts [rad/s].
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
+    if everywhere(cut == task):
+        return task
     asked, done = (
         torch.linalg.vector_norm(
             torch.linalg.vecdot(J, v.unsqueeze(-2)).view(*v.shape[:-1], 2, 3) / caps[:, None],
@@ -233,9 +238,12 @@ def scale_null_space(
     Returns:
         The scaled null-space velocity [rad/s].
     """
+    at_rest = null == 0
+    if everywhere(at_rest):
+        return null
     # A joint at rest does not bound the factor: divided by the smallest number its bounds are
     # infinite, or of the wrong sign where the task alone is too fast.
-    null_or_tiny = torch.where(null == 0, torch.finfo(null.dtype).tiny, null)
+    null_or_tiny = torch.where(at_rest, torch.finfo(null.dtype).tiny, null)
     at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
     least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
     most = torch.maximum(at_lower, at_upper).amin(-1, keepdim=True)

@@ -26,7 +26,7 @@ from hrc_learn.controller.interface import (
     SafetyState,
 )
 from hrc_learn.controller.limit_barrier import LimitBarrier, SpeedBarrier
-from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number, may_branch
+from hrc_learn.geometry.numerics import ArrayLike, as_tensor, everywhere, has_numbers, is_number
 from hrc_learn.kinematics import MotionLimits, SerialChain
 from hrc_learn.pytree import zero_where
 
@@ -179,6 +179,9 @@ class SafetyFilter(nn.Module):
 
     def restored(self, state: SafetyState) -> SafetyState:
         """The state with invalid values replaced: at rest, in the middle of the joint range."""
+        valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
+        if everywhere(valid) and has_numbers(state):
+            return state
         lower, upper = self.barrier.walls.unbind(-2)
         zero = torch.zeros_like(state.velocity)
         fallback = (
@@ -188,7 +191,6 @@ class SafetyFilter(nn.Module):
             (state.too_fast, torch.zeros_like(state.too_fast)),
         )
         v, a, q, time = (torch.where(is_number(x), x, instead) for x, instead in fallback)
-        valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
         dt = torch.where(valid, state.dt, _SHORTEST_STEP)
         return replace(state, velocity=v, acceleration=a, position=q, dt=dt, too_fast=time)
 
@@ -474,7 +476,7 @@ class SafetyFilter(nn.Module):
         # The solver's rounding is a motion where a velocity limit is zero.
         v = torch.where(v.abs() < _REST, 0, v)
         braking = given.invalid | given.stopped
-        if not may_branch(v) or bool(braking.any()):
+        if not everywhere(~braking):
             v = torch.where(braking, self._stopping(given), v)
         idle = braking.squeeze(-1)
         return v, replace(zero_where(idle, report), solved=report.solved | idle)
@@ -491,7 +493,7 @@ class SafetyFilter(nn.Module):
         cap = cap * (1 - 8 * torch.finfo(v.dtype).eps)
         speed = self._highest_speed(given, v)
         passes = (speed <= cap) | given.invalid | given.stopped
-        if may_branch(v) and bool(passes.all()):
+        if everywhere(passes):
             return v, ~passes
         stopping, easing = self._stopping(given), self._easing(given)
         hard, gentle = self._highest_speed(given, stopping), self._highest_speed(given, easing)

@@ -13,11 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from operator import add
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Sequence | float
 """A tensor, a NumPy array, or a nested list of numbers."""
@@ -143,6 +145,17 @@ def may_branch(x: Tensor) -> bool:
     if torch.compiler.is_compiling() or x.device.type != "cpu":
         return False
     return torch._C._functorch.maybe_current_level() is None  # pyright: ignore
+
+
+def everywhere(mask: Bool[Tensor, "*batch"]) -> bool:
+    """True where a step may branch and a mask holds for the whole batch."""
+    return may_branch(mask) and bool(mask.all())
+
+
+def has_numbers(tree: Any) -> bool:
+    """True where a step may branch and all floating-point values of a pytree are numbers."""
+    values = [x.reshape(-1) for x in tree_leaves(tree) if x.is_floating_point()]
+    return may_branch(values[0]) and bool(is_number(torch.cat(values)).all())
 
 
 def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

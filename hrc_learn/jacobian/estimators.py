@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import is_number, matmul, may_branch
+from hrc_learn.geometry.numerics import has_numbers, is_number, matmul
 from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import chosen, pytree
@@ -78,12 +78,12 @@ class ImageJacobianEstimator(nn.Module, ABC):
 
     def restored(self, state: Any) -> Any:
         """The state, replaced by the initial state where any of its numbers is not finite."""
+        if has_numbers(state):
+            return state
         batch = state.weight.shape[:-2]
         numbers = [x for x in tree_leaves(state) if x.is_floating_point()]
         finite = [is_number(x.reshape(*batch, -1)).all(-1) for x in numbers]
         known = reduce(torch.logical_and, finite)
-        if may_branch(known) and bool(known.all()):
-            return state
         return chosen(known, state, self.initial_state(*batch))
 
     def resumed(self, state: Any, pause: float) -> Any:

@@ -15,6 +15,8 @@ from hrc_learn.geometry.numerics import (
     Constant,
     as_tensor,
     check_settings,
+    everywhere,
+    has_numbers,
     inverse_norm,
     is_number,
     matmul,
@@ -172,6 +174,31 @@ def test_whole_numbers_and_lists_become_float64_and_floats_stay():
 def test_numbers_in_si_units_are_no_larger_than_a_million_millions():
     x = torch.tensor([0.0, -9e11, 1.1e12, -1.1e12, math.inf, math.nan])
     assert is_number(x).tolist() == [True, True, False, False, False, False]
+
+
+@pytest.mark.parametrize("bad", [math.nan, -math.inf, 1.1e12])
+def test_one_value_that_is_no_number_spoils_a_tree(bad):
+    counts, tree = torch.tensor([2**50]), {"a": torch.ones(2, 3), "b": [torch.zeros(())]}
+    assert has_numbers((counts, tree))
+    tree["a"][1, 2] = bad
+    assert not has_numbers((counts, tree))
+
+
+def test_steps_skip_work_only_where_they_may_branch(monkeypatch):
+    mask = torch.tensor([True, True])
+    assert everywhere(mask)
+    assert not everywhere(torch.tensor([True, False]))
+    found = []
+
+    def inside(x: Tensor) -> Tensor:
+        found.extend([everywhere(x == x), has_numbers(x)])
+        return x
+
+    torch.func.vmap(inside)(torch.zeros(2))
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert found == [False, False]
+    assert not everywhere(mask)
+    assert not has_numbers(torch.zeros(2))
 
 
 @pytest.mark.parametrize("x", [-0.5, 0.0, 0.3, 1.0, 1.5])
