@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import check_settings, is_number, may_branch
+from hrc_learn.geometry.numerics import check_settings, everywhere, is_number
 from hrc_learn.jacobian.estimators import ImageJacobianEstimator, Measurement, evaluate
 from hrc_learn.jacobian.fitting import component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
@@ -35,6 +35,7 @@ from hrc_learn.jacobian.perspective import (
     SHIFT,
     SIZE,
     camera_jacobian,
+    eye_by_step,
     eye_of,
     marker_pixels,
     stepped,
@@ -236,7 +237,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def update(self, state: CameraState, measurement: Measurement) -> CameraState:
         """State after an image; unchanged without a visible marker."""
         seen = measurement.valid & is_number(measurement.feature).all(-1)
-        if may_branch(seen) and not bool(seen.any()):
+        if everywhere(~seen):
             return state
         state = self._watched(state, measurement, seen)
         state, kept = self._with_key_frame(state, measurement, seen)
@@ -278,16 +279,9 @@ class CameraEstimator(ImageJacobianEstimator):
         by_turn = torch.stack([R[..., 1, :], -R[..., 0, :], zero], dim=-1)
         by_turn = (home @ by_turn)[..., :2, :] / config.tilt
         away = (eye_of(cameras) - eye_of(self.reference)) / config.place
-        t = cameras[..., SHIFT]
-        # A step moves the camera position e = -R^T t to e + R^T (w x t) - R^T dt.
-        cross = torch.linalg.cross(
-            torch.eye(3).to(t).expand(*t.shape[:-1], 3, 3), t.unsqueeze(-2)
-        ).mT
-        place_by_turn = R.mT @ cross / config.place
-        empty = R.new_zeros(*R.shape[:-2], 5, 4)
-        rotation = torch.cat([by_turn, place_by_turn], dim=-2)
-        shift = torch.cat([torch.zeros_like(by_turn), -R.mT / config.place], dim=-2)
-        slope = torch.cat([empty, rotation, shift, torch.zeros_like(shift)], dim=-1)
+        tilted = torch.cat([by_turn, torch.zeros_like(by_turn)], dim=-1)
+        moved = torch.cat([tilted, eye_by_step(cameras) / config.place], dim=-2)
+        slope = torch.nn.functional.pad(moved, (ROTATION.start, SIZE - SHIFT.stop))
         return torch.cat([tilt, away], dim=-1), slope
 
     def _watched(

@@ -155,6 +155,16 @@ def eye_of(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3"]:
     return -quaternion.rotate(back, camera[..., SHIFT])
 
 
+def eye_by_step(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3 6"]:
+    """Derivative of `eye_of` by the rotation and shift of a step (`stepped`)."""
+    # A step moves the camera position e = -R^T t to e + R^T (w x t) - R^T dt.
+    t = camera[..., SHIFT].unsqueeze(-2)
+    axes = torch.eye(3).to(t).expand(*t.shape[:-2], 3, 3)
+    turned = torch.linalg.cross(axes, t).mT
+    back = quaternion.to_matrix(quaternion.conjugate(quaternion.exp(camera[..., ROTATION])))
+    return back @ torch.cat([turned, -axes], dim=-1)
+
+
 def rays(
     camera: Float[Tensor, "*batch 13"], pixel: Float[Tensor, "*batch 2"]
 ) -> Float[Tensor, "*batch 3"]:
@@ -213,6 +223,13 @@ class CameraFit:
         """Largest standard deviation of the step among some components, such as `FOCAL`."""
         return float(self.covariance.diagonal()[part].max().clamp_min(0).sqrt())
 
+    @property
+    def place_deviation(self) -> float:
+        """Largest standard deviation of the camera's position along an axis of the base [m]."""
+        by_step, moved = eye_by_step(self.camera), slice(ROTATION.start, SHIFT.stop)
+        covariance = by_step @ self.covariance[moved, moved] @ by_step.mT
+        return float(covariance.diagonal().max().clamp_min(0).sqrt())
+
     def __str__(self) -> str:
         """Position, viewing direction, focal length and marker of the camera, as text."""
         x, y, z = eye_of(self.camera).tolist()
@@ -222,7 +239,7 @@ class CameraFit:
         a, b, c = (1e3 * self.camera[MARKER]).tolist()
         return (
             f"camera at ({x:.3f}, {y:.3f}, {z:.3f}) m in the base frame, within "
-            f"{1e3 * self.deviation(SHIFT):.1f} mm and "
+            f"{1e3 * self.place_deviation:.1f} mm and "
             f"{np.rad2deg(self.deviation(ROTATION)):.2f} degrees (one standard deviation), its "
             f"view {tilt:.0f} degrees from straight down; focal length {focal:.0f} px, within "
             f"{focal * self.deviation(FOCAL):.0f}; marker at ({a:.0f}, {b:.0f}, {c:.0f}) mm on "

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CellErrors, EvidenceResult, RBFImageJacobian
-from hrc_learn.jacobian.perspective import FOCAL, SHIFT
+from hrc_learn.jacobian.perspective import FOCAL
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.model_files import SavedModel, write_model
 from hrc_learn.skills.servo_target import VisualTarget, object_heading
@@ -199,7 +199,7 @@ class VisualServoSkill:
             values |= {
                 "focal_px": float(camera.camera[FOCAL].exp()),
                 "focal_relative_std": camera.deviation(FOCAL),
-                "camera_place_std_mm": 1e3 * camera.deviation(SHIFT),
+                "camera_place_std_mm": 1e3 * camera.place_deviation,
             }
         if self.learned is not None:
             first, best = self.learned.rounds[0], self.learned.kept
