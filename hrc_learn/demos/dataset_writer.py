@@ -354,8 +354,8 @@ class DatasetWriter:
         for key in theirs | features:
             if theirs.get(key) != features.get(key):
                 raise ValueError(
-                    f"cannot append to {self.root}: {key} there is {theirs.get(key)}, here "
-                    f"{features.get(key)}; record the same quantities, or a dataset of its own"
+                    f"cannot append to {self.root}: {key} is {theirs.get(key)} there, but "
+                    f"{features.get(key)} here; record the same quantities, or a new dataset"
                 )
         known = {column.role: column for column in columns if column.role is not None}
         sidecar = replace(

@@ -191,7 +191,7 @@ def resting(demo: Demonstration) -> Bool[np.ndarray, " _frames"]:
     joints = demo.joint_position
     values = demo.position if joints is None else joints
     if values is None:
-        raise ValueError("rest is found in joint positions or positions; neither is recorded")
+        raise ValueError("rest is found in joint or tool positions; neither is recorded")
     _, rates = local_polynomial(demo.time, values, window=_REST_WINDOW, degree=2)
     speed = np.linalg.norm(rates, axis=1) if joints is None else np.abs(rates).max(1)
     low, high = _LINEAR_REST if joints is None else _JOINT_REST

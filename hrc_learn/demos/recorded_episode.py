@@ -158,7 +158,7 @@ def describe_difference(given: Collection[str], expected: Collection[str]) -> st
     """Missing and surplus quantities of a frame or an episode, in words."""
     missing, new = sorted(set(expected) - set(given)), sorted(set(given) - set(expected))
     parts = [f"lacks {', '.join(missing)}"] * bool(missing)
-    parts += [f"gives {', '.join(new)} besides"] * bool(new)
+    parts += [f"adds {', '.join(new)}"] * bool(new)
     return f"{' and '.join(parts)}: all frames need the quantities of the first"
 
 

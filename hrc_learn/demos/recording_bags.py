@@ -28,11 +28,11 @@ from hrc_learn.demos.recording_messages import (
 )
 
 _SHORTEST = 0.5
-"""Parts between gaps that are shorter are left out [s]."""
+"""Duration below which a part between gaps is left out [s]."""
 _SAME_CLOCK = 0.5
-"""Largest difference between a message's own stamp and its reception on one clock [s]."""
+"""Largest difference between stamps and times of reception if both use one clock [s]."""
 _BURST = 2e-4
-"""Messages that follow each other this fast were written by a program, not by an arm [s]."""
+"""Median interval below which messages were written at once, not during a motion [s]."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
 
 
@@ -42,10 +42,10 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(path: Path) -> list[Recording]:
-    """Episodes of a bag; one with gaps in its joints or images becomes several.
+    """Episodes of a bag; gaps in its joints or images divide it into several episodes.
 
-    Stamps are those in the messages where their clock is that of the recorder or that of all
-    topics, and times of reception elsewhere.
+    The stamps in the messages are used if their clock is the recorder's, or if all topics use
+    the same clock; otherwise, the times of reception are used.
 
     Raises:
         DatasetError: The bag is damaged, or holds no topic that is understood.
@@ -81,7 +81,7 @@ def _opened_bag(path: Path) -> tuple[dict[str, str], Messages]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    def opened() -> AnyReader:  # bags from before ROS 2 Iron hold no definitions
+    def opened() -> AnyReader:  # bags older than ROS 2 Iron lack definitions
         return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
     def messages(topics: Sequence[str], start: int | None = None) -> Iterator:
@@ -141,9 +141,9 @@ def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
 def _gathered(
     types: Mapping[str, str], messages: Messages
 ) -> tuple[dict[str, Topic], list[str]]:
-    """Topics by field, and joints in the order of the robot's description, if it is there.
+    """Topics by field, and joints in the order of the robot description, if it was recorded.
 
-    Drivers publish joints in any order, often that of the alphabet.
+    Drivers publish joints in any order, often alphabetically.
     """
     sets: dict[str, dict[frozenset[str], Topic]] = {}
     edges: dict[tuple[str, str], list[tuple[float, float, np.ndarray]]] = {}
@@ -197,12 +197,12 @@ def _numbers(
     order: Sequence[str],
     notes: list[str],
 ) -> Field | None:
-    """Field of a topic of numbers; None if it cannot be used, which a note says.
+    """Field of a topic of numbers; None, with a note, if it cannot be used.
 
     Args:
         name: Name of the field.
         one: Messages of the topic.
-        places: Messages in the order of their times, each time once.
+        places: Indices of the messages, sorted by time, without repeated times.
         order: Joints in the order of the robot's description.
         notes: Receives what is left out.
     """
@@ -228,7 +228,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     fields = whole.fields
     clocked = {name: one for name, one in fields.items() if one.clock}
     if not any(one.kind == "number" for one in clocked.values()):
-        # No name tells the tool: the pose of any frame may be its.
+        # No name identifies the tool: the pose of any frame may be the tool's.
         poses = {n: replace(f, kind="number") for n, f in fields.items() if f.kind == "pose"}
         fields = {**fields, **poses}
     numbers = [n for n in clocked if fields[n].kind == "number"]
@@ -283,7 +283,7 @@ def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
 
 
 def _during(fields: Mapping[str, Field], start: float, stop: float) -> dict[str, Field]:
-    """Fields from their last frames before a time to a later time [s]."""
+    """Fields from their last frames before `start` to their last ones before `stop` [s]."""
     found = {}
     for name, one in fields.items():
         time = fields[one.clock or name].numbers()[:, 0]

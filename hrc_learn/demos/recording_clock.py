@@ -1,4 +1,4 @@
-"""Clocks of recordings: stamps in seconds, and all fields on the clock of the state."""
+"""Clocks of recordings: stamps in seconds, and all fields at the stamps of the state."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -12,17 +12,17 @@ from hrc_learn.demos.recording_meaning import Meaning
 from hrc_learn.demos.recording_names import ImportOptions
 
 _EPOCH = (1e9, 3e9)
-"""Stamps that count from 1970, in the years 2001 to 2065 [s]."""
+"""Range of stamps that count from 1970 [s]: the years 2001 to 2065."""
 _STEPS = (1 / 1500, 0.5)
 """Plausible steps between stamps [s]: 2 Hz to 1.5 kHz."""
 _JUMP = 10.0
-"""Gap between stamps that is reported, as a multiple of the usual one."""
+"""Smallest gap between stamps that is reported, as a multiple of the median gap."""
 _FASTER = 1.5
-"""States per image from which states of topics are thinned to the images."""
+"""States per image above which the states of topics are thinned to one state per image."""
 
 
 class Clock(NamedTuple):
-    """Frames of a recording's state that all of its fields know."""
+    """Frames of a recording's state at which all of its fields have values."""
 
     time: Float64[np.ndarray, " frames"]
     """Stamps of the state [s]."""
@@ -32,14 +32,14 @@ class Clock(NamedTuple):
 
 
 def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOptions) -> Clock:
-    """Bring all fields that have a meaning to the clock of the state.
+    """Assign the frames of all understood or kept fields to the stamps of the state.
 
     Slower fields hold their last value: nothing is interpolated, because a robot does not know
-    what its sensors will measure. Frames at either end that some field does not know are cut.
+    what its sensors will measure. Frames at either end are cut where a field has no value.
 
     Raises:
-        DatasetError: Stamps are missing or do not increase, a field belongs to another time,
-            or is silent in between.
+        DatasetError: Stamps are missing or do not increase, or a field covers another time or
+            has a gap.
     """
     place = f"{recording.file.name} {recording.label}".strip()
     time, notes = _stamps_of_state(recording, meaning, options)
@@ -79,15 +79,15 @@ def _thinned(
     Args:
         time: Stamps of the state [s].
         cameras: Latest image of each camera at each stamp.
-        fps: Wanted rate [1/s]; None: that of the fastest camera.
-        notes: Receives the method.
+        fps: Wanted rate [1/s]; None for the rate of the fastest camera.
+        notes: Receives a note on the method.
     """
     rows, rate = np.arange(len(time)), (len(time) - 1) / (time[-1] - time[0])
     if fps is not None:
         ticks = np.arange(time[0], time[-1] + 1e-6, 1 / fps)
         rows = np.unique(np.searchsorted(time, ticks - 0.25 / rate))
         rows = rows[rows < len(time)]
-        method = f"the first state from each tick of {fps:g} Hz on"
+        method = f"the first state at or after each tick of {fps:g} Hz"
     elif cameras:
         name = max(cameras, key=lambda camera: len(np.unique(cameras[camera])))
         new = np.flatnonzero(np.diff(cameras[name], prepend=-1) > 0)
@@ -101,7 +101,7 @@ def _thinned(
 def _stamps_of_state(
     recording: Recording, meaning: Meaning, options: ImportOptions
 ) -> tuple[Float64[np.ndarray, " frames"], list[str]]:
-    """Stamps [s], or even ones at the rate that is known, and notes."""
+    """Stamps of the state [s], even ones if only a duration or rate is known, and notes."""
     fields, frames = recording.fields, recording.fields[meaning.main].frames
     if frames < 2:
         raise recording.error(f"a demonstration needs at least two frames, got {frames}")
@@ -122,7 +122,7 @@ def _stamps_of_state(
         return np.arange(frames) / rate, []
     if stamps:
         text = f"holds {fields[stamps].frames} stamps for {frames} frames of the state"
-        raise recording.error(f"{text}: name its own (--time), or give --fps", stamps)
+        raise recording.error(f"{text}: name its stamps (--time), or give --fps", stamps)
     raise recording.error(
         "there are no stamps: name the field of stamps (time), or give duration or fps"
     )
@@ -163,7 +163,7 @@ def read_stamps(
 def _latest(
     recording: Recording, name: str, time: Float64[np.ndarray, " frames"], main: str
 ) -> Int64[np.ndarray, " frames"]:
-    """Latest frame of a field at each stamp of the state; -1 where it is none or old."""
+    """Latest frame of a field at each stamp of the state; -1 if it is missing or too old."""
     one, own = recording.fields[name], recording.clock_of(name, main)
     length, lasts = one.frames, float(time[-1] - time[0])
     if own not in ("", main):

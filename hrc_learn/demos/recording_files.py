@@ -1,4 +1,4 @@
-"""Recordings as fields whose frames are read when they are used, and their episodes."""
+"""Recordings as fields whose frames are read on demand, and their division into episodes."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -16,15 +16,15 @@ from hrc_learn.demos.read.columns import column_places
 from hrc_learn.demos.read.naming import without_unit
 
 Kind = Literal["number", "image", "encoded", "text", "depth", "pose", "other"]
-"""Content of a field; "pose" is that of another frame than the tool's."""
+"""Content of a field; "pose" is the pose of a frame that is not known to be the tool's."""
 Read = Callable[[int, int], Shaped[np.ndarray, "_frames ..."]]
 
 UNNAMED = "array"
-"""Name of an array that has none."""
+"""Name given to an array without a name."""
 _SMALLEST_IMAGE = 16
-"""Shorter side from which an array of whole numbers is an image [px]."""
+"""Smallest shorter side of an array that counts as an image [px]."""
 _SKIPPED = 100
-"""Largest number of images that are passed over; above, the stream is opened anew."""
+"""Largest number of images to skip by reading on; beyond it, the stream is opened anew."""
 _EPISODE = re.compile(r"(?:[a-z]+[_\- ]?)*\d+", re.IGNORECASE)
 """Names of groups that hold one episode each: demo_0, episode_12, traj_3, 7."""
 _EPISODE_ENDS = ("episode_ends", "traj_ends", "trajectory_ends")
@@ -42,7 +42,7 @@ _NO_CLOCK = re.compile(r"execut|cycle|delay|latency|comput|process|duration|delt
 _UNITS = {"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us"}
 _UNITS |= {"nsec": "ns", "nanos": "ns", "nm": "N m", "n*m": "N m", "metre": "m", "meter": "m"}
 _UNITS |= {"radian": "rad", "degree": "deg", "percent": "%"}
-"""Units that are spelled in files in another way than in names -> units of `read.units`."""
+"""Spellings of units in files -> units of `read.units`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ class Recording:
 
     file: Path
     label: str = ""
-    """Group or number of the episode in its file; "" if the file holds one."""
+    """Group or number of the episode in its file; "" if the file holds only one episode."""
     fields: dict[str, Field]
     fps: float | int | None = None
     """Frame rate that the file states [1/s]."""
@@ -115,8 +115,8 @@ class Recording:
     def clock_of(self, name: str, preferred: str = "") -> str:
         """Field that holds the stamps of another field; "" if none has as many frames.
 
-        It is one that is named after the field, then one of the same group, then of a group
-        around, then the preferred one.
+        Stamps named after the field come first, then those of the same group, those of an
+        enclosing group, and the preferred field.
         """
         if self.fields[name].clock:
             return self.fields[name].clock
@@ -135,26 +135,26 @@ class Recording:
 
 
 def longest_hold(stamps: Float64[np.ndarray, " frames"]) -> float:
-    """Age up to which a value counts as measured [s]: 0.2 s, or three of its periods."""
+    """Age up to which a value is held [s]: 0.2 s or three periods, whichever is longer."""
     return max(0.2, 3 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.2
 
 
 def unit_in_words(unit: str) -> str:
-    """Unit in the words of `read.units`, from one that a file declares."""
+    """Unit as `read.units` spells it, from a unit that a file declares."""
     plain = unit.strip()
     spelled = "" if " " in plain else without_unit(f"value [{plain}]")[1]
     return _UNITS.get(plain.lower()) or spelled or plain
 
 
 def is_time(name: str, one: Field) -> bool:
-    """True if the field holds stamps by its name."""
+    """True if the name of the field says that it holds stamps."""
     last = name.split("/")[-1].lower()
     named = _TIME.fullmatch(last) and not _NO_CLOCK.search(last)
     return one.kind == "number" and one.width == 1 and bool(named)
 
 
 def time_unit_in(name: str) -> str:
-    """Unit that the name of stamps tells; "" if none."""
+    """Unit in the name of a field of stamps; "" if it names none."""
     match = _TIME.fullmatch(name.split("/")[-1].lower())
     return unit_in_words((match and match["unit"]) or "")
 
@@ -162,7 +162,7 @@ def time_unit_in(name: str) -> str:
 def make_field(
     name: str, shape: tuple[int, ...], dtype: np.dtype, read: Read, **details: Any
 ) -> Field:
-    """A field of the kind that its name, shape and type tell.
+    """A field, of the kind that follows from its name, shape and type.
 
     Args:
         name: Name in the file.
@@ -204,7 +204,7 @@ class StreamRead:
     def __init__(self, images: Callable[[int], Iterator[Any]]):
         """
         Args:
-            images: Function that gives the images from a frame on.
+            images: Function that yields the images, beginning at a given frame.
         """
         self._images, self._next = images, 0
         self._stream: Iterator[Any] | None = None
@@ -236,8 +236,8 @@ def split_episodes(
 ) -> list[Recording]:
     """Episodes among the arrays of a file.
 
-    They are groups that count (`demo_0`, `demo_1`), slices up to `episode_ends` or to the
-    frames marked as the last ones, or the first axis of arrays of three axes.
+    Episodes are numbered groups (`demo_0`, `demo_1`), slices that end at `episode_ends` or at
+    frames marked as last ones, or entries along the first axis of three-dimensional arrays.
 
     Args:
         file: The file.
@@ -272,7 +272,7 @@ def split_episodes(
 
 
 def _layer(whole: Recording, name: str, field: Field, number: int, count: int) -> Field:
-    """One demonstration of an array of three axes; other arrays hold for all of them."""
+    """One demonstration of a three-dimensional array; other arrays belong to all of them."""
     if field.kind != "other" or len(field.shape) != 3:
         return field
     if field.frames not in (1, count):
@@ -284,7 +284,7 @@ def _layer(whole: Recording, name: str, field: Field, number: int, count: int) -
 
 
 def _by_number(fields: Mapping[str, Field]) -> Mapping[str, Field]:
-    """The arrays in one group for each number, if all of them count: states_0, actions_0."""
+    """The arrays grouped by their numbers, if all are numbered: states_0, actions_0."""
     found: dict[str, Field] = {}
     stems: dict[str, set[str]] = {}
     for name, field in fields.items():
@@ -298,7 +298,7 @@ def _by_number(fields: Mapping[str, Field]) -> Mapping[str, Field]:
 
 
 def _numbered_groups(fields: Mapping[str, Field]) -> dict[str, dict[str, Field]]:
-    """Groups of one episode each, by their names in counting order; {} if there are none."""
+    """Groups that hold one episode each, by name in numerical order; {} if there are none."""
     for level in range(4):
         found: dict[str, dict[str, Field]] = {}
         for name, field in fields.items():
@@ -308,7 +308,7 @@ def _numbered_groups(fields: Mapping[str, Field]) -> dict[str, dict[str, Field]]
                 group["/".join(parts[level + 1 :])] = field
         stems = {re.sub(r"\d+$", "", name) for name in found}
         common = set.intersection(*(set(group) for group in found.values())) if found else set()
-        # cam0 and cam1 hold images at the same time; episodes hold the same numbers.
+        # Episodes have numeric fields in common; groups such as cam0 and cam1 do not.
         same = any(fields_[n].kind == "number" for fields_ in found.values() for n in common)
         alone = len(found) == 1 and not re.match(r"demo|ep|traj|\d", min(found).split("/")[-1])
         if len(stems) == 1 and same and not alone:

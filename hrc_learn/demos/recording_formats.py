@@ -50,7 +50,7 @@ def open_recordings(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
         columns: Names for the columns of a .npy file, or of a text file without a header.
 
     Raises:
-        DatasetError: The path is missing, of another kind, damaged, or leads to other files.
+        DatasetError: The path is missing, of an unknown format, damaged, or has links.
     """
     reader = _reader_of(path)
     try:
@@ -59,7 +59,7 @@ def open_recordings(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
         return reader(path)
     except (DatasetError, ModuleNotFoundError):
         raise
-    except Exception as error:  # of any library, about a file from anywhere
+    except Exception as error:  # foreign files may raise any error
         raise DatasetError(f"cannot be read ({error}): copy it again", file=path) from error
 
 
@@ -88,7 +88,7 @@ def _known_reader(path: Path) -> Callable[..., list[Recording]] | None:
         return read_bag if is_bag(path) else read_zarr if is_zarr else None
     name = path.name.lower()
     for suffix, reader in READERS.items():
-        # The files of one RLDS set are numbered behind the suffix.
+        # The files of an RLDS dataset have a number after the suffix.
         if name.endswith(suffix) or (suffix == ".tfrecord" and suffix in name):
             return reader
     return None
@@ -118,7 +118,7 @@ def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
 
 
 def _numpy_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays of a file by its content, whatever its name ends in."""
+    """Arrays of a file, whose format is found by its content, not by its suffix."""
     name = None
     with path.open("rb") as stream:
         single = stream.read(6) == b"\x93NUMPY"
@@ -167,7 +167,7 @@ def read_hdf5(path: Path) -> list[Recording]:
             if isinstance(node, h5py.Group):
                 _attributes(node.attrs, details)
             elif not isinstance(node, h5py.Dataset):
-                continue  # a type of its own holds no numbers
+                continue  # a named type holds no numbers
             elif node.external or node.is_virtual:
                 raise DatasetError("is kept in another file: not opened", file=path, key=place)
             elif node.shape == ():
@@ -195,7 +195,7 @@ def _text(value: Any) -> str:
 
 
 def _attributes(attributes: Mapping[str, Any], details: dict[str, Any]) -> None:
-    """Frame rate and task among the attributes of a group."""
+    """Add the frame rate and the task among the attributes of a group to `details`."""
     for name, value in attributes.items():
         key = name.lower()
         with contextlib.suppress(TypeError, ValueError, AttributeError, ZeroDivisionError):
@@ -254,7 +254,7 @@ def read_mat(path: Path) -> list[Recording]:
 
 
 def _within(value: Any, place: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays of nested structures and cells, by their places."""
+    """Arrays of nested structures and cells, by their paths."""
     if isinstance(value, np.ndarray) and value.dtype.hasobject:
         value = list(value.ravel())
     if isinstance(value, list):
@@ -267,7 +267,10 @@ def _within(value: Any, place: str = "") -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _frames_first(one: Recording) -> Recording:
-    """Arrays with their frames, of which most arrays have as many, along the first axis."""
+    """The recording with the frames of all arrays along the first axis.
+
+    The number of frames is the most frequent length among the longest axes of the arrays.
+    """
     fields = one.fields
     lengths = [max(f.shape) for f in fields.values() if len(f.shape) <= 2]
     frames = max(dict.fromkeys(lengths), key=lengths.count, default=0)
@@ -277,7 +280,7 @@ def _frames_first(one: Recording) -> Recording:
 
 
 def read_tfrecord(path: Path) -> list[Recording]:
-    """Episodes of an RLDS dataset, one record each; arrays have their components in a row."""
+    """Episodes of an RLDS dataset, one per record; arrays are flattened to rows."""
     episodes: list[Recording] = []
     size, offset = path.stat().st_size, 0
     with path.open("rb") as stream:
@@ -342,13 +345,13 @@ READERS: dict[str, Callable[..., list[Recording]]] = {
     ".tfrecord": read_tfrecord,
     **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
 }
-"""Reader of each suffix."""
+"""Suffix -> reader."""
 
 
 def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
-    """Episodes of a folder: files that count are episodes, others belong together.
+    """Episodes of a folder: numbered files are one episode each, other files together form one.
 
-    A video belongs to the episode whose name it begins with.
+    A video belongs to the file with whose name its own name begins.
     """
     entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     entries.sort(key=lambda entry: natural(entry.name))

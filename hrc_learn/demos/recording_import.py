@@ -23,12 +23,12 @@ from hrc_learn.demos.videos import Image, decode_image
 
 _POSE = ("position", "orientation")
 _BATCH = 32
-"""Images read at a time."""
+"""Number of images read at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One recording on the clock of its state."""
+    """One recording, at the stamps of its state."""
 
     demonstration: Demonstration
     images: dict[str, tuple[Field, Int64[np.ndarray, " _frames"]]] = field(default_factory=dict)
@@ -38,7 +38,7 @@ class Episode:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportPlan:
-    """Recordings and what they were understood as."""
+    """Recordings and the meaning found for their fields."""
 
     recordings: tuple[Recording, ...]
     meaning: Meaning
@@ -59,7 +59,7 @@ class ImportPlan:
         return "action" in self.meaning.kept or "command_position" in self.meaning.selections
 
     def counts(self) -> dict[str, int]:
-        """Numbers of episodes, frames, and of fields understood, kept and left out."""
+        """Numbers of episodes and frames, and of fields understood, kept and left out."""
         meaning = self.meaning
         return {
             "episodes": len(self.recordings),
@@ -73,7 +73,7 @@ class ImportPlan:
         """The preview: fields and their meaning, notes, actions and episodes.
 
         Args:
-            actions: True if next states are to be the actions where none were recorded.
+            actions: True if next states serve as the actions in case none were recorded.
         """
         meaning = self.meaning
         rows = [("fields", "understood as", "unit", "sure", "evidence")]
@@ -110,7 +110,7 @@ class ImportPlan:
         yield "{episodes} episodes of {frames} frames in all".format(**self.counts())
 
     def template(self) -> str:
-        """Content of a mapping file (JSON) that says what was understood."""
+        """Content of a mapping file (JSON) with the meaning that was found."""
         meaning = self.meaning
         columns = {role: self._tokens(s.columns) for role, s in meaning.selections.items()}
         columns |= {key: self._tokens(places) for key, (places, _) in meaning.kept.items()}
@@ -126,7 +126,7 @@ class ImportPlan:
     def _tokens(self, places: Sequence[Place]) -> list[str]:
         """Fields and ranges of fields that name the columns."""
         fields, tokens = self.recordings[0].fields, []
-        # Within a run, places count as their indices do.
+        # Within a run, the component index increases with the place in the list.
         runs = groupby(enumerate(places), key=lambda one: (one[1][0], one[1][1] - one[0]))
         for (name, _), run in runs:
             indices = [index for _, (_, index) in run]
@@ -142,7 +142,7 @@ def plan_import(
 
     Args:
         paths: Files and folders.
-        options: The caller's word about them.
+        options: The caller's options.
         columns: Names for the columns of .npy files, or of text files without a header.
 
     Raises:
@@ -167,7 +167,7 @@ def write_plan(
         actions: Take the next state as action where no commands were recorded.
 
     Returns:
-        Numbers of episodes and frames, seconds and the frame rate.
+        Numbers of `episodes` and `frames`, total duration `seconds` [s] and `fps` [1/s].
 
     Raises:
         ValueError: Episodes do not fit into one dataset, or as in `ImportPlan.episodes`.
@@ -204,7 +204,7 @@ def write_plan(
 
 
 def _with_next_states(demo: Demonstration) -> Demonstration:
-    """Take the joints, the pose or the state of the next frame as action; the last repeats."""
+    """Use joints, pose or state of the next frame as the action; the last one repeats."""
     following = np.minimum(np.arange(len(demo)) + 1, len(demo) - 1)
     if demo.joint_position is not None:
         return replace(demo, command_position=demo.joint_position[following])
@@ -215,7 +215,7 @@ def _with_next_states(demo: Demonstration) -> Demonstration:
 
 
 def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> Episode:
-    """One recording on the clock of its state, in SI units."""
+    """One recording, at the stamps of its state, in SI units."""
     clock = clock_of_state(recording, meaning, options)
     time, step = clock.time, max(float(np.median(np.diff(clock.time))), 1e-9)
 
@@ -238,7 +238,7 @@ def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> 
             start_time=float(time[0]),
             joint_names=meaning.joint_names,
             task=options.task or recording.task or recording.file.stem,
-            # LeRobot counts frames at a whole rate; true stamps are kept in their own column.
+            # LeRobot uses whole frame rates; true stamps are kept in a column of their own.
             fps=options.fps or max(1, round(1 / step)),
             extra=extra,
             **demonstration_fields(quantities, factors),
@@ -263,14 +263,14 @@ def _images(
             if images.kind == "encoded":
                 image = decode_image(bytes(image))
             elif image.dtype != np.uint8:
-                # Of real numbers, 0 to 1 or 0 to 255.
+                # Images of real numbers range from 0 to 1 or from 0 to 255.
                 scale = scale or (255.0 if float(batch.max()) <= 1.0 else 1.0)
                 image = np.clip(np.rint(image * scale), 0, 255).astype(np.uint8)
             yield _rgb(image)[: size[0], : size[1]]
 
 
 def _rgb(image: np.ndarray) -> Image:
-    """An image with its three colours last."""
+    """The image with its three colour channels last."""
     image = image[..., None] if image.ndim == 2 else image
     image = image if image.shape[-1] in (1, 3, 4) else np.moveaxis(image, 0, -1)
     image = np.repeat(image, 3, axis=-1) if image.shape[-1] == 1 else image

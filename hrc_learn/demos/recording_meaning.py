@@ -1,7 +1,7 @@
-"""Meaning of the fields of recordings: by the caller's word, by name, and by their values.
+"""Meaning of the fields of recordings, from the caller's options, their names and their values.
 
-Names and units are judged as for datasets (`read.columns`, `read.units`). What is not
-understood is left out and listed, or kept as recorded where it is the state or the action.
+Names and units are judged as for datasets (`read.columns`, `read.units`). Fields that are not
+understood are left out and listed; a state or an action among them is kept as recorded.
 """
 
 import re
@@ -28,13 +28,14 @@ from hrc_learn.demos.recording_names import (
 )
 
 _REACH = 5.0
-"""Beyond the reach of any arm on a fixed base [m]."""
+"""Distance beyond the reach of any arm on a fixed base [m]."""
 _ANGLES = re.compile(r"(?:^|[._])r_?x$", re.IGNORECASE)
 _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
-"""Episodes and frame rate [1/s] with which a command is compared: 30 frames of delay."""
+"""Number of episodes and frame rate [1/s] for comparing commands with joints. At this rate, the
+longest delay that is tried is 30 frames."""
 _ALIKE = 0.3
-"""Distance of a command from its joint, as a fraction of that of any other command, below which
-their order is known."""
+"""Largest distance of a joint's nearest command, as a fraction of the second nearest one's, at
+which the order of the commands is clear."""
 
 
 @dataclass(kw_only=True)
@@ -42,12 +43,12 @@ class Meaning:
     """Meaning of the fields of recordings, found step by step."""
 
     selections: dict[str, ColumnSelection]
-    """Columns of each quantity, by role; their keys are fields."""
+    """Columns of each quantity, by role; a column is named by a field, not by a feature."""
     decisions: dict[str, UnitDecision] = field(default_factory=dict)
     """Unit of each quantity."""
     joint_names: tuple[str, ...] = ()
     kept: dict[str, tuple[tuple[Place, ...], tuple[str, ...]]] = field(default_factory=dict)
-    """Feature of the dataset -> columns that are kept as recorded, and their names there."""
+    """Feature of the dataset -> columns kept as recorded, and their names in the feature."""
     cameras: dict[str, str] = field(default_factory=dict)
     """Camera -> field."""
     time: str = ""
@@ -56,11 +57,11 @@ class Meaning:
     """Field -> reason."""
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    """Doubts that may have changed the values."""
+    """Doubtful decisions that may have changed the values."""
 
     @property
     def main(self) -> str:
-        """Field whose frames are those of the state."""
+        """Field of the state, which determines the frames of the episode."""
         for role in ("joint_position", "position", *ORIENTATION_ROLES, *self.selections):
             if role in self.selections:
                 return self.selections[role].columns[0][0]
@@ -82,8 +83,8 @@ def understand(
 
     Args:
         recordings: Episodes of one robot.
-        options: The caller's word, which comes before names and values.
-        hinted: True if the caller named the columns of a file: unknown ones are then joints.
+        options: The caller's options, which take precedence over names and values.
+        hinted: True if the caller named the columns of a file: unknown columns are then joints.
 
     Raises:
         DatasetError: A named field does not exist, nothing was understood, a quantity has a
@@ -126,7 +127,7 @@ def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
 def _by_name(
     first: Recording, options: ImportOptions, hinted: bool
 ) -> tuple[Meaning, FieldSearch]:
-    """Meaning of the fields of one episode by the caller's word and by their names."""
+    """Meaning of the fields of one episode, from the caller's options and their names."""
     explicit = _explicit(first, options)
     given = {place[0] for places in explicit.values() for place in places}
     search = FieldSearch(first, hinted)
@@ -147,7 +148,7 @@ def _by_name(
         },
         cameras=find_cameras(first, options.images),
         left_out=search.left_out,
-        # The preview shows the others already.
+        # The preview already shows what the other notes say.
         notes=[
             search.explained(n)
             for n in found.notes
@@ -210,7 +211,7 @@ def _selection(first: Recording, role: str, places: Sequence[Place]) -> ColumnSe
 
 
 def _add_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str]) -> None:
-    """Keep vectors whose names tell no content as recorded, as the state."""
+    """Keep a state of unknown content as recorded; an unnamed array is taken for joints."""
     for name in states:
         places = first.places(name, "state")
         if name == UNNAMED and not meaning.selections:
@@ -226,7 +227,7 @@ def _add_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str])
             meaning.left_out[name] = "a state of unknown content; to keep it: observation.NAME"
         else:
             meaning.kept["observation.state"] = (tuple(places), column_names(first, places))
-            meaning.notes.append(f"{name} is kept as recorded: its name tells no quantity")
+            meaning.notes.append(f"{name} is kept as recorded: its name tells no content")
 
 
 def _add_fingers(meaning: Meaning, search: FieldSearch) -> None:
@@ -247,7 +248,7 @@ def _add_fingers(meaning: Meaning, search: FieldSearch) -> None:
 
 
 def _name_joints(meaning: Meaning, given: tuple[str, ...], first: Recording) -> None:
-    """Give the joints their names; quantities of other joints are left out."""
+    """Give the joints their names; quantities of another number of joints are left out."""
     chosen = {r: s for r, s in meaning.selections.items() if r in JOINT_FIELDS}
     if not chosen:
         return
@@ -286,7 +287,7 @@ def read_columns(
 def _decide_units(
     meaning: Meaning, options: ImportOptions, recordings: Sequence[Recording]
 ) -> None:
-    """Decide on the unit of each quantity; doubtful ones are refused."""
+    """Decide on the unit of each quantity; a doubtful unit is an error."""
     for role, unit in options.units.items():
         unit_factor(role, unit)
     selections, first = meaning.selections, recordings[0]
@@ -313,7 +314,7 @@ def _decide_units(
         doubt = None if stated else decision.doubt
         largest = _largest(first, selections[role], (3, 7, 11) if role == "pose_matrix" else ())
         if role == "pose_matrix" and not stated and largest > _REACH:
-            doubt = f"{role} in m or mm? It moves to {largest:.4g}: say --units {role} mm, or m"
+            doubt = f"{role} in m or mm? It reaches {largest:.4g}: say --units {role} mm, or m"
         if doubt is not None:
             doubt = doubt.partition(", or leave columns")[0]  # an option of other commands
             if role == "joint_position" and "gripper" not in selections:
@@ -330,7 +331,7 @@ def _decide_units(
 
 
 def _gripper_among(first: Recording, joints: ColumnSelection) -> list[str]:
-    """A question about last columns without names that behave as those of a gripper."""
+    """Question about the last columns, if these are unnamed and behave like a gripper."""
     values = read_columns(first, joints.columns)
     if len(values) < 2:
         return []
@@ -361,7 +362,7 @@ def _decide_commands(
         meaning: Receives the commands.
         recordings: Episodes.
         named: True if the caller named the commands.
-        actions: Vectors that are named as an action, but not by their content.
+        actions: Vectors whose names tell that they are an action, but not their content.
     """
     selections, kept, first = meaning.selections, meaning.kept, recordings[0]
     joints, command = selections.get("joint_position"), selections.get("command_position")
@@ -414,9 +415,9 @@ def _matched(
 def _in_order(
     first: Recording, command: tuple[Place, ...], joints: Sequence[Place]
 ) -> tuple[Place, ...]:
-    """Commands without names in the order of the joints, where it is another and clear.
+    """Unnamed commands, put in the order of the joints if that order is clear.
 
-    A controller has an order of its own, which such commands do not tell.
+    Controllers may order the joints differently, and unnamed commands do not show it.
     """
     if not len(command) == len(joints) > 1:
         return command

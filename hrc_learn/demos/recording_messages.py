@@ -1,6 +1,6 @@
-"""Messages of robots as numbers, poses and images, understood by their attributes.
+"""Messages of robots as numbers, poses and images, recognised by their attributes.
 
-Types of any ROS version, JSON and protobuf are read alike, whether they are installed or not.
+Messages of any ROS version, JSON and protobuf are read alike; no type need be installed.
 """
 
 import base64
@@ -28,11 +28,11 @@ _CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": 
 TOOL = re.compile(
     r"(?:^|[/_])(?:tcp|tool\d*|eef?|end_?effector|flange|hand)(?:$|[/_])", re.IGNORECASE
 )
-"""Frames of a tool, and topics that tell its pose."""
+"""Names of tool frames, and of topics with the pose of a tool."""
 _BASE = re.compile(r"(?:^|[/_])base(?:_link)?$|link_?0$", re.IGNORECASE)
 
 type Messages = Callable[..., Iterator[tuple[str, int, Any]]]
-"""Function of topics and of the first time [ns]; gives topic, reception [ns] and message."""
+"""Function of topics and the first time [ns]; yields topic, time of reception [ns], message."""
 
 
 @dataclass
@@ -46,10 +46,10 @@ class Topic:
     """Times in the messages [s]; 0 where they have none."""
     values: list[np.ndarray] = field(default_factory=list)
     sample: Any = None
-    """First message of images."""
+    """First message; for images, it tells their format."""
 
     def add(self, received: int, stamp: float, value: np.ndarray, names: Any) -> None:
-        """Add numbers, in the order of the first message's names."""
+        """Add the numbers of a message, reordered to the names of the first message."""
         self.received.append(received * 1e-9)
         self.stamps.append(stamp)
         if names is not None and names != self.names:
@@ -67,11 +67,11 @@ def stamp_of(message: Any) -> float:
 
 
 type Part = tuple[str, tuple[str, ...] | None, np.ndarray]
-"""Field of a message, names of its components, and values; none of an image."""
+"""Field of a message, names of its components, and its values (empty for an image)."""
 
 
 def parts_of(name: str, message: Any) -> Iterator[Part]:
-    """Fields of a message; quantities that no attribute tells are left out."""
+    """Fields of a message; content that its attributes do not identify is left out."""
     has = lambda *names: all(hasattr(message, n) for n in names)  # noqa: E731
     if has("name", "position", "velocity"):
         for part, known in _JOINTS.items():
@@ -97,7 +97,7 @@ def parts_of(name: str, message: Any) -> Iterator[Part]:
 
 
 def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
-    """Transform of a position and a quaternion of any length."""
+    """Transform from a position and a quaternion, which need not have unit length."""
     from scipy.spatial.transform import Rotation
 
     matrix, wxyz = np.eye(4), (turn.w, turn.x, turn.y, turn.z)
@@ -108,7 +108,7 @@ def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
-    """Poses of tools and of last frames in their base, from `/tf` and `/tf_static`."""
+    """Poses of tools and of frames without children in their base, from `/tf`, `/tf_static`."""
     parents = {child: parent for parent, child in edges}
     moving = {c for (_, c), rows in edges.items() if np.ptp([r[2] for r in rows], axis=0).any()}
     wanted = [c for c in parents if TOOL.search(c) or c not in parents.values()]
@@ -138,7 +138,7 @@ def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, T
 
 
 def image_field(name: str, one: Topic, messages: Messages, notes: list[str]) -> Field | None:
-    """Field of a topic of images; None if they cannot be read, which a note says."""
+    """Field of an image topic; None, with a note, if the images cannot be read."""
     first, count = one.sample, len(one.received)
     kind = str(getattr(first, "encoding", "") or getattr(first, "format", "")).lower()
     raw, codec = hasattr(first, "width"), next((c for w, c in _CODECS.items() if w in kind), "")
@@ -149,13 +149,13 @@ def image_field(name: str, one: Topic, messages: Messages, notes: list[str]) -> 
         return None
 
     def contents(start: int) -> Iterator[tuple[Any, bytes]]:
-        since = int(one.received[start] * 1e9) - 1000  # rounded to a microsecond
+        since = int(one.received[start] * 1e9) - 1000  # 1 us earlier: times are rounded
         for _, _, message in messages([name, f"/{name}"], since):
             data = message.data
             yield message, base64.b64decode(data) if isinstance(data, str) else bytes(data)
 
     def decoded(start: int) -> Iterator[Any]:
-        if codec:  # every image may need all before it
+        if codec:  # every image may depend on all earlier ones
             yield from islice(_decoded(name, codec, contents(0)), start, None)
         for message, data in contents(start):
             yield _rgb(message, data, *_PIXELS[kind]) if raw else data
@@ -167,7 +167,7 @@ def image_field(name: str, one: Topic, messages: Messages, notes: list[str]) -> 
 
 
 def _decoded(name: str, codec: str, contents: Iterator[tuple[Any, bytes]]) -> Iterator[Image]:
-    """RGB images of a video of one packet a message."""
+    """RGB images of a video whose messages hold one packet each."""
     import av
 
     decoder: Any = av.CodecContext.create(codec, "r")
@@ -181,10 +181,10 @@ def _decoded(name: str, codec: str, contents: Iterator[tuple[Any, bytes]]) -> It
 
 
 def image_of(message: Any) -> Image:
-    """RGB image of a raw or compressed one.
+    """RGB image of a message with a raw or compressed image.
 
     Raises:
-        DatasetError: Its encoding is not read here, or it is damaged.
+        DatasetError: The encoding is not supported, or the image is damaged.
     """
     if not hasattr(message, "width"):
         return decode_image(bytes(message.data))
@@ -194,7 +194,7 @@ def image_of(message: Any) -> Image:
 
 
 def _rgb(message: Any, data: bytes, channels: int, form: str) -> np.ndarray:
-    """RGB image of a raw one, whose rows may be longer than the image is wide."""
+    """RGB image from raw data, whose rows may be padded beyond the width of the image."""
     import av
 
     rows = np.frombuffer(data, np.uint8).reshape(message.height, -1)

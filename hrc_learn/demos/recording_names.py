@@ -1,6 +1,6 @@
-"""Names of the fields of recordings, and the caller's word about them.
+"""Names of the fields of recordings, and the caller's options.
 
-Fields are presented as features of a dataset, so that its conventions apply.
+Fields are treated as features of a dataset, so that the naming conventions of datasets apply.
 """
 
 import re
@@ -34,7 +34,7 @@ _ALOHA = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ARM
 
 @dataclass(frozen=True, kw_only=True)
 class ImportOptions:
-    """The caller's word about recordings; also the content of a mapping file."""
+    """The caller's options for recordings; also the content of a mapping file."""
 
     columns: dict[str, str | list[str]] = field(default_factory=dict)
     """Quantity of `demos.ROLES`, "action" or "observation.NAME" -> fields, ranges of fields
@@ -48,7 +48,8 @@ class ImportOptions:
     joint_names: tuple[str, ...] = ()
     """Joint names."""
     fps: float | int | None = None
-    """Frame rate [1/s] where there are no stamps; with stamps, it is only recorded."""
+    """Frame rate [1/s] where there are no stamps. With stamps, it is only stored, but faster
+    topics are thinned to it."""
     duration: float | int | None = None
     """Duration of each episode [s] where there are no stamps."""
     task: str | None = None
@@ -76,7 +77,7 @@ def column_names(first: Recording, places: Sequence[Place]) -> tuple[str, ...]:
 
 
 def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str, str]:
-    """Cameras and the fields of their images, as the caller names them or by their names.
+    """Cameras and the fields of their images: those that the caller names, or else all images.
 
     Raises:
         DatasetError: A named field does not exist, or holds no images.
@@ -102,13 +103,13 @@ def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str,
 
 
 class FieldSearch:
-    """Features for the numbers of an episode, and the fields that are none.
+    """Features made of the numeric fields of an episode, and the fields that become none.
 
     Attributes:
         features: Features by key.
-        states: Vectors that are named as a state, but not by their content.
+        states: Vectors whose names tell that they are a state, but not their content.
         actions: The same for actions.
-        fingers: For each finger among the joints: True in a command, name, column.
+        fingers: Fingers among the joints: True for a command, then name and column.
         two_fingers: Field with the positions of a gripper's two fingers, "" if there is none.
         left_out: Field -> reason.
     """
@@ -117,7 +118,7 @@ class FieldSearch:
         """
         Args:
             first: The episode.
-            hinted: True if the caller named the columns: unknown ones are joints.
+            hinted: True if the caller named the columns: unknown columns are then joints.
         """
         self._first, self._hinted = first, hinted
         self.features: dict[str, Feature] = {}
@@ -127,7 +128,7 @@ class FieldSearch:
         self.fingers: list[tuple[bool, str, Place]] = []
         self.two_fingers = ""
         kinds = {"depth": "depth images are not written", "text": "text", "other": "no frames"}
-        kinds["pose"] = "no tool by its name; to take it: --orientation"
+        kinds["pose"] = "its name is not that of a tool; to use it: --orientation"
         kept = first.fields.items()
         self.left_out = {name: kinds[one.kind] for name, one in kept if one.kind in kinds}
 
@@ -138,7 +139,7 @@ class FieldSearch:
         for name, one in fields.items():
             parts = name.lower().split("/")
             if _IGNORED.fullmatch(parts[-1]) or any(part.startswith("next_") for part in parts):
-                self.left_out[name] = "counts, or is of a learner or the next frame"
+                self.left_out[name] = "a counter, or data of a learner or the next frame"
             elif one.width == 1 and len(parts) == 1:
                 table.append(name)
             else:
@@ -163,7 +164,7 @@ class FieldSearch:
         if name in self.left_out:
             return
         if key == "tcp_pose" and str(one.width) in _WORDS["turns"]:
-            # Which encoding, and in which order? Nothing tells.
+            # The encoding and its order are unknown.
             self.left_out[f"{name}[3:{one.width}]"] = _WORDS["turns"][str(one.width)]
             key, places = "eef_pos", places[:3]
         if key == "eef_quat" and not re.match(r"robot\d_", bare):  # robosuite: x, y, z, w
@@ -213,7 +214,7 @@ class FieldSearch:
         return key
 
     def _add_table(self, columns: Sequence[str]) -> None:
-        """Add the columns of a table, those that count as one vector."""
+        """Add the columns of a table; columns of one quantity become a vector."""
         groups: dict[str, list[tuple[str, str]]] = {}
         for name in columns:
             plain = _MEASURED.sub("", name.strip().lstrip("%").strip())
@@ -241,17 +242,17 @@ class FieldSearch:
                 self.left_out[name] = "its name says nothing"
         for key, members in groups.items():
             names = tuple(plain for _, plain in members)
-            # Names that only count, as q_0 and target_q_0, say no more than their order.
+            # Names that only number the columns, such as q_0, say no more than their order.
             counted = naming.role_of_key(key) and all(map(_INDEXED.fullmatch, names))
             self._add(key, [(n, 0) for n, _ in members], None if counted else names)
 
     def explained(self, note: str) -> str:
-        """A note of the reader about the field instead of the feature."""
+        """A note of the reader, with the field's name instead of the feature's."""
         key, colon, text = note.partition(": ")
         return f"{self._places[key][0][0]}{colon}{text}" if key in self._places else note
 
     def located(self, selection: ColumnSelection) -> ColumnSelection:
-        """The selection with fields for features."""
+        """The selection with fields in place of features."""
         columns = tuple(self._places[key][index] for key, index in selection.columns)
         return replace(selection, columns=columns)
 

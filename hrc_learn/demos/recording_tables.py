@@ -1,4 +1,4 @@
-"""Tables of numbers: text files as spreadsheets, loggers and numpy write them, and Parquet."""
+"""Tables of numbers: text files from spreadsheets, loggers and numpy, and Parquet files."""
 
 import csv
 import io
@@ -27,7 +27,7 @@ _WRONG_ROW = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     """Columns of a text file.
 
-    Fields are separated by commas, semicolons, tabs, bars or blanks; decimals may have a comma.
+    Fields are separated by commas, semicolons, tabs, bars or blanks; decimal commas are read.
     Lines that begin with #, % or // are comments, and the last one before the numbers may name
     the columns. The unnamed index that pandas writes is left out, as are columns of text;
     dates become seconds.
@@ -62,7 +62,7 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
         raise DatasetError("holds a header and no numbers", file=path)
     width = len(_split(rows[0][1], delimiter))
     if header and len(header) == width - 1:
-        header = ["", *header]  # R and pandas name no column of row numbers
+        header = ["", *header]  # R and pandas do not name the column of row numbers
     names = header or list(columns) or [str(place) for place in range(width)]
     if len(names) != width:
         raise DatasetError(f"{len(names)} column names for {width} columns", file=path)

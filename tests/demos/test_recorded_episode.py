@@ -53,8 +53,8 @@ def test_a_frame_that_does_not_fit(values, text):
     ("names", "text"),
     [
         (["joint_position"], "frame 2 lacks gripper: all frames need the quantities of the"),
-        (["joint_position", "gripper", "position"], "frame 2 gives position besides: all"),
-        (["position"], "frame 2 lacks gripper, joint_position and gives position besides: all"),
+        (["joint_position", "gripper", "position"], "frame 2 adds position: all"),
+        (["position"], "frame 2 lacks gripper, joint_position and adds position: all"),
     ],
 )
 def test_frames_of_an_episode_hold_the_same_quantities(names, text):

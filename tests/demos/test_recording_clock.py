@@ -235,7 +235,7 @@ def test_states_of_topics_are_thinned_to_the_fastest_camera():
 def test_states_of_topics_are_thinned_to_a_wanted_rate(fps):
     found = clock(streams(), meaning(time="qt", **JOINTS), fps=fps)
     np.testing.assert_allclose(found.time, 5 + np.arange(fps) / fps, atol=1e-9)
-    text = f"states at 100 Hz are thinned: the first state from each tick of {fps} Hz on"
+    text = f"states at 100 Hz are thinned: the first state at or after each tick of {fps} Hz"
     assert found.notes[-1].endswith(text)
     # Another rate than that of the states repeats none.
     found = clock(streams(), meaning(time="qt", **JOINTS), fps=150)

@@ -62,7 +62,7 @@ def test_joints_at_rest_are_compared_by_their_distance():
 def test_a_state_of_unknown_content_is_kept_and_left_out_next_to_joints():
     found = understood(state=Q)
     assert found.kept["observation.state"][1] == ("state_0", "state_1", "state_2")
-    assert found.notes == ["state is kept as recorded: its name tells no quantity"]
+    assert found.notes == ["state is kept as recorded: its name tells no content"]
     found = understood(state=Q, qpos=Q)
     text = "a state of unknown content; to keep it: observation.NAME"
     assert found.left_out == {"state": text}
@@ -174,7 +174,7 @@ def test_transforms_beyond_the_reach_of_an_arm_may_be_in_millimetres(flat):
         return understood(options, units=units, ee_pose=values)
 
     assert ask(4.9).decisions["pose_matrix"].unit == "m"
-    with pytest.raises(DatasetError, match=r"in m or mm\? It moves to 5\.1: say --units") as c:
+    with pytest.raises(DatasetError, match=r"in m or mm\? It reaches 5\.1: say --units") as c:
         ask(5.1)
     assert c.value.key == "ee_pose"
     assert ask(5.1, {"units": {"pose_matrix": "mm"}}).decisions["pose_matrix"].unit == "mm"
@@ -260,8 +260,8 @@ def test_fields_that_are_not_taken_are_listed_with_the_reason():
         "depth": "depth images are not written",
         "note": "text",
         "waves": "no frames",
-        "reward": "counts, or is of a learner or the next frame",
-        "next_obs/qpos": "counts, or is of a learner or the next frame",
+        "reward": "a counter, or data of a learner or the next frame",
+        "next_obs/qpos": "a counter, or data of a learner or the next frame",
         "camera_pose": "transforms of another frame than the hand's",
         "other": "not understood; to keep it: observation.NAME",
     }
