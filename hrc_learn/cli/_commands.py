@@ -16,7 +16,7 @@ from hrc_learn.cli._run import parse, status_of
 
 @dataclass(frozen=True)
 class Command:
-    """A command, its code imported when it runs."""
+    """A command, whose code is imported when it runs."""
 
     runs: str
     """Module of `hrc_learn.cli` and its function, which takes the arguments and returns the
@@ -34,7 +34,7 @@ class Command:
         return text.split(": ")[0].rstrip(".")
 
     def run(self, args: Any) -> int:
-        """Carry it out and return the exit status."""
+        """Run the command and return its exit status."""
         module, function = self.runs.split(".")
         return getattr(import_module(f"hrc_learn.cli.{module}"), function)(args) or 0
 
@@ -102,8 +102,8 @@ def _run(words: Sequence[str]) -> int:
         return 0
     if rest and rest[0] not in ("-h", "--help"):
         close = get_close_matches(rest[0], COMMANDS, 1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
-        raise ValueError(f"no command {rest[0]!r} of hrc; {hint}")
+        hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(COMMANDS)}"
+        raise ValueError(f"hrc has no command {rest[0]!r}; {hint}")
     print("\n".join(_overview()))
     return 0 if rest else 2
 
@@ -124,7 +124,7 @@ def name_leading(options: Sequence[str], words: Sequence[str]) -> list[str]:
     for i, option in enumerate(options):
         if not values:
             break
-        # All remaining values belong to the last option: tyro refuses what it cannot take.
+        # All remaining values go to the last option: tyro refuses those that it cannot take.
         taken = values if i == len(options) - 1 else values[:1]
         named += [f"--{option}", *taken]
         values = values[len(taken) :]
@@ -139,8 +139,8 @@ def _overview() -> list[str]:
         "",
         *_table((name, command.summary) for name, command in COMMANDS.items()),
         "",
-        "`hrc COMMAND --help` lists the options of a command. Every command writes its figures",
-        "with --json FILE.",
+        "`hrc COMMAND --help` lists the options of a command. Every command writes its",
+        "measured values with --json FILE.",
     ]
 
 

@@ -1,7 +1,7 @@
 """Frame of a command: command line, settings, exit status, error messages, JSON values.
 
-Exit status: 0 done, 1 the work failed, 2 bad input, 143 ended by SIGTERM. Bad input ends in one
-line on stderr. Settings beyond the options are fields of configuration dataclasses, as TOML:
+Exit status: 0 done, 1 the work failed, 2 bad input, 143 ended by SIGTERM. Bad input is reported
+in one line on stderr. Other settings are fields of configuration dataclasses, given as TOML:
 `--config site.speed=0.1 cell.toml` sets a field and reads a file; the last value counts.
 """
 
@@ -45,7 +45,7 @@ _LIBRARIES = {
     "meshes": ("example_robot_data",),
 }
 _DEVICES = {"--robot": "site.device", "--teleop": "site.leader"}
-"""Settings that hold LeRobot's options of a device."""
+"""Settings that hold LeRobot's options for a device."""
 EXTRAS = {library: extra for extra, names in _LIBRARIES.items() for library in names}
 """Extra of the package that installs a library."""
 
@@ -53,9 +53,10 @@ EXTRAS = {library: extra for extra, names in _LIBRARIES.items() for library in n
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
     """Parse the command line into the dataclass `args`, call `main` with it, and exit.
 
-    `main` returns the exit status, None for 0. A ValueError or a file that is missing, exists
-    or may not be used is the caller's mistake: status 2 and one line. A library that is not
-    installed: status 1 and the extra that installs it. Other exceptions show their traceback.
+    `main` returns the exit status, None for 0. A ValueError, or a file that is missing, already
+    exists or may not be used, is the caller's mistake: status 2 and one line on stderr. If a
+    library is not installed, the line names the extra that installs it, with status 1. Other
+    exceptions show their traceback.
     """
     words, program = sys.argv[1:], Path(sys.argv[0]).name
     description = (sys.modules[main.__module__].__doc__ or main.__doc__ or "").strip() or None
@@ -68,7 +69,7 @@ def status_of(work: Callable[[], int]) -> int:
     SIGTERM is raised as an exception, so that arms are stopped and files closed, with status
     143. A closed output, as with `hrc ... | head`, ends quietly with status 1.
     """
-    # Users need no line number of ours in a warning.
+    # Users do not need the source line of a warning.
     warnings.formatwarning = lambda message, *_place, **_line: f"warning: {message}\n"
     try:
         with _ended_by_sigterm():
@@ -82,7 +83,7 @@ def status_of(work: Callable[[], int]) -> int:
         library = (error.name or "").split(".")[0]
         if library in EXTRAS:
             extra = f"pip install 'hrc-learn[{EXTRAS[library]}]'"
-            missing = f"{library} is not installed, which this needs: {extra}"
+            missing = f"{library} is not installed; install it with: {extra}"
         elif not str(error).startswith("No module named"):
             missing = one_line(error)  # our own message, which says what to do
         else:
@@ -151,7 +152,7 @@ def parse[Args](
     Raises:
         SystemExit: After help, with status 0; after one line about bad input, with status 2.
     """
-    import tyro  # a tenth of a second, which a mistyped command does not need
+    import tyro  # takes 0.1 s, which a mistyped command avoids
 
     said = io.StringIO()
     try:
@@ -171,9 +172,9 @@ def parse[Args](
 def gathered_settings(words: Sequence[str]) -> list[str]:
     """Command line with all settings after one `--config`, in their order.
 
-    These are the values of every `--config`, of which the parser would keep the last alone, and
-    LeRobot's options of a device: `--robot.port=/dev/ttyACM0` and `--robot.port /dev/ttyACM0`
-    become `site.device.port=/dev/ttyACM0`.
+    Settings are the values of every `--config`, of which the parser would keep only the last,
+    and LeRobot's options for a device: `--robot.port=/dev/ttyACM0` and
+    `--robot.port /dev/ttyACM0` become `site.device.port=/dev/ttyACM0`.
     """
     rest, settings, in_settings, remaining = [], [], False, iter(words)
     for word in remaining:
@@ -193,7 +194,7 @@ def gathered_settings(words: Sequence[str]) -> list[str]:
 
 
 def _complaint(box: str) -> str:
-    """One line of the box in which tyro reports an error."""
+    """One-line message made from the box in which tyro reports an error."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)  # colours
     # Inside the frame: a title, then sections separated by rules.
     rows = [re.sub("[│╭╮╰╯]", " ", row).rstrip() for row in plain.splitlines()]
@@ -239,7 +240,7 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
 
 
 def refuse_repeats(episodes: Sequence[int]) -> None:
-    """Refuse an episode that is named twice, as it would count twice.
+    """Refuse episodes that are named twice, because they would count twice.
 
     Raises:
         ValueError: An episode is repeated.
@@ -262,7 +263,7 @@ def configuration(args: Any) -> dict[str, Any]:
 
 
 def command_line() -> str:
-    """Command line that repeats this process, to be pasted where it was started."""
+    """Command line that repeats this process, valid in the folder where it was started."""
     from hrc_learn.viz.report import shortest
 
     program, *arguments = sys.argv
@@ -343,14 +344,14 @@ def updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
 
 
 def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    """Settings without classes of ours, one given after the other."""
+    """Nested dictionary of settings, in which `new` overrides `old`."""
     both = old.keys() & new.keys()
     inner = {k for k in both if isinstance(old[k], dict) and isinstance(new[k], dict)}
     return old | new | {k: _merged(old[k], new[k]) for k in inner}
 
 
 def _converted(value: Any, hint: Any, place: str) -> Any:
-    """A TOML value as its annotated type."""
+    """A TOML value, converted to its annotated type."""
     if isinstance(hint, typing.TypeAliasType):
         hint = hint.__value__
     if value in ("none", "None") and type(None) in typing.get_args(hint):  # TOML has no null
@@ -365,7 +366,7 @@ def _converted(value: Any, hint: Any, place: str) -> Any:
 
 
 def _custom(kind: type, value: Any) -> Any:
-    """Value of a type that TOML does not know."""
+    """Value converted to a type that TOML does not have."""
     if kind is Path and isinstance(value, str):
         return Path(value)
     raise ValueError(f"{kind.__name__} cannot be given here")
@@ -385,7 +386,7 @@ def _refuse_unknown(value: Any, made: Any, place: str) -> None:
 
 
 def _listed(name: str, value: Any) -> Iterator[str]:
-    """Every setting below a name with its value, one a line."""
+    """Every setting below a name with its value, one per line."""
     if not dataclasses.is_dataclass(value):
         yield f"{name} = {value}"
         return

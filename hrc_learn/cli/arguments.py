@@ -1,8 +1,8 @@
 """Command lines of all commands.
 
-A command line is a frozen dataclass: each field is an option, its docstring the help. Nothing
-here imports a library, so that a mistyped option is found before any work; tests compare the
-choices with the definitions they repeat.
+A command line is a frozen dataclass: each field is an option, and its docstring is the help.
+This module imports no library, so that a mistyped option is reported at once. Choices therefore
+repeat definitions of other modules; tests compare the two.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ Scaling = Literal["none", "paper", "amplitude", "rotation"]
 
 
 def sibling(dataset: Path, suffix: str) -> Path:
-    """Folder DATASET_suffix next to a dataset, which may be given as "." or ".."."""
+    """Folder DATASET_suffix next to a dataset; the dataset may be given as "." or ".."."""
     named = dataset if dataset.name not in ("", "..") else dataset.resolve()
     return named.with_name(f"{named.name}_{suffix}")
 
@@ -67,7 +67,7 @@ class OnDataset(Measured):
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Meaning of a dataset's columns, where the reader does not find it."""
+    """Meaning of those columns of a dataset that cannot be detected."""
 
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
@@ -76,7 +76,7 @@ class Columns:
 
 
 def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str] | None]:
-    """Columns by quantity: a feature, a range of it, a list of names from "a,b", or none."""
+    """Columns by quantity: a feature, a range of a feature, names given as "a,b", or None."""
     texts = {role: text.split(",") if "," in text else text for role, text in mapping.items()}
     return {role: None if text == "none" else text for role, text in texts.items()}
 
@@ -94,24 +94,24 @@ class Check(Columns, OnDataset, Written):
     strict: bool = False
     """Count warnings as errors in the exit status."""
     full: bool = False
-    """Print each finding on a line of its own, not one line per kind."""
+    """Print one line per finding instead of one line per kind of finding."""
     keep_contract: bool = False
     """Store the meaning of the columns in DATASET/meta/hrc_learn.json."""
     camera: bool = False
-    """Also find the episodes between which the camera was moved, by the tool's marker."""
+    """Also detect between which episodes the camera was moved, from the tool's marker."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repair(Columns, OnDataset):
-    """Repair a dataset into a new copy, or finish what a killed process left of it.
+    """Write a repaired copy of a dataset, or complete one that a killed process left.
 
     By default the copy is trimmed, measured angles are unwrapped and the signs of quaternions
     are made continuous. Commands, grippers and discrete columns stay as they are. The changes
     are listed by episode; the original dataset stays as it is.
 
-    What a killed process left unfinished at DATASET or in a folder below it is finished first,
-    in place: an interrupted recording becomes a dataset of its saved episodes, an interrupted
-    replacement is completed. A copy follows then only if --out is given.
+    Work that a killed process left unfinished in DATASET or in a folder below it is completed
+    first, in place: an interrupted recording becomes a dataset of its saved episodes, and an
+    interrupted replacement is completed. In this case a copy is written only with --out.
 
         hrc repair broken repaired
         hrc repair killed_recording
@@ -121,11 +121,11 @@ class Repair(Columns, OnDataset):
     out: Path | None = None
     """Folder of the new dataset, which must not exist. Default: DATASET_repaired."""
     skip: tuple[Literal["trim", "unwrap", "signs", "late"], ...] = ()
-    """Default repairs to leave out: rest at both ends, full turns of angles, quaternion signs,
-    frames whose time stamp does not increase."""
+    """Default repairs to leave out: trim (rest at both ends), unwrap (full turns of angles),
+    signs (of quaternions), late (frames whose time stamp does not increase)."""
     drop: tuple[Literal["bad-frames", "bad-episodes", "repeats"], ...] = ()
-    """Additional repairs: frames with values that are not finite, episodes that cannot be
-    repaired, frames that repeat the one before for up to 0.1 s."""
+    """Additional repairs: drop frames with non-finite values, episodes that cannot be repaired,
+    or frames that repeat the previous one for up to 0.1 s."""
     offsets: dict[str, float] = field(default_factory=dict)
     """Angles to add to measured joints [deg], such as: joint_2 2.5 joint_4 -4."""
     fps: float | None = None
@@ -145,18 +145,18 @@ class Repair(Columns, OnDataset):
 class Merge(Measured):
     """Merge datasets of one robot into a new one, and list their differences.
 
-    Columns are matched by name and brought to the order and units of the first dataset, tasks
-    by their texts. Videos are copied. What cannot be matched is refused.
+    Columns are matched by name and converted to the order and units of the first dataset. Tasks
+    are matched by their texts. Videos are copied. Datasets that do not match are refused.
 
         hrc merge monday tuesday --out pour
     """
 
     datasets: tuple[Path, ...]
-    """Folders of two LeRobot datasets or more."""
+    """Folders of two or more LeRobot datasets."""
     out: Path
     """Folder of the new dataset, which must not exist."""
     fps: float | None = None
-    """Resample datasets of other frame rates [1/s], which needs --no-videos."""
+    """Resample datasets to this frame rate [1/s]. Needs --no-videos."""
     videos: bool = True
     """Keep the videos."""
 
@@ -183,7 +183,7 @@ class Curate(OnDataset):
     accept: tuple[int, ...] = ()
     """Episodes to keep as they are."""
     cut: dict[int, str] = field(default_factory=dict)
-    """Frames to keep of an episode, such as: 12 30:410."""
+    """Frames of an episode to keep: 12 30:410 keeps frames 30 to 409 of episode 12."""
     write: bool = False
     """Write the cleaned dataset from the stored decisions, without a page."""
 
@@ -199,7 +199,7 @@ class Import(Measured):
 
     Reads .npz, .npy, text tables (.csv, .tsv, .txt), Parquet, HDF5 (ALOHA, robomimic and
     others), zarr, .mat, RLDS, bags of ROS 1 and 2, MCAP, and folders of these with videos. A
-    preview lists what each field was understood as; options or a mapping file correct it.
+    preview lists the meaning assigned to each field; options or a mapping file correct it.
     Recorded commands become actions.
 
         hrc import pour.npz --out pour --joints q --time t
@@ -213,25 +213,26 @@ class Import(Measured):
     out: Path | None = None
     """Folder of the new dataset, which must not exist."""
     dry_run: bool = False
-    """Show what was understood and write no dataset."""
+    """Show the preview and write no dataset."""
     mapping: Path | None = None
     """Mapping file (JSON or TOML): fields of each quantity, units, images. With --dry-run, a
     file that does not exist is written as a template."""
     joints: tuple[str, ...] = ()
     """Array of joint positions, or its columns."""
     command: tuple[str, ...] = ()
-    """Array of commanded joint positions, or its columns: the action."""
+    """Array of commanded joint positions, or its columns. They become the action."""
     gripper: tuple[str, ...] = ()
     """Array or column of the gripper's opening."""
     position: tuple[str, ...] = ()
     """Array of the end effector's position, or its columns."""
     orientation: tuple[str, ...] = ()
-    """Array of its orientation (quaternion, rotation vector, 6D or 4x4), or its columns."""
+    """Array of the end effector's orientation (quaternion, rotation vector, 6D or 4x4), or its
+    columns."""
     time: str | None = None
     """Array or column of time stamps."""
     columns: tuple[str, ...] = ()
-    """Column names of a .npy file or a table without a header: px py pz and qw qx qy qz are
-    poses, t is time, all others joints."""
+    """Column names for a .npy file or a table without a header. px py pz and qw qx qy qz form a
+    pose, t is time, all others are joints."""
     joint_names: tuple[str, ...] = ()
     """Joint names. Default: those of the columns, or joint1, joint2, ..."""
     units: dict[str, str] = field(default_factory=dict)
@@ -241,10 +242,10 @@ class Import(Measured):
     duration: float | None = None
     """Duration of each demonstration [s] if there are no time stamps."""
     fps: float | None = None
-    """Frame rate [1/s] if there are no time stamps; bags are thinned to it."""
+    """Frame rate [1/s] if there are no time stamps. Bags are reduced to this rate."""
     actions: bool = True
-    """Where no commands were recorded, take the state of the next frame as action, as LeRobot's
-    policies need them."""
+    """If no commands were recorded, use the state of the next frame as the action, because
+    LeRobot's policies need actions."""
     robot_type: str = "unknown"
     """Robot type stored in the dataset."""
     task: str | None = None
@@ -256,18 +257,18 @@ class Show(Measured):
     """Open a run, a fit or the demonstrations of a dataset in Rerun.
 
     A dataset is shown with its arm in 3D, cameras, gripper, and commands next to measured
-    joints. Each episode has a timeline of its own; choose it in the time panel. The arm follows
-    from the dataset's robot type, or from --robot.
+    joints. Each episode has a timeline of its own; choose it in the time panel. The arm is
+    given by the dataset's robot type, or by --robot.
     """
 
     dataset: Path
     """Folder of a run, a fit or a dataset, or a recording (.rrd)."""
     out: Path | None = None
-    """File for the recording (.rrd) of a dataset. It is not opened."""
+    """Write the recording of a dataset to this file (.rrd) instead of opening it."""
     web: bool = False
-    """Open it in the browser, as on machines without a screen. Ctrl-C ends it."""
+    """Show it in the browser until Ctrl-C. This is the default without a screen."""
     episodes: tuple[int, ...] = ()
-    """Episodes to show. Default: all, or 200 of a larger dataset."""
+    """Episodes to show. Default: all, but at most 200 or a million frames."""
     robot: str = ""
     """Arm to draw, as in `hrc demo`. Default: by the dataset's robot type."""
 
@@ -276,8 +277,8 @@ class Show(Measured):
 class Push(OnDataset):
     """Check a dataset and have LeRobot upload it to the Hugging Face Hub with a dataset card.
 
-    Creates the repository if needed. Log in with `hf auth login` first. LeRobot takes datasets
-    of version 3.0: `hrc repair` makes one of an older version.
+    Creates the repository if needed. Log in with `hf auth login` first. LeRobot accepts only
+    datasets of version 3.0: `hrc repair` converts older ones.
 
         hrc push pour alice/pour --license cc-by-4.0
         hrc push pour alice/pour --dry-run
@@ -292,7 +293,7 @@ class Push(OnDataset):
     tags: tuple[str, ...] = ()
     """Tags in addition to those of LeRobot."""
     unsound: bool = False
-    """Upload a dataset that has errors."""
+    """Upload the dataset even if it has errors."""
     dry_run: bool = False
     """Check the dataset without uploading it."""
 
@@ -323,47 +324,49 @@ class FitPrimitives(Columns, Fit):
     channels: tuple[Channel, ...] = ()
     """Channels to learn. Default: joint and pose, if the dataset has them."""
     several: Literal["best", "mean", "distribution", "contextual", "streamed"] = "best"
-    """Common model of several demonstrations: the best of mean, contextual and nearest on
-    held-out ones; their mean; their mean and all of them (for a ProbabilisticDMP); a function
-    of the context; or one primitive fitted in a single pass over the data."""
+    """Common model of several demonstrations. best: of mean, contextual and nearest, the one
+    that predicts held-out demonstrations best. mean: their mean. distribution: their mean and
+    all primitives (for a ProbabilisticDMP). contextual: a function of the context. streamed:
+    one primitive, fitted in a single pass over the data."""
     context: tuple[str, ...] = ()
-    """Columns whose first row is the context. Default: start and goal."""
+    """Columns whose values in the first frame are the context. Default: start and goal."""
     n_basis: int | None = 60
     """Number of basis functions. None: chosen by the error on held-out samples."""
     method: Literal["trajectory", "ridge", "lwr"] = "trajectory"
-    """Least squares on the motion, ridge regression on the forcing term, or the paper's locally
-    weighted regression."""
+    """trajectory: least squares on the motion. ridge: ridge regression on the forcing term.
+    lwr: the paper's locally weighted regression."""
     scaling: Scaling = "none"
     """Scaling of the forcing term with start and goal."""
     joint_names: tuple[str, ...] = ()
     """Joints to learn, in this order. Default: all."""
     as_lerobot_policy: bool = False
-    """Write a trained LeRobot policy of type dmp instead, from observations to actions."""
+    """Write a LeRobot policy of type dmp instead, which maps observations to actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitImageJacobian(Fit):
     """Fit the image Jacobian of an uncalibrated camera to a dataset.
 
-    Learns the motion of the marker's image as a function of the end effector's motion, with its
-    uncertainty, and the target in the image if an object was observed. With --marker it finds
-    the marker in the videos first; the pixels go to DATASET.features, and an interrupted search
-    is resumed. Under torchrun each process reads a part of the demonstrations.
+    Learns how the marker moves in the image when the end effector moves, with the uncertainty,
+    and the target in the image if an object was observed. --marker first searches the videos
+    for the marker: its pixels are stored in DATASET.features, so that an interrupted search can
+    be resumed. Under torchrun, each process reads a part of the demonstrations.
 
         hrc fit image-jacobian grasping --marker 3 --camera front
         hrc fit image-jacobian --dataset grasping --markerless
     """
 
     marker: int | None = None
-    """Marker on the end effector, by its number in OpenCV's ArUco dictionary 4x4_50. Default:
-    pixels are in the dataset or were found earlier."""
+    """Number of the end effector's marker in OpenCV's ArUco dictionary 4x4_50. Default: use the
+    pixels that the dataset holds or an earlier search found."""
     markerless: bool = False
     """Find tool and object in the videos without any marker."""
     camera: str | None = None
-    """Camera of --marker or --markerless. May be left out if there is only one."""
+    """Camera to search with --marker or --markerless. Needed if there are several."""
 
     neurons: Literal["around", "grid"] = "around"
-    """Thirteen neurons around the demonstrated poses, or the paper's grid over x and y."""
+    """around: thirteen neurons around the demonstrated poses. grid: the paper's grid over x and
+    y."""
     learn: bool = True
     """Learn neurons, noise and prior by the gradient of the evidence."""
     config: tuple[str, ...] = ()
@@ -373,19 +376,19 @@ class FitImageJacobian(Fit):
 
 @dataclass(frozen=True, kw_only=True)
 class Tokens(OnDataset, Written):
-    """Fit tokens of action chunks to a dataset, or report their length and errors.
+    """Fit a tokenizer of action chunks to a dataset, or report its token counts and errors.
 
     Every sequence of tokens decodes to a motion that continues from the arm's state and stays
-    in the demonstrated range. Every fifth episode is left out of the fit, for the figures.
+    in the demonstrated range. Every fifth episode is held out of the fit, to measure errors.
 
         hrc tokens fit --dataset pouring --config tolerance=0.005 seconds=0.5
         hrc tokens report --dataset pouring --model pouring_tokens
     """
 
     action: Literal["fit", "report"]
-    """Fit a tokenizer, or report the figures of one."""
+    """Fit a tokenizer, or report the measured values of a fitted one."""
     model: Path | None = None
-    """Folder of hrc tokens fit, for the report."""
+    """Folder written by hrc tokens fit, for the report."""
     out: Path | None = None
     """Folder for the tokenizer. Default: DATASET_tokens."""
     config: tuple[str, ...] = ()
@@ -398,42 +401,42 @@ class Evaluate(OnDataset, Written):
     """Evaluate a model of `hrc fit` on demonstrations that it has not seen.
 
     Primitives predict each demonstration from start, goal and duration. Without a model,
-    primitives are fitted to four of five demonstrations first. An image Jacobian is compared
-    with the simulator's true one. Exit status 1 if a target was missed.
+    primitives are first fitted to four fifths of the demonstrations. An image Jacobian is
+    compared with the simulator's true one. Exit status 1 if a target was missed.
     """
 
     model: Path | None = None
-    """Folder of `hrc fit`."""
+    """Folder written by `hrc fit`."""
     out: Path | None = None
     """Folder for figures and measured values of primitives."""
     episodes: tuple[int, ...] = ()
     """Episodes to evaluate on. Default: those not learned from, or all."""
     most_nrmse: float | None = None
-    """Largest median error of primitives that passes."""
+    """Largest median NRMSE of primitives that passes. Default: any."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Play(Written):
-    """Carry out a fitted model to a goal: path, joints, film, table and LeRobot episode.
+    """Write the motion of a fitted model to a goal: path, joints, film, table, LeRobot episode.
 
-    With --robot the path becomes joint positions within the limits of that arm, and takes
-    longer where they demand it; without, it stays in the model's coordinates. Exit status 1 if
-    the arm cannot do it.
+    With --robot, the path becomes joint positions within the limits of that arm, and the motion
+    is slowed down if they require it. Without --robot, the path stays in the model's
+    coordinates. Exit status 1 if the arm cannot follow the path.
 
         hrc play pour_model --goal 0.4 0.1 0.3 --robot panda
         hrc play pour_model --goal pose 0.4 0.1 0.3 0 1 0 0 --start episode 2 --robot panda
     """
 
     model: Path
-    """Folder of `hrc fit`."""
+    """Folder written by `hrc fit`."""
     goal: tuple[str, ...]
-    """Joints, position [m], or pose with quaternion (w, x, y, z), by the count of numbers or
-    with the word joints, position or pose before them; or the end of a demonstration: episode
-    2."""
+    """Joint positions, position [m], or pose with quaternion (w, x, y, z), distinguished by the
+    count of numbers or by the word joints, position or pose before them. Or the end of a
+    demonstration, such as: episode 2."""
     start: tuple[str, ...] = ()
-    """The same for the start, or the start of a demonstration. Default: the model's."""
+    """Start, in the same form; an episode gives its first frame. Default: the model's."""
     robot: str = ""
-    """Arm, as in `hrc demo`. Default: none."""
+    """Arm, as in `hrc demo`. Default: no arm."""
     duration: float | None = None
     """Duration [s]. Default: the model's."""
     out: Path | None = None
@@ -449,8 +452,8 @@ class Play(Written):
 class Smooth(Measured):
     """Limit velocity, acceleration and jerk of a trained LeRobot policy's actions.
 
-    Adds two steps to the processors of a checkpoint, which also blend the seams between chunks.
-    The limits are those of the demonstrators. The weights stay as they are.
+    Adds two steps to the processors of a checkpoint. They limit the actions to what the
+    demonstrators did, and blend consecutive action chunks. The weights stay as they are.
     """
 
     checkpoint: Path | None = None
@@ -466,7 +469,7 @@ class Smooth(Measured):
     degrees: bool = False
     """Actions are in degrees. Default: radians with --urdf, percent with --calibration."""
     limits: Path | None = None
-    """File for the limits, for --robot.limits of a robot of type `smooth`."""
+    """File to write the limits to, for --robot.limits of a robot of type `smooth`."""
     remove: bool = False
     """Remove the two steps."""
 
@@ -484,7 +487,7 @@ class Report(Measured):
     out: Path
     """HTML file to write. Replaces an older one."""
     evidence: bool = False
-    """Write the requirements of ISO 10218:2025 near people, with the measured values."""
+    """Instead, list the requirements of ISO 10218:2025 near people, with measured values."""
 
 
 Shelf = Literal["lower", "middle", "upper"]
@@ -498,8 +501,8 @@ class WithRobot(Measured):
     """A command for any arm."""
 
     robot: str = "panda"
-    """Arm by name, or its URDF or MJCF file: FILE, FILE:TIP or FILE:BASE:TIP, with the flange
-    link TIP where the file has several ends."""
+    """Arm by name, or its URDF or MJCF file: FILE, FILE:TIP or FILE:BASE:TIP. TIP is the flange
+    link, needed if the file has several end links."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -507,11 +510,11 @@ class WithDriver(WithRobot):
     """A command for a simulated or a real arm."""
 
     arm: ArmDriver = "sim"
-    """Driver: simulated, the package franky, our own loop at 1 kHz (franka), a robot of
-    LeRobot, with its options: --robot.type=so101_follower --robot.port=/dev/ttyACM0, or topics
-    of ROS 2, which --config site.ros2.* names."""
+    """Driver. sim: simulated arm. franky: the package franky. franka: this package's loop at
+    1 kHz. lerobot: a robot of LeRobot, with its options such as --robot.type=so101_follower
+    --robot.port=/dev/ttyACM0. ros2: topics of ROS 2, named by --config site.ros2.*."""
     ip: str = ""
-    """Address of the arm's control box. "sim" serves the simulated arm there."""
+    """Address of the arm's control box. "sim" starts a simulated control box."""
     config: tuple[str, ...] = ()
     """Further settings as NAME=VALUE or TOML files, such as site.speed=0.1. `--config help`
     lists them."""
@@ -527,14 +530,14 @@ class WithDriver(WithRobot):
                 of the simulated work cell.
         """
         if self.arm in ("lerobot", "ros2"):
-            text = "is for Franka arms: LeRobot's have --robot.port, ROS 2 has ROS_DOMAIN_ID"
+            text = "is for Franka arms: use --robot.port for LeRobot, ROS_DOMAIN_ID for ROS 2"
             refuse_given(self, ["ip"], text)
         elif self.arm == "sim" and self.ip:
             raise ValueError(f"--ip {self.ip} needs a driver: --arm franky or --arm franka.")
         elif self.arm != "sim" and not self.ip:
             raise ValueError(
                 f"--arm {self.arm} needs --ip with the address of the arm's control box; "
-                "--ip sim serves the simulated arm there."
+                "--ip sim starts a simulated one."
             )
         real = self.arm != "sim" and self.ip != "sim"
         if real:
@@ -549,7 +552,7 @@ class WithImperfections(Measured):
     imperfections: float = 1.0
     """Scale of the errors of arm, camera, calibration and objects. 1: nominal."""
     ideal: bool = False
-    """No imperfections, as --imperfections 0."""
+    """No imperfections, like --imperfections 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -567,9 +570,9 @@ class Demo(WithImperfections, WithRobot, Written):
     shelf: Shelf = "middle"
     """Shelf for the object. The middle one is demonstrated."""
     seed: int = 0
-    """Seed of the object's place and of image noise."""
+    """Random seed of the object's place and of image noise."""
     markerless: bool = False
-    """Learn from video and see without any marker; needs EGL."""
+    """Learn and servo from camera images without any marker; needs EGL."""
     overwrite: bool = False
     """Record and learn again, even if models are up to date."""
 
@@ -592,29 +595,29 @@ class Run(WithImperfections, WithDriver, Written):
     out: Path | None = None
     """Folder for recordings, report and measured values. Default: outputs/EXPERIMENT."""
     placing: Path | None = None
-    """Folder of `hrc fit` on demonstrations of placing. Default: that of `hrc demo`, which is
-    made first if it is missing."""
+    """Folder written by `hrc fit` from demonstrations of placing. Default: the model of
+    `hrc demo`, learned first if it is missing."""
     aiming: Path | None = None
-    """Folder of `hrc fit image-jacobian`. Default: that of `hrc demo`."""
+    """Folder written by `hrc fit image-jacobian`. Default: the model of `hrc demo`."""
     seed: int = 0
-    """Seed of the run, and the first one of its trials."""
+    """Random seed of the run. Trials count up from it."""
     trials: int = 0
     """Number of repetitions with random conditions, for statistics."""
     camera: str = "auto"
     """Simulated camera: "egl" renders, "synthetic" only draws markers, "auto" renders if it
     can. For a real arm: device number or path, URL of a stream, or a video file."""
     markerless: bool = False
-    """See gripper and object without any marker, among clutter and shadows; needs EGL."""
+    """Detect gripper and object without any marker, among clutter and shadows; needs EGL."""
     shelf: tuple[Shelf, ...] = ("middle",)
-    """Shelf for the object. Two or three shelves: as many objects."""
+    """Shelf for the object. With two or three shelves, as many objects are placed."""
     pulls: Literal["scripted", "random", "none"] = "scripted"
     """Pulls at the elbow: while the arm waits for them, at random moments, or never."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     worker: bool = False
-    """Simulate a worker who puts an object on the table and reaches under the arm."""
+    """Simulate a worker, putting an object on the table and reaching under the arm."""
     handover: bool = False
-    """A person hands over the last object."""
+    """Let a simulated person hand over the last object."""
     page: bool = False
     """Serve a page to watch, draw targets and pull at the elbow."""
     serve: bool = False
@@ -625,10 +628,10 @@ class Run(WithImperfections, WithDriver, Written):
 class Record(WithRobot, Written):
     """Record demonstrations by a scripted expert in simulation, or by a leader arm.
 
-    Placing carries an object to a shelf, the elbow pulled past the cabinet's door. Servoing
-    moves the marked end effector above an object, watched by an uncalibrated camera. Expert
-    records the columns of LeRobot's robots, for its policies. Leader leads a real arm of
-    LeRobot by one of its teleoperators, within the arm's limits:
+    placing: an object is carried to a shelf while the elbow is pulled past the cabinet's door.
+    servoing: the marked end effector moves above an object, seen by an uncalibrated camera.
+    expert: demonstrations with the columns of LeRobot's robots, for LeRobot's policies.
+    leader: a LeRobot teleoperator leads a real LeRobot arm within the arm's limits:
 
         hrc record leader --robot so101 --out demos --robot.type=so101_follower
             --robot.port=/dev/ttyACM0 --teleop.type=so101_leader --teleop.port=/dev/ttyACM1
@@ -639,14 +642,14 @@ class Record(WithRobot, Written):
     out: Path
     """Folder of the new dataset."""
     episodes: int | None = None
-    """Number of demonstrations. Default: 3 of placing, 8 of servoing, 10 of the expert, 5 by
-    the leader."""
+    """Number of demonstrations. Default: placing 3, servoing 8, expert 10, leader 5."""
     seed: int | None = None
-    """Seed of initial positions, tremor and image noise. Default: 0, of servoing 1."""
+    """Random seed of initial positions, tremor and image noise. Default: servoing 1, others
+    0."""
     shelf: Shelf = "middle"
     """Shelf to place on."""
     scenario: Literal["placing", "grasping"] = "placing"
-    """Scenario of the expert, as `--robot.scenario` of LeRobot's commands."""
+    """Scenario of the expert, like `--robot.scenario` in LeRobot's commands."""
     config: tuple[str, ...] = ()
     """Further settings as NAME=VALUE or TOML files, such as demonstration.duration=5 or
     robot.fps=10. `--config help` lists them."""
@@ -656,9 +659,9 @@ class Record(WithRobot, Written):
 class Multiply(OnDataset):
     """Make hundreds of judged demonstrations from a few, in new scenes or for another arm.
 
-    Each demonstration is cut where the gripper moves, and each segment follows the object that
-    it is about. Motions that miss their poses, break limits, collide or fail in physics are
-    left out, with the reason. An interrupted run is continued by the same command.
+    Each demonstration is split where the gripper moves, and each segment is adapted to the pose
+    of its object. Motions that miss their poses, break limits, collide or fail in physics are
+    left out, and the reasons are listed. The same command continues an interrupted run.
 
         hrc multiply five --episodes 1000 --out thousand
         hrc multiply five --episodes 500 --out ur --robot ur5e
@@ -671,7 +674,7 @@ class Multiply(OnDataset):
     robot: str = ""
     """Arm of the new motions, by name or file. Default: that of the dataset."""
     config: tuple[str, ...] = ()
-    """Scenes, variation and judge as NAME=VALUE or TOML files, such as
+    """Settings of scenes, variation and judge as NAME=VALUE or TOML files, such as
     objects.object.yaw=[-0.5,0.5] or judge.scene=none. `--config help` lists them."""
 
     @property
@@ -695,7 +698,7 @@ class ServePage(WithDriver):
     port: int | None = None
     """Port of the page. Default: the first free one from 8080."""
     host: str = "127.0.0.1"
-    """Address to serve at. 0.0.0.0 serves the network, by TLS and with a token."""
+    """Address to serve at. 0.0.0.0 serves the network, over TLS and with a token."""
     device: Literal["none", "gamepad", "keyboard", "haptic"] = "none"
     """Additional device that moves the end effector."""
     duration: float | None = None
@@ -706,11 +709,11 @@ class ServePage(WithDriver):
 class Serve(WithDriver):
     """Run the controller at a fixed rate and report its latency.
 
-    The arm servoes to a marker that a simulated camera sees at 31 Hz; a real arm does move.
-    Reported are the time from reading the joints to the command, the delay of each tick, and
-    the ticks that were missed. The first start compiles the step, in about 10 s
-    (`--config step=eager`: not). With --ros2 it is a lifecycle node instead:
-    goals, images and pushes come over topics, commands go to a stock controller.
+    The arm servoes the image of its marker to a target; a camera is simulated at 31 Hz, but a
+    real arm does move. The report lists the time from reading the joints to the command, the
+    delay of each tick, and missed ticks. The first start takes about 10 s to compile the step;
+    `--config step=eager` skips this. With --ros2, the controller is a lifecycle node instead:
+    it receives goals, images and pushes on topics and commands a standard ROS 2 controller.
 
         hrc serve --ros2 --robot /robot_description:tool0
     """

@@ -70,7 +70,7 @@ def _open(recordings: Sequence[Path], web: bool) -> int:
 _SHOWN, _SHOWN_FRAMES = 200, 1_000_000
 """Largest number of demonstrations and frames shown by default, limited by the viewer."""
 _VIDEO_BYTES = 300_000_000
-"""Size of all images shown: those of further episodes are left out."""
+"""Total size of the images shown, after which those of further episodes are left out."""
 
 
 def _record(args: Show, out: Path) -> int:
@@ -107,7 +107,7 @@ def _stream(args: Show) -> int:
 
 
 def _shown(args: Show) -> "ShownDataset":
-    """Demonstrations of a dataset, as they are shown."""
+    """Demonstrations of a dataset, prepared for display."""
     from hrc_learn.demos import DatasetError, Demonstration, open_demos
     from hrc_learn.demos.dataset_views import arm_of_dataset
     from hrc_learn.demos.images import ImageReader, camera_images

@@ -1,4 +1,4 @@
-"""`hrc import`, `check`, `repair`, `merge`, `curate`, `push`: making and mending datasets."""
+"""`hrc import`, `check`, `repair`, `merge`, `curate`, `push`: making and repairing datasets."""
 
 import sys
 import webbrowser
@@ -60,7 +60,7 @@ def import_recordings(args: Import) -> None:
         print(f"warning: {warning}", file=sys.stderr)
     if template and args.mapping is not None:
         write_text(args.mapping, plan.template())
-        print(f"{args.mapping}: a mapping file that says the same; edit it")
+        print(f"{args.mapping}: a mapping file with this meaning; edit it")
     if args.dry_run or args.out is None:
         write_values(args.json, plan.counts())
         return
@@ -73,7 +73,7 @@ def import_recordings(args: Import) -> None:
 
 
 def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
-    """Options of the command line, which come before those of the mapping file."""
+    """Options of the mapping file, overridden by those of the command line."""
     said = ImportOptions()
     if mapping is not None:
         read = read_toml if mapping.suffix == ".toml" else read_json
@@ -109,10 +109,10 @@ def check(args: Check) -> int:
 
     Raises:
         FileNotFoundError: There is no dataset.
-        ValueError: Options name what does not exist, there are no columns to store a contract
-            of, or no marker to find camera motion by. The findings are written before.
+        ValueError: An option names something that does not exist, no columns could be read for
+            the contract, or there is no marker for `--camera`. The findings are written first.
     """
-    if not args.dataset.is_dir():  # no error of the data
+    if not args.dataset.is_dir():  # not an error in the data
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
     report = check_dataset(args.dataset, columns(args.mapping), units=args.units)
     if report.contract is not None:
@@ -144,7 +144,7 @@ def check(args: Check) -> int:
 
 def _store_contract(dataset: Path, contract: Contract | None) -> None:
     if contract is None:
-        raise ValueError(f"{dataset}: no columns could be read to store a contract of")
+        raise ValueError(f"{dataset}: no columns could be read, so no contract is stored")
     contract.selections(open_folder(dataset).features)  # refuses an unreadable contract
     sure, doubtful = contract.without_doubt()
     keep_contract(dataset, sure)
@@ -224,7 +224,7 @@ def curate(args: Curate) -> None:
     named = Counter([*args.accept, *args.cut, *args.reject])
     if twice := [episode for episode, count in named.items() if count > 1]:
         raise ValueError(
-            f"--accept, --cut and --reject name episode {min(twice)} twice: decide on one"
+            f"--accept, --cut and --reject name episode {min(twice)} twice: name it once"
         )
     progress = partial(track, transient=True)
     ranking = rank_episodes(args.dataset, partial(progress, description="Ranking"))
@@ -258,7 +258,7 @@ def curate(args: Curate) -> None:
 
 
 def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
-    """Stored decisions, updated and stored again with those of the command line."""
+    """Stored decisions, updated with those of the command line and stored again."""
     decisions = read_decisions(args.dataset)
     lengths = {quality.episode: quality.length for quality in ranking.episodes}
     typed: dict[int, tuple[Verdict, str]] = {
@@ -280,7 +280,7 @@ def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
         except ValueError as error:
             raise ValueError(
                 f"--cut {episode} {text}: give the first frame to keep and the one after the "
-                f"last, such as 30:410, of {lengths[episode]} ({error})"
+                f"last, such as 30:410; the episode has {lengths[episode]} ({error})"
             ) from error
     if typed:
         keep_decisions(args.dataset, decisions)
@@ -289,7 +289,7 @@ def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
 
 def _browser_decisions(args: Curate, ranking: Ranking) -> Decisions:
     """Serve the page until Ctrl-C and return the decisions made there."""
-    # The page's server, which the terminal does not need.
+    # Imported here: the terminal does not need the page's server.
     from hrc_learn.teleoperation.curation_page import CurationPage
     from hrc_learn.teleoperation.gate.address import AddressConfig
 
@@ -314,7 +314,7 @@ def push(args: Push) -> int:
     """
     report = check_dataset(args.dataset)
     if report.errors and not args.unsound:
-        text = f"{args.dataset} has errors: repair it, or upload it so (--unsound); the first:"
+        text = f"{args.dataset} has errors: repair it, or upload it anyway (--unsound). First:"
         raise ValueError(f"{text} {report.errors[0]}")
     sizes = [path.stat().st_size for path in args.dataset.rglob("*") if path.is_file()]
     print(f"{counted(len(sizes), 'file')}, {sum(sizes) / 1e6:.1f} MB", flush=True)

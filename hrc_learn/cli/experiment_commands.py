@@ -1,6 +1,6 @@
-"""`hrc demo` and `hrc run`: the whole job from the demonstrations on, and the experiments.
+"""`hrc demo` and `hrc run`: the whole job including the learning, and the experiments.
 
-An experiment that is given no model uses the demo's, which is learned first if it is missing.
+If no model is given, an experiment uses that of `hrc demo`, learned first if it is missing.
 """
 
 import hashlib
@@ -68,8 +68,8 @@ def run(args: Run) -> int:
     is_real = args.drives_real_arm(_SIMULATED)
     if args.arm == "lerobot":
         raise ValueError(
-            "hrc run leads Franka arms only, not --arm lerobot: hrc page guides the arm and "
-            "hrc play carries out a model."
+            "hrc run does not support --arm lerobot: use hrc page to guide the arm, or hrc "
+            "play for the motion of a model."
         )
     experiment = _experiment(args, _models(args))
     settings = with_settings(args.config, _Settings(experiment=experiment))
@@ -174,16 +174,16 @@ def _run_on_arm(
 
 
 def _models(args: Run) -> dict[str, Path]:
-    """Models that the experiment needs; those of the demo, made if missing, by default."""
+    """Models that the experiment needs; by default those of the demo, learned if missing."""
     defaults = {"placing": MODELS / "placing", "aiming": MODELS / _aiming(args.markerless)}
     needed = {k: v for k, v in defaults.items() if args.experiment in _APPLIES[k]}
     if any(getattr(args, k) is None and not v.is_dir() for k, v in needed.items()):
         console = Console()
-        console.print(f"note: no model given and none in {MODELS}: it is learned first")
+        console.print(f"note: no model is given or found in {MODELS}: it is learned first")
         if args.robot != "panda":
             raise ValueError(
-                f"the models in {MODELS} are a Panda's: make those of the {args.robot} by "
-                f"`hrc demo --robot {args.robot} --out FOLDER`, and name them."
+                f"the models in {MODELS} are for the Panda: learn models for the {args.robot} "
+                f"by `hrc demo --robot {args.robot} --out FOLDER`, and name them as options."
             )
         learn(MODELS, console, markerless=args.markerless)
     return {k: (getattr(args, k) or v).resolve() for k, v in needed.items()}
@@ -233,12 +233,13 @@ def learn(
 
     Args:
         out: Folder for `placing_demos`, `aiming_demos` and the models `placing`, `aiming`,
-            which are replaced; without markers for `aiming_films` and `aiming_markerless`.
+            which are replaced; if `markerless`, for `aiming_films` and `aiming_markerless`
+            instead of `aiming_demos` and `aiming`.
         console: Console for the progress.
-        steps: Number of steps, including those of the caller.
+        steps: Number of steps to print, including those of the caller.
         robot: Options that choose the arm. Default: the Panda.
         again: Repeat every step.
-        markerless: Film the demonstrations of servoing, and find tool and object there.
+        markerless: Film the demonstrations of servoing, and find tool and object in the film.
 
     Raises:
         RuntimeError: The scripted expert fails.
@@ -274,7 +275,7 @@ def _digest(folder: Path, pattern: str = "*") -> str:
 def _learning_steps(
     out: Path, robot: WithRobot, markerless: bool
 ) -> Iterator[tuple[str, Callable[[], object], list[Path]]]:
-    """Title and work of each step, and the folders that it reads, its result last."""
+    """Title and work of each step, the folders that it reads, and last the one it writes."""
     from hrc_learn.cli.fit_command import fit_primitives
     from hrc_learn.cli.image_jacobian_commands import fit_image_jacobian
     from hrc_learn.cli.record_command import record

@@ -89,7 +89,7 @@ def _learn(
     scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
     fitted = fit(demos, args.n_basis, args.method, channels=args.channels, **scaled)
     metrics = fitted.metrics()
-    # Scaled motions are linear neither in the mean nor in a context.
+    # The compared models need motions that are linear in start and goal; scaled ones are not.
     if args.several in ("best", "contextual") and args.scaling == "none":
         only = args.several == "contextual"
         metrics |= keep_best(fitted, demos, args.context, folder, regression_only=only)
@@ -145,7 +145,7 @@ def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
             f"episodes of a single frame are left out: {', '.join(map(str, left_out))}"
         )
     if "gripper" in source.units:
-        notes.append("no primitive is fitted to the gripper (--as-lerobot-policy moves it)")
+        notes.append("no primitive is fitted to the gripper (--as-lerobot-policy includes it)")
     return source, notes
 
 
@@ -204,8 +204,8 @@ def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> Non
         error = 100 * metrics[f"held_out_{channel}_{better}_nrmse_median"]
         mean = 100 * metrics[f"held_out_{channel}_mean_nrmse_median"]
         print(
-            f"{channel}: held-out demonstrations are predicted by {_MODELS[better]}, NRMSE "
-            f"{error:.1f} %, by the mean {mean:.1f} %; hrc evaluate uses it"
+            f"{channel}: {_MODELS[better]} predicts held-out demonstrations best (NRMSE "
+            f"{error:.1f} %, mean: {mean:.1f} %); hrc evaluate uses this model"
         )
     print(f"Model in {shlex.quote(str(args.folder))}")
     write_values(args.json, metrics)
@@ -225,8 +225,8 @@ _COUNTS: tuple[Row, ...] = (
     ("demonstrations", "demonstrations", 1, "", None, 0.0),
     ("left_out_error", "held-out error, relative to the spread of actions", 100, "%", None, 0),
 )
-# Key of a channel, name, factor, unit and largest value that passes. A primitive represents its
-# demonstration up to a centimetre in a motion of half a metre.
+# Key of a channel, name, factor, unit and largest value that passes: 2 % is a deviation of a
+# centimetre in a motion of half a metre.
 _ROWS = (
     # The maximum: a mean would hide one demonstration that its primitive misses.
     ("{}_nrmse_max", "worst NRMSE of a demonstration", 100, "%", 2.0),
@@ -239,11 +239,11 @@ _RESOLUTION = 0.01
 
 
 def _rows(metrics: Mapping[str, float]) -> list[Measurement]:
-    """Main measured values, NRMSE relative to the range of motion."""
+    """Main measured values; the NRMSE is relative to the range of motion."""
     rows = [*_COUNTS]
     for channel in CHANNELS:
         held_out = [
-            (key, f"held out, by {words}", 100, "%", None)
+            (key, f"held-out NRMSE, by {words}", 100, "%", None)
             for kind, words in _MODELS.items()
             if (key := f"held_out_{channel}_{kind}_nrmse_median") in metrics
         ]

@@ -69,7 +69,7 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
             console.print(f"note: {note}")
         if args.learn and len(demos) < learning.hold_out:
             console.print(
-                f"note: {len(demos)} demonstrations are too few to learn the neurons; they "
+                f"note: {len(demos)} demonstrations are too few to learn the neurons, which "
                 f"stay as they are (--config learning.hold_out={learning.hold_out})"
             )
         # The paper's grid, or neurons around the demonstrations.
@@ -92,22 +92,23 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
 type _Searched = tuple[
     DemonstrationSource | DemonstrationSet, Mapping[str, float | int], MarkerlessFit | None
 ]
-"""Demonstrations, figures of the search in their video, and what was found without markers."""
+"""Demonstrations, measured values of the search in their video, and the result of a markerless
+search."""
 
 
 def _demonstrations(args: FitImageJacobian, console: Console, rank: int) -> _Searched:
-    """Demonstrations with the pixels of `--marker`, or those found without one."""
+    """Demonstrations with their own pixels, those of `--marker`, or those of `--markerless`."""
     demos = open_demos(args.dataset, episodes=args.episodes or None)
     if args.markerless:
-        refuse_given(args, ["marker"], "is a marker, and --markerless uses none")
+        refuse_given(args, ["marker"], "is not used by --markerless")
         with console.status(f"Searching the video of {len(demos)} demonstrations"):
             unmarked = find_landmarks(demos, args.camera)
         return unmarked.demos, unmarked.figures(), unmarked
     if args.marker is None:
-        refuse_given(args, ["camera"], "is the camera of --marker")
+        refuse_given(args, ["camera"], "needs --marker or --markerless")
         return demos, {}, None
     if rank != 0:
-        distributed.sum_over_processes(torch.zeros(()))  # the first process searches
+        distributed.sum_over_processes(torch.zeros(()))  # waits for the search of the first one
     found = _find_marker(args, args.marker, console)
     if rank == 0:
         distributed.sum_over_processes(torch.zeros(()))
@@ -210,7 +211,7 @@ def evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
 
 def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:
     """Errors on two grids of poses."""
-    # MuJoCo, which the evaluation of primitives does not need.
+    # Imported here: the evaluation of primitives does not need MuJoCo.
     from hrc_learn.experiments.grasping_experiment import compare_with_truth, held_out_grid
     from hrc_learn.sim import World
     from hrc_learn.sim.workplace import Workplace

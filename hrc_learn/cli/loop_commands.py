@@ -63,14 +63,14 @@ MARKER = (0.05, 0.0, -0.08)
 FRAME_TIME = 0.032
 """Time between images of `hrc serve` [s]."""
 CENTRE = (0.35, 0.35, 0.35)
-"""Centre of the box that the tool moves in, in `hrc serve`, for the Franka hand [m]."""
+"""Centre of the tool's motion in `hrc serve`, for an arm with the Franka hand [m]."""
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
 def _access(
     args: WithDriver, site: ArmSite, world: World, safety: SafetyConfig
 ) -> tuple[Callable[[], AbstractContextManager[OpenedArm]], SafetyConfig]:
-    """Connection to a real arm, which the world follows, or to the arm of the world.
+    """Connection to a real arm, which the simulated world mirrors, or to the simulated arm.
 
     Returns:
         Function that connects, and the configuration of the safety filter for this arm.
@@ -188,7 +188,7 @@ def _opened_device(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...
 def _run_page(
     session: PageSession, page: Page, dt: float, duration: float | None
 ) -> dict[str, float | int]:
-    """Run the loop at the rate of the arm and return its figures."""
+    """Run the loop at the rate of the arm and return its measured values."""
     rate, steps = Rate(dt), 0
     try:
         with ending_at_rest(session.arm.stop):
@@ -209,7 +209,7 @@ class _ServeSettings:
 
     site: ArmSite = field(default_factory=ArmSite)
     step: Literal["fastest", "eager"] = "fastest"
-    """Compile the step to machine code, or do not."""
+    """fastest: compile the step to machine code; eager: do not compile it."""
     autostart: bool = True
     """Configure and activate the node at once; False: a launch file does."""
 
@@ -230,7 +230,7 @@ def serve(args: Serve) -> None:
         _serve_node(args, settings)
         return
     robot = ArmChoice(found_description(args.robot)).work_arm()
-    # A short arm has a small hand.
+    # `hand_size` also scales the workspace: smaller arms have smaller hands.
     centre = robot.hand_size * np.array(CENTRE)
     camera = _camera(centre)
     scene = SceneConfig(timestep=dt)
@@ -254,7 +254,7 @@ def serve(args: Serve) -> None:
 
 
 def _serve_node(args: Serve, settings: _ServeSettings) -> None:
-    """Run the controller as a node until Ctrl-C, or for the duration that is given."""
+    """Run the controller as a node until Ctrl-C, or for the given duration."""
     from hrc_learn.hardware.ros2_node import ControllerNode
 
     print(ros2_origin(), flush=True)
@@ -280,10 +280,10 @@ def _report(args: Serve, figures: Mapping[str, float | int]) -> None:
 
 
 def _camera(centre: Float[np.ndarray, "3"]) -> CameraModel:
-    """Camera 1.1 m from the middle of the box, looking down with a lean of 0.2 rad.
+    """Camera 1.1 m from the centre of the motion, looking down at 0.2 rad from the vertical.
 
-    The image is turned by half a radian from that of the paper's camera, whose image Jacobian
-    the controller starts with.
+    Its image is turned by half a radian from that of the paper's camera; the controller starts
+    with the image Jacobian of the latter.
     """
     lean, turn = 0.2, 1.0
     towards = np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)
@@ -327,7 +327,7 @@ def _run_serve(
     frame_steps = max(1, round(FRAME_TIME / dt))
     took, late = np.empty(steps), np.empty(steps)
     observation["joint_position"][:] = arm.read().joint_position
-    runner.step()  # the first step is slower than all others
+    runner.step()  # the first step is slow and not measured
     reading = arm.read()
     runner.start(reading.joint_position, reading.joint_velocity)
     rate = Rate(dt)

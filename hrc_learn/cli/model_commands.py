@@ -33,7 +33,8 @@ def evaluate(args: Evaluate) -> int:
 
     Raises:
         FileNotFoundError: There is no dataset, or no model.
-        ValueError: The model does not name its dataset, or the episodes contradict it.
+        ValueError: The model does not name its dataset, an episode is named twice, or no
+            episode is left to fit.
     """
     refuse_repeats(args.episodes)
     if args.model is not None and not args.model.is_dir():
@@ -46,7 +47,7 @@ def evaluate(args: Evaluate) -> int:
             _fit_most(args, model)
             return _evaluate_primitives(args, model)
     if (args.model / "jacobian").is_dir():
-        # MuJoCo, which primitives do not need.
+        # Imported here: primitives do not need MuJoCo.
         from hrc_learn.cli.image_jacobian_commands import evaluate_image_jacobian
 
         return evaluate_image_jacobian(args, args.model)
@@ -57,7 +58,7 @@ def _fit_most(args: Evaluate, model: Path) -> None:
     """Fit the demonstrations that are not held out for the evaluation.
 
     Raises:
-        ValueError: All of them are held out.
+        ValueError: All demonstrations are held out.
     """
     source = open_demos(args.dataset)
     count = len(source)
@@ -86,7 +87,7 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
     figures: dict[str, float] = {"demonstrations": float(len(demos))}
     errors: dict[str, ReproductionError] = {}
     for channel, better in best_models(model).items():
-        console.print(f"note: the {better} model predicts {channel}, not the mean")
+        console.print(f"note: the {better} model predicts {channel} instead of the mean")
     for channel in channels:
         motions.require(channel)
         made = predict(model, channel, motions, demos)
@@ -107,7 +108,7 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
 
 
 def _figure(demos: DemonstrationSet, error: ReproductionError) -> Figure:
-    """Each measure over the episodes, with its median."""
+    """Figure of each error measure over the episodes, with its median."""
     plots = []
     for name, values in error.columns().items():
         median = values.quantile(0.5).expand_as(values)
@@ -125,7 +126,7 @@ def _with_unit(name: str) -> str:
 
 
 def _demonstrations(args: Evaluate, model: Path, console: Console) -> DemonstrationSet:
-    """Demonstrations to evaluate on, read in the way they were read for the fit."""
+    """Demonstrations to evaluate on, read with the same options as for the fit."""
     made_by = fitted_from(model)
     learned = {int(i) for i in made_by.get("episodes") or ()}
     wanted = as_fitted(made_by)
@@ -144,7 +145,7 @@ def _demonstrations(args: Evaluate, model: Path, console: Console) -> Demonstrat
 
 
 def as_fitted(made_by: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `open_demos` with which a model's dataset was read."""
+    """Arguments for `open_demos` that read a dataset as for the fit of a model."""
     return {
         "joint_names": tuple(made_by.get("joint_names") or ()) or None,
         "mapping": columns(made_by.get("mapping") or {}),
@@ -167,7 +168,7 @@ def fitted_from(model: Path) -> dict[str, Any]:
 
 
 _ROWS = 8
-"""Demonstrations in a table: the worst."""
+"""Number of demonstrations in a table, the worst ones."""
 
 
 def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> Table:
@@ -196,7 +197,7 @@ def smooth(args: Smooth) -> None:
     if args.checkpoint is None and (args.remove or args.limits is None):
         raise ValueError("give --checkpoint, or --limits to write only a file.")
     if args.dataset is None and not args.remove:
-        raise ValueError("give --dataset: the limits are those of its demonstrators.")
+        raise ValueError("give --dataset: the limits are taken from its demonstrations.")
     # LeRobot takes seconds to import.
     from hrc_learn.lerobot.arm_values import ArmValues
     from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing

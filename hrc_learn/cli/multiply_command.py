@@ -35,16 +35,16 @@ from hrc_learn.teleoperation.scenarios import SHELVES, make_scenario
 
 # Motions that are made at a time.
 _CHUNK = 50
-# Attempts after which fewer successes than this fraction end the work.
+# After this number of attempts, a smaller fraction of successes ends the run.
 _ENOUGH, _FEW = 100, 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """An object, or another place that the task is about."""
+    """An object, or another place that motions depend on."""
 
     columns: str = ""
-    """Columns of its pose, such as "observation.state[8:14]": x, y, z [m] and perhaps a
+    """Columns of its pose, such as "observation.state[8:14]": x, y, z [m], optionally with a
     rotation vector [rad] or a quaternion (w, x, y, z). Default: columns named NAME.x and so
     on."""
     pose: tuple[float, ...] = ()
@@ -66,16 +66,16 @@ class MultiplyConfig:
     seed: int = 0
     """Seed of all random choices."""
     style: float = 0.3
-    """Fraction of a random mixture of all demonstrations in each motion; 0: one alone."""
+    """Fraction of a random mixture of all demonstrations in each motion; 0: no mixture."""
     speed: tuple[float, float] = (0.9, 1.1)
     """Range of the speed, relative to the demonstrations."""
     start: float = 0.01
     """Largest displacement of the first position along each axis [m]."""
     shift: tuple[float, float, float] | None = None
-    """Displacement of scene and start for another arm [m]. Default: that between the arms' work
-    cells, or none."""
+    """Displacement of scene and start for another arm [m]. Default: the displacement between
+    the work cells of the two arms, or none outside a work cell."""
     segments: str = ""
-    """JSON file of the segments. With --episodes 0 it is written, to be corrected."""
+    """JSON file of the segments. `--episodes 0` writes it, so that it can be corrected."""
     demonstrations: tuple[int, ...] = ()
     """Episodes to learn from. Default: all."""
 
@@ -106,7 +106,7 @@ def multiply(args: Multiply) -> int:
     job = Multiplication(args, with_settings(args.config, Settings()))
     print(*aligned(job.segmentation.rows(job.demos[:3])), sep="\n")
     if not job.objects:
-        print("no object poses: the scene stays as it was; --config objects.NAME.columns=...")
+        print("no object poses: the scene stays as shown; --config objects.NAME.columns=...")
     if not args.episodes:
         if file := job.config.segments:
             write_json(Path(file), job.segmentation)
@@ -128,7 +128,7 @@ def multiply(args: Multiply) -> int:
 
 
 class Multiplication:
-    """Everything that is known before the first motion is made."""
+    """One run of `hrc multiply`: dataset, arm, judge, segments and fitted motions."""
 
     def __init__(self, args: Multiply, settings: Settings):
         self.args, self.settings, self.config = args, settings, settings.multiply
@@ -151,8 +151,8 @@ class Multiplication:
         }
         if unknown := settings.objects.keys() - objects.keys():
             raise ValueError(
-                f"no pose is known of the object {min(unknown)!r}; there are "
-                f"{', '.join(objects) or 'none'}: give objects.{min(unknown)}.columns or .pose."
+                f"the pose of the object {min(unknown)!r} is unknown (known: "
+                f"{', '.join(objects) or 'none'}): set objects.{min(unknown)}.columns or .pose."
             )
         shown = [d.joint_position for d in self.demos if d.joint_position is not None]
         joints = [torch.from_numpy(taught.positions(q)) for q in shown]
@@ -315,7 +315,7 @@ class Multiplication:
 
 
 def _judge(config: JudgeConfig, task: str) -> JudgeConfig:
-    """The judge, by default the scenario of our work cell that a task names."""
+    """The judge; by default, that of the work-cell scenario with this task, if there is one."""
     if config.scene:
         return replace(config, scene="" if config.scene == "none" else config.scene)
     for scene, shelf in [("grasping", "middle"), *(("placing", shelf) for shelf in SHELVES)]:

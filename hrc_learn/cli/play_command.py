@@ -1,4 +1,4 @@
-"""`hrc play`: a fitted model carried out to a goal."""
+"""`hrc play`: the motion of a fitted model to a new goal."""
 
 import sys
 from collections.abc import Sequence
@@ -32,18 +32,18 @@ from hrc_learn.viz.run_dashboard import record_run
 
 _ERRORS = {
     "goal_position_error_mm": "{:.1f} mm from the goal",
-    "goal_turn_error_deg": "{:.1f} deg from it",
-    "goal_joint_error": "joints {:.2g} from the goal",
+    "goal_turn_error_deg": "{:.1f} deg from the goal's orientation",
+    "goal_joint_error": "joints at most {:.2g} from the goal",
 }
 _POSE = ("x [m]", "y [m]", "z [m]", "qw", "qx", "qy", "qz")
 
 
 def play(args: Play) -> int:
-    """Carry out a model to a goal; exit status 1 if the arm cannot do it.
+    """Write the motion of a model to a goal; exit status 1 if the arm cannot follow it.
 
     Raises:
         FileNotFoundError: There is no model.
-        ValueError: The goal does not fit the model, or the model not the arm.
+        ValueError: The goal or the arm does not fit the model.
     """
     if not args.model.is_dir():
         raise FileNotFoundError(f"there is no model at {args.model}")
@@ -76,13 +76,13 @@ def play(args: Play) -> int:
 
 
 def _target(model: FittedModel, words: Sequence[str], option: str) -> Target:
-    """Start or goal, of numbers or of a demonstration."""
+    """Start or goal, given as numbers or as an episode of the demonstrations."""
     if words[0] != "episode":
         return model.target(words, option)
     try:
         (episode,) = map(int, words[1:])
     except ValueError:
-        raise ValueError(f"{option} episode needs the number of one: episode 2") from None
+        raise ValueError(f"{option} episode needs one number, such as: episode 2") from None
     made_by = fitted_from(model.folder)
     demos = open_demos(made_by["dataset"], episodes=[episode], **as_fitted(made_by))
     (demo,) = demos
@@ -176,7 +176,7 @@ def _report(args: Play, robot: Arm | None, motion: PlayedMotion) -> None:
     said = [_ERRORS[name].format(error) for name, error in motion.goal_errors.items()]
     print(f"{lasts:.2f} s, {', '.join(said)}")
     if robot is None:
-        print("note: no --robot, so no limits were checked: motion.csv has the model's path")
+        print("note: without --robot no limits are checked; motion.csv has the model's path")
     elif motion.slowed_by:
         print(
             f"note: {lasts:.2f} s instead of {motion.planned_duration:.2f} s, because the "

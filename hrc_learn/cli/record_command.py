@@ -79,7 +79,7 @@ def record(args: Record) -> int:
 
 
 def _record_placing(args: Record, episodes: int, seed: int) -> None:
-    """Placing on a shelf: end effector and null-space posture at once."""
+    """Record placing on a shelf: motion of end effector and null-space posture."""
     settings = _Settings(demonstration=PlacingDemonstrationConfig())
     config = with_settings(args.config, settings).demonstration
     workplace, world, rng = _work_cell(args, seed)
@@ -100,7 +100,7 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
 
 
 def _record_servoing(args: Record, episodes: int, seed: int) -> None:
-    """Visual servoing to an object with an uncalibrated camera."""
+    """Record visual servoing to an object with an uncalibrated camera."""
     settings = _Settings(demonstration=ServoDemonstrationConfig())
     settings = with_settings(args.config, settings)
     config = settings.demonstration
@@ -127,13 +127,13 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
 def _film_servoing(
     args: Record, config: ServoDemonstrationConfig, episodes: int, seed: int
 ) -> None:
-    """Visual servoing without markers: joints, poses and the camera's video."""
+    """Record visual servoing without markers: joints, poses and the camera's video."""
     workplace, _, rng = _work_cell(args, seed)
     workplace = replace(workplace, scene=unmarked(workplace.scene, UnmarkedLook(seed=seed)))
     world = World(workplace.scene)
     sensor = MarkerSensor(open_camera(world, "synthetic", rng=rng), workplace.scene.marker_ids)
     camera = open_camera(world, "egl", rng=rng)
-    # A finder needs fewer images than a tracker of markers.
+    # The markerless search needs fewer images than a marker tracker.
     config = replace(config, record_every=2 * config.record_every)
 
     def demonstrate() -> Iterator[dict[str, Any]]:
@@ -186,7 +186,7 @@ def _write(
 
 
 def _record_expert(args: Record, episodes: int, seed: int) -> None:
-    """The columns of lerobot-record with mujoco_arm and arm_expert, in simulated time."""
+    """Record the columns of lerobot-record with mujoco_arm, arm_expert and simulated time."""
     from hrc_learn.lerobot.episode_recording import record_expert
     from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 
@@ -206,7 +206,7 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
         seed=seed,
     )
     config = with_settings(args.config, Settings(robot=default)).robot
-    # The camera's motion is found from pose and marker of the tool: one needs the other.
+    # Camera motion is detected from the tool's pose and marker: the marker needs the pose.
     config = replace(config, hand=config.hand or config.marker)
     failed = 0
     with Progress(transient=True) as progress:
@@ -227,9 +227,9 @@ class _LeaderConfig:
     duration: float = 20.0
     """Duration of a demonstration [s]; Ctrl-C ends the recording and keeps the saved ones."""
     pause: float = 5.0
-    """Time before each demonstration, in which the arm follows already [s]."""
+    """Time before each demonstration, in which the arm already follows [s]."""
     fps: int = 50
-    """Frames a second: the rate of the loop."""
+    """Frames per second, which is also the rate of the loop."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +239,7 @@ class _LeaderSettings:
 
 
 def _record_leader(args: Record, episodes: int, seed: int) -> None:
-    """A real arm follows a leader; positions, commands and gripper of both are recorded."""
+    """Let a real arm follow a leader; record the arm's positions, gripper and commands."""
     settings = with_settings(args.config, _LeaderSettings())
     config = settings.demonstration
     frames = round(config.duration * config.fps)
@@ -286,7 +286,7 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
 def _follower(
     robot: Arm, arm: StoppableArm, leader: LeaderArm, site: ArmSite, dt: float
 ) -> Callable[[], dict[str, Any]]:
-    """Function that takes one step after the leader within the limits; returns its frame."""
+    """Function that moves the arm one step towards the leader and returns the frame."""
     servo_config = PositionServoConfig(safety=site.cell_config().safety)
     servo = PositionServo(robot.chain, arm, dt, servo_config)
     opening = site.lerobot.opening

@@ -37,9 +37,10 @@ class TokenSettings:
     tolerance: float = 0.01
     """Root mean square error of decoded chunks, relative to the range of each column."""
     start_known: bool = True
-    """False: tokens determine the start of a chunk, too, and encode no velocity."""
+    """True if a chunk starts at the arm's state; False: the tokens also encode the start, and
+    no velocity is used."""
     held_out: int = 5
-    """Every episode of this number is left out of the fit, for the report; 0: none."""
+    """Number n if every n-th episode is held out of the fit, for the report; 0: none."""
 
 
 class Chunks(NamedTuple):
@@ -49,7 +50,7 @@ class Chunks(NamedTuple):
     """Time since the known frame [s]."""
     motions: Float[np.ndarray, "N T1 D"]
     start_velocity: Float[np.ndarray, "N D"]
-    """Velocity before the known frame, by the difference of the last two frames [1/s]."""
+    """Velocity at the known frame, as the difference from the frame before [1/s]."""
 
 
 def read_chunks(
@@ -85,7 +86,7 @@ def tokens(args: Tokens) -> None:
     """Fit a tokenizer, or report the errors of one.
 
     Raises:
-        ValueError: Options of the other word, or a dataset without the feature.
+        ValueError: An option belongs to the other action, or the dataset lacks the feature.
     """
     every = [entry.index for entry in open_folder(args.dataset).episodes]
     if args.action == "report":
@@ -114,7 +115,7 @@ def tokens(args: Tokens) -> None:
 
 
 def fit(dataset: Path, settings: TokenSettings, episodes: list[int]) -> MotionTokenizer:
-    """Tokenizer of the chunks of episodes."""
+    """Tokenizer fitted to chunks of these episodes."""
     chunks = read_chunks(dataset, settings.feature, settings.seconds, episodes, MOST_FITTED)
     return MotionTokenizer.fit(
         chunks.time,
@@ -127,7 +128,7 @@ def fit(dataset: Path, settings: TokenSettings, episodes: list[int]) -> MotionTo
 
 
 def held_out(episodes: list[int], number: int) -> list[int]:
-    """Episodes that a fit leaves out: every one of that number, or the last of fewer."""
+    """Held-out episodes: every `number`-th, or the last one if there are fewer."""
     return [] if not number else episodes[number - 1 :: number] or episodes[1:][-1:]
 
 

@@ -149,8 +149,8 @@ def test_choices_are_those_of_the_package(alias, known):
         (("fit",), "missing: --dataset (see hrc fit --help)"),
         (("record", "placing", "--out", "x", "--episodes", "few"), "--episodes"),
         (("record", "placing", "--out", "x", "--episodes", 0), "must be at least 1"),
-        (("evalute", "x"), "no command 'evalute' of hrc; did you mean evaluate?"),
-        (("dance",), "no command 'dance' of hrc; there are demo, run"),
+        (("evalute", "x"), "hrc has no command 'evalute'; did you mean evaluate?"),
+        (("dance",), "hrc has no command 'dance'; it has demo, run"),
         (("run", "dance"), "'placing', 'grasping', 'collaboration'"),
         (("run", "placing", "--worker"), "--worker is an option of hrc run collaboration"),
         (
@@ -174,7 +174,7 @@ def test_choices_are_those_of_the_package(alias, known):
         (("smooth",), "give --checkpoint, or --limits to write only a file"),
         (
             ("smooth", "--limits", "new.json"),
-            "give --dataset: the limits are those of its demonstrators",
+            "give --dataset: the limits are taken from its demonstrations",
         ),
         (
             ("play", "none", "--goal", 0.4, 0, 0.4, "--out", "new"),
@@ -325,7 +325,7 @@ def run(monkeypatch, main) -> object:
             "error: mujoco is not",
         ),
         (ModuleNotFoundError("no tyro", name="tyro"), 1, "error: tyro is not installed"),
-        (ModuleNotFoundError("none", name="httpx"), 1, "error: httpx is not installed, which"),
+        (ModuleNotFoundError("none", name="httpx"), 1, "error: httpx is not installed; inst"),
         (MissingModelError("get it", name="robosuite"), 1, "error: get it\n"),
     ],
 )
@@ -393,9 +393,9 @@ def test_options_of_a_lerobot_device_become_settings():
 def test_a_lerobot_arm_needs_its_type_and_no_address(tmp_path):
     out = str(tmp_path / "set")
     asked = done("page", "--arm", "lerobot", "--ip", "sim", "--out", out, status=2)
-    assert "--ip is for Franka arms: LeRobot's have --robot.port" in asked.error
+    assert "--ip is for Franka arms: use --robot.port for LeRobot" in asked.error
     asked = done("run", "placing", "--arm", "lerobot", "--out", out, status=2)
-    assert "hrc run leads Franka arms only" in asked.error
+    assert "hrc run does not support --arm lerobot" in asked.error
 
 
 def test_settings_of_several_config_options_count_together():

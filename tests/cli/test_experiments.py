@@ -141,7 +141,7 @@ def test_an_arm_without_null_space_is_not_pulled(ran, capsys):
             {"experiment": "grasping", "camera": "film.mp4"},
             "the cameras",
         ),
-        ({"experiment": "placing", "arm": "lerobot"}, "not --arm lerobot"),
+        ({"experiment": "placing", "arm": "lerobot"}, "does not support --arm lerobot"),
         ({"experiment": "placing", "arm": "franky", "ip": "1.2.3.4", "trials": 2}, "simulated"),
     ],
 )

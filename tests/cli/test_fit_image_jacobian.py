@@ -38,7 +38,7 @@ def test_it_writes_a_model_like_the_camera_of_the_work_cell(tmp_path):
     model = tmp_path / "model"
     options = ("--no-learn", "--json", tmp_path / "values.json")
     output = done("fit", "image-jacobian", tmp_path / "set", "--out", model, *options).output
-    assert "held-out error, relative to that motion" in output
+    assert "held-out error, relative to image motion" in output
     (focal,) = re.findall(r"focal length (\d+) px", output)
     assert int(focal) == pytest.approx(camera.focal[0], rel=0.02)
     metrics = json.loads((model / "metrics.json").read_text())

@@ -193,7 +193,7 @@ def test_a_fit_shows_few_rows_with_units(fitted):
 
 def test_an_evaluation_uses_the_model_that_predicts_best(poses, fitted):
     model, output = fitted
-    assert "held out, by a regression" in output
+    assert "held-out NRMSE, by a regression" in output
     metrics = json.loads((model / "metrics.json").read_text())
     kind = json.loads((model / "prediction.json").read_text())["models"]["position"]
     errors = [metrics[f"held_out_position_{m}_nrmse_median"] for m in ("mean", kind)]

@@ -99,7 +99,7 @@ def test_an_episode_without_joints_gives_a_pose_or_nothing(episode):
 
 @pytest.mark.parametrize("words", [["episode"], ["episode", "1", "2"], ["episode", "x"]])
 def test_an_episode_is_one_number(episode, words):
-    with pytest.raises(ValueError, match="--start episode needs the number of one"):
+    with pytest.raises(ValueError, match="--start episode needs one number"):
         play_command._target(model(), words, "--start")
     assert play_command._target(model(), ["1", "2"], "--goal") == (("1", "2"), "--goal")
 
@@ -146,10 +146,10 @@ def test_a_report_says_how_long_it_lasts_and_why(capsys, robot, slowed):
     args = Play(model=Path("m"), goal=("1",), out=Path("out"))
     play_command._report(args, robot and arm(robot), motion(slowed_by=slowed))
     first, *rest = capsys.readouterr().out.splitlines()
-    assert first == "0.08 s, 1.3 mm from the goal, 0.0 deg from it"
+    assert first == "0.08 s, 1.3 mm from the goal, 0.0 deg from the goal's orientation"
     notes = [line for line in rest if line.startswith("note: ")]
     if robot is None:
-        assert "no limits were checked" in notes[0]
+        assert "no limits are checked" in notes[0]
     elif slowed:
         assert notes == [
             f"note: 0.08 s instead of 0.05 s, because the {slowed} would be beyond its limit"

@@ -132,7 +132,7 @@ def test_segments_are_listed_and_may_be_corrected(dataset, tmp_path):
     [
         (("--config", "objects.cup.columns=observation.state[0:4]"), "3, 6 or 7"),
         (("--config", "judge.scene=nowhere.xml"), "no scene 'nowhere.xml'"),
-        (("--config", "objects.cup.x=[0.1,0.2]"), "no pose is known of the object 'cup'"),
+        (("--config", "objects.cup.x=[0.1,0.2]"), "the pose of the object 'cup' is unknown"),
         (("--config", "multiply.style=2"), "from 0 to 1"),
         (("--config", "multiply.speed=[0.0,1.0]"), "range above 0"),
         (("--config", "objects.block.x=[2.0,2.1]"), "hardly any motion"),

@@ -114,7 +114,7 @@ def raising(error):
         (FileNotFoundError(2, "No such file", "a.csv"), 2, "error: a.csv: No such file"),
         (FileExistsError("x exists"), 2, "error: x exists"),
         (ModuleNotFoundError("No module named 'h5py'", name="h5py.x"), 1,
-         "error: h5py is not installed, which this needs: pip install 'hrc-learn[import]'"),
+         "error: h5py is not installed; install it with: pip install 'hrc-learn[import]'"),
         (ModuleNotFoundError("install the SDK", name="sdk"), 1, "error: install the SDK"),
         (ConnectionError("no arm"), 1, "failed: no arm"),
         (OSError(28, "No space left", "out"), 2, "error: out: No space left"),
