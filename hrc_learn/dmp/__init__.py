@@ -1,4 +1,4 @@
-"""Dynamic movement primitives: learned motions that start, goal and duration reshape."""
+"""Dynamic movement primitives: learned motions that adapt to start, goal and duration."""
 
 from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp.closed_loop_step import DMPState as DMPState

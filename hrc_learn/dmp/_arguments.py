@@ -1,9 +1,10 @@
 """Checked conversion of the arguments of movement primitives to tensors.
 
-Tensors, NumPy arrays and nested lists are accepted everywhere, of integers or floats. `...`
-stands for any number of leading batch axes. The axis names in the aliases (`_T`, `_D`) document
-the layout and are not bound: arguments of one call broadcast, and demonstrations in a list
-differ in length. Sizes that have to agree are compared where the values are used.
+Tensors, NumPy arrays and nested lists of integers or floats are accepted everywhere. `...`
+stands for any number of leading batch axes. The axis names in the aliases (`_T`, `_D`) only
+document the layout and are not checked, because the arguments of a call broadcast and the
+demonstrations in a list differ in length. Sizes that have to agree are compared where the
+values are used.
 """
 
 import math
@@ -46,10 +47,10 @@ def to_tensor(
     """Convert like `torch.as_tensor`; arrays may be read-only or have negative strides.
 
     Raises:
-        ValueError: Values that are no real numbers, or truth values where numbers are due.
+        ValueError: Values that are not real numbers, or booleans where `dtype` is floating.
     """
     if isinstance(values, Tensor) and values.dtype == dtype and values.device == device:
-        return values  # the common case: `as_tensor` takes longer to find out
+        return values  # the common case, which `as_tensor` recognises more slowly
     if isinstance(values, np.ndarray):
         if values.dtype.kind not in "biuf":
             raise ValueError(f"expected real numbers, got an array of {values.dtype}")
@@ -59,12 +60,12 @@ def to_tensor(
         raise ValueError(f"expected real numbers, got {tensor.dtype}")
     if isinstance(values, Tensor):
         return tensor.to(device, dtype)
-    # From Python's numbers again, because their float64 values would be rounded to float32.
+    # Convert the original values again, because `tensor` holds Python's floats as float32.
     return torch.as_tensor(values, dtype=dtype, device=device)
 
 
 def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Function that `torch.autocast` leaves alone: in half precision paths are off visibly."""
+    """Function that runs without `torch.autocast`: half precision visibly distorts paths."""
 
     @wraps(function)
     def exact(*arguments: P.args, **options: P.kwargs) -> R:
@@ -77,11 +78,11 @@ def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 
 def readable(*tensors: Tensor) -> bool:
-    """True if Python may branch on the values: nothing traces, maps or differentiates them."""
+    """True if Python may branch on the values: no tracing, transform or forward derivative."""
     if torch.compiler.is_compiling():
         return False
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    # A loop, because a comprehension takes as long as the product of a short rollout.
+    # A loop, because a comprehension takes as long as the matrix product of a short rollout.
     for x in tensors:
         if functorch.is_functorch_wrapped_tensor(x):
             return False
@@ -102,14 +103,14 @@ A PyTorch version without this function counts as always inside a transform.
 
 
 def transforming() -> bool:
-    """True inside `torch.func` transforms and forward derivatives, which read no memory."""
+    """True inside `torch.func` transforms and forward derivatives, where NumPy cannot read."""
     return _transform_level() is not None or forward_ad._current_level >= 0
 
 
 def refuse_nested_forward(s: Tensor) -> None:
-    """Raise NotImplementedError where times may have two forward derivatives.
+    """Raise NotImplementedError if times may be inside two nested forward derivatives.
 
-    PyTorch silently takes the outer derivative of an `autograd.Function` for zero there.
+    PyTorch then silently treats the outer derivative of an `autograd.Function` as zero.
     """
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
     if torch.compiler.is_compiling() or not functorch.is_functorch_wrapped_tensor(s):
@@ -184,8 +185,8 @@ def finite(name: str, values: Tensor) -> Tensor:
     # Reading from another device would wait for all work queued there.
     if not values.is_cpu or not readable(values):
         return values
-    # For a few numbers Python's sum takes half the time.
-    # PyTorch 2.8 makes no list inside a transform, not even of tensors from outside.
+    # For a few numbers, Python's sum takes half the time of PyTorch's. Inside a transform,
+    # PyTorch 2.8 refuses `tolist`, even for tensors from outside.
     few = values.ndim == 1 and values.numel() <= 32 and not transforming()
     if not math.isfinite(sum(values.tolist()) if few else values.detach().sum().item()):
         wrong = values[~values.isfinite()]
@@ -210,7 +211,7 @@ def positive(name: str, value: Scalars, like: Tensor) -> Float[Tensor, "*batch"]
 def check_not_negative(name: str, value: Tensor | float | int) -> None:
     """Raise ValueError unless all numbers are finite and not negative.
 
-    Tensors on another device than the CPU are not read.
+    Tensors that are not on the CPU are not checked.
     """
     if isinstance(value, Tensor):
         if not value.is_cpu or not readable(value):
@@ -226,7 +227,8 @@ def seconds(time: Times, device: torch.device) -> Float[Tensor, "*batch T"]:
     """Times [s] since the start of a motion (float64).
 
     Raises:
-        ValueError: A single number instead of an array, or a time that is not >= 0 and finite.
+        ValueError: A single number instead of an array, or a time that is negative or not
+            finite.
     """
     time = to_tensor(time, dtype=torch.float64, device=device)
     if time.ndim == 0 or (readable(time) and not ((time >= 0) & (time < math.inf)).all()):

@@ -1,8 +1,8 @@
 """State of a primitive in closed loop, and its exact step.
 
-The equation is linear, so each coupling term has a particular motion that solves it alone and
-is known at both ends of a step. The difference between the state and the sum of these motions
-decays as the unforced spring does. Steps of any length are therefore exact.
+The equation is linear, so each term (forcing, goal filter, coupling) has a particular solution,
+which is known at both ends of a step. The difference between the state and the sum of these
+solutions decays as the unforced spring does. Steps of any length are therefore exact.
 """
 
 import math
@@ -20,8 +20,8 @@ from hrc_learn.dmp.response import Response
 from hrc_learn.geometry import minimum_jerk
 
 RESONANCE = 1e-3
-"""Smallest distance of a goal filter from a mode of the spring, relative to the stiffness. The
-particular motion grows as its inverse, and as many digits are lost."""
+"""Smallest |rate^2 - alpha rate + alpha beta| / (alpha beta) of a goal filter; it is zero at a
+mode of the spring. The particular solution grows with its inverse, and digits are lost."""
 _FULL_PACE = torch.ones((), dtype=torch.float64)
 """Pace of an undisturbed motion, made once because making a tensor takes longer than a sum."""
 
@@ -47,9 +47,9 @@ class DMPState:
     duration: Float[Tensor, "*batch"]
     """Duration of the motion if nothing slows it [s]."""
     pace: Float[Tensor, "*batch"]
-    """Speed of the clock in the last step, 1 undisturbed and towards 0 when slowed."""
+    """Relative speed of the clock in the last step: 1 if undisturbed, less if slowed."""
     s: Float[Tensor, "*batch"]
-    """Normalised time, 1 at the end of the motion. Float64, as rounding adds up over steps."""
+    """Normalised time, 1 at the end of the motion (float64: rounding adds up over steps)."""
     forced: Float[Tensor, "*batch 2 D"]
     """State (y, dy/ds) caused so far by the unscaled forcing term alone."""
 
@@ -81,10 +81,10 @@ def step(
         ds: Step in normalised time (float64); a number if nothing traces or differentiates it.
         response: Response of the primitive.
         weights: Weights of the unscaled forcing term.
-        scale: Scaling of states (*batch, K, D) that the forcing term causes.
-        gain: Factor on them.
+        scale: Function that scales states (*batch, K, D) caused by the forcing term.
+        gain: Factor on these states.
         goal_filter: Rate in dg/ds = -rate (g - target); None: the goal jumps to its target.
-        push: Constant second derivative by s added to the motion.
+        push: Second derivative by s that is added to the motion.
         pace: Speed of the clock, stored for the velocity.
     """
     spring, s, target = response.spring, state.s + ds, state.target
@@ -96,14 +96,14 @@ def step(
         forced = response.forced.to(s.device)(s)
     E, coast = spring.propagator(ds), response.coasting(now)
     forced = forced.to(target) @ weights.mT
-    if isinstance(coast, Tensor) or coast > 0:  # past the end, the spring alone moves it
+    if isinstance(coast, Tensor) or coast > 0:  # after the forcing, the spring acts alone
         forced = spring.propagator(coast).to(target) @ forced
-    # Motion caused by the forcing at both ends of the step; the difference to it decays.
+    # States caused by the forcing at both ends of the step; the difference to them decays.
     before, after = scale(state.forced), scale(forced)
     if gain is not None:
         before, after = gain * before, gain * after
     if response.approach:
-        # Along the curve of an approach, start and goal act unscaled, next to the weights.
+        # The approach from start to goal adds to the effect of the weights, without scaling.
         fraction, displacement = response.approach, state.displacement[..., None, :]
         curve = approach_state(torch.stack([state.s, s]), fraction).to(displacement)
         before = before + curve[0][..., None] * displacement
@@ -116,7 +116,7 @@ def step(
     rest = target if push is None else target + push / spring.stiffness
     y = torch.stack([state.position - rest, state.rate], dim=-2)
     E, y = E.to(target), y - before
-    # Fused where PyTorch can.
+    # One fused operation for shapes that allow it.
     y = torch.addmm(after, E, y) if E.ndim == y.ndim == after.ndim == 2 else E @ y + after
     offset, velocity = y.unbind(dim=-2)
     return DMPState(
@@ -163,13 +163,13 @@ def uncoupled_step(
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
 ) -> DMPState | None:
-    """`step` of one motion without coupling, in NumPy: a third of the time.
+    """`step` for one motion without coupling, in NumPy and a third of the time.
 
     For so few numbers, dispatch in PyTorch takes far longer than the arithmetic.
 
     Returns:
-        None where NumPy does not apply: the motion is differentiated, mapped or traced, is a
-        batch, on another device or not in float64.
+        State after the step. None where NumPy does not apply: the motion is differentiated,
+        mapped or traced, is a batch, is on another device or is not in float64.
     """
     tensors = (
         *(weights, state.position, state.rate, state.target, state.forced),
@@ -218,15 +218,15 @@ def numpy_approach(
 def _filtered(
     goal: Tensor, target: Tensor, ds: Tensor | float, rate: float, spring: SpringDamper
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Filtered goal after a step, and the motion (y - target, y') it causes before and after.
+    """Filtered goal after a step, and the state (y - target, y') it causes before and after.
 
-    y_p = target + k (g - target), k = alpha beta / (rate^2 - alpha rate + alpha beta), solves
-    the equation for a goal that decays to its target.
+    For a goal that decays to its target, the particular solution is y_p = target +
+    k (g - target) with k = alpha beta / (rate^2 - alpha rate + alpha beta).
     """
     denominator = rate**2 - spring.alpha * rate + spring.stiffness
     if not 0 < rate < math.inf or abs(denominator) < RESONANCE * spring.stiffness:
         raise ValueError(
-            f"a goal filter needs a positive rate off the modes of the spring, got {rate}"
+            f"a goal filter needs a positive rate away from the spring's modes, got {rate}"
         )
     gain = spring.stiffness / denominator
     lag_before = goal - target
@@ -241,7 +241,7 @@ def _filtered(
 
 
 def host_value(time: Tensor) -> Tensor | float:
-    """The time as a number if it is a plain scalar that nothing differentiates or traces."""
+    """Time as a number if it is a plain scalar that is not differentiated or traced."""
     if not readable(time) or time.ndim or type(time) is not Tensor or time.requires_grad:
         return time
     # Reading from another device would wait for all work queued there.

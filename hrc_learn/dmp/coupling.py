@@ -1,7 +1,7 @@
 """Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
-`step` takes their results as `phase_stopping` or as `coupling`. Obstacles are given by points
-on their surfaces, the nearest of each, so that the terms need no shapes.
+`step` takes their results as `phase_stopping` or as `coupling`. Each obstacle is given by the
+nearest point on its surface, so the terms need no shapes.
 
 Forces and the distance to a second arm act on the velocity (Gams et al. 2014, "Coupling
 movement primitives: interaction with the environment and bimanual tasks"). The spring opposes a
@@ -10,13 +10,14 @@ push on the acceleration; a term C added to the velocity moves the primitive as 
     tau z_dot = alpha (beta (g - y) - z) + f + lead tau C_dot,   tau y_dot = z + C
 
 C = tau gain error, with an error of force or of distance. A goal that contradicts the wanted
-force still pulls: at rest, feedback alone leaves 1 / (1 + K gain) of the error, K = k tau /
-beta on a contact of stiffness k, 2 tau / beta between two arms. The feedback of one repetition
-as feed-forward of the next reduces it by the same factor again. A coupling is constant over
-each step, which is of first order in its length.
+force still pulls: at rest, feedback alone leaves the fraction 1 / (1 + K gain) of the error,
+with K = k tau / beta in contact with a stiffness k, and K = 2 tau / beta between two arms. If
+the feedback of one repetition is the feed-forward of the next, the error falls by this factor
+again. A coupling is held constant over each step, with an error of first order in the step.
 
-Two arms keep an offset, error = wanted - (other - position), if one is coupled to minus the
-error and the other to plus that. To follow a leader, one arm takes the whole error.
+Two arms keep an offset if the arm at `position` receives minus the error and the other arm plus
+the error, with error = wanted - (other - position). To follow a leader, the follower receives
+the whole error.
 """
 
 import torch
@@ -26,7 +27,7 @@ from torch import Tensor
 from hrc_learn.dmp.dynamics import SpringDamper
 
 TOUCH = 1e-3
-"""Distance [m] below which repulsion stays constant, because it has no bound at contact."""
+"""Distance [m] below which repulsion stops growing; it would have no bound at contact."""
 
 
 def phase_stopping(
@@ -40,7 +41,8 @@ def phase_stopping(
     Args:
         planned: Position of the primitive [rad] or [m].
         measured: Position of the robot, in the same units.
-        gain: 1 / [rad^2] or 1 / [m^2]; the clock runs at half speed at 1 / sqrt(gain).
+        gain: [1/rad^2] or [1/m^2]; at a distance of 1 / sqrt(gain) the clock runs at half
+            speed.
     """
     return gain * (planned - measured).square().sum(-1)
 
@@ -56,10 +58,10 @@ def steering(
 ) -> Float[Tensor, "*batch 3"]:
     """Acceleration that turns the velocity away from obstacles ahead [m/s^2].
 
-    gamma R v phi exp(-beta phi), phi the angle between velocity and obstacle, R a quarter
-    turn away from it (Hoffmann et al. 2009, "Biologically-inspired dynamical systems for
-    movement generation", eq. 9). It bends the path without changing the speed. An obstacle
-    straight ahead has no effect, because neither side is nearer.
+    The term is gamma R v phi exp(-beta phi), with the angle phi between velocity and obstacle
+    and a quarter turn R away from the obstacle (Hoffmann et al. 2009, "Biologically-inspired
+    dynamical systems for movement generation", eq. 9). It bends the path without changing the
+    speed. An obstacle straight ahead has no effect, because neither side is nearer.
 
     Args:
         position: [m].
@@ -91,8 +93,8 @@ def repulsion(
 ) -> Float[Tensor, "*batch 3"]:
     """Acceleration away from obstacles closer than `reach` [m/s^2].
 
-    Minus the gradient of U = gain / 2 (1 / d - 1 / reach)^2, d the distance (Khatib 1986,
-    "Real-time obstacle avoidance for manipulators and mobile robots").
+    It is minus the gradient of U = gain / 2 (1 / d - 1 / reach)^2 at the distance d (Khatib
+    1986, "Real-time obstacle avoidance for manipulators and mobile robots").
 
     Args:
         position: [m].
@@ -118,8 +120,8 @@ def velocity_coupling(
 ) -> Float[Tensor, "*batch D"]:
     """Coupling for `step` that acts as a term C added to the velocity.
 
-    Eliminating z gives alpha / tau V + (1 + lead) V_dot, V = C / tau: a proportional and a
-    derivative term of the error.
+    Eliminating z gives alpha / tau V + (1 + lead) V_dot with V = C / tau: a proportional and
+    a derivative term of the error.
 
     Args:
         velocity: V, such as gain * (wanted - measured force) [m/s].

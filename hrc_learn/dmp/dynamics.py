@@ -1,10 +1,11 @@
 """The dynamics of a primitive: spring-damper, phase, and basis functions of the forcing term.
 
-Left to the spring, a motion reacts to a new goal at once: the acceleration jumps at the start
-and the motion becomes several times faster. With a minimum-jerk approach the forcing term
-contains a part proportional to goal - start under which, with all weights zero, the motion is
-y_0 + (g - y_0) m(s). The weights then shape the remainder (the elementary trajectory of Zhou et
-al. 2019, "Learning via-movement primitives", as part of a second-order system).
+If only the spring reacts to a new goal, the acceleration jumps at the start, and the velocity
+towards the goal peaks more than twice as high as in a minimum-jerk motion. With a minimum-jerk
+approach, the forcing term contains a part proportional to goal - start. With all weights zero,
+the motion is then y_0 + (g - y_0) m(s), with the minimum-jerk curve m from 0 to 1: the
+elementary trajectory of Zhou et al. 2019, "Learning via-movement primitives", in a second-order
+system. The weights describe how a motion deviates from this trajectory.
 """
 
 import math
@@ -23,7 +24,7 @@ CRITICAL = 1e-12
 """Bound on |1 - 4 beta / alpha| below which the damping counts as critical. Closer to zero,
 sinh(r s) / r loses more than six digits to cancellation."""
 ROUNDING = 38.0
-"""Exponent below which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
+"""Decay exponent beyond which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
 DOMAINS = ("time", "phase")
 DEGREE = 3
 """Degree of the splines: the lowest whose forcing has a continuous second derivative."""
@@ -67,7 +68,7 @@ class SpringDamper:
 
     @property
     def smooth_interval(self) -> float:
-        """Length over which the unforced motion is a polynomial of low degree."""
+        """Normalised time over which the free motion is nearly a polynomial of low degree."""
         half = self.alpha / 2
         fastest = half + math.sqrt(max(half**2 - self.stiffness, 0.0))
         # The modulus of complex modes is the square root of the stiffness.
@@ -78,10 +79,10 @@ class SpringDamper:
         return -self.stiffness * offset - self.alpha * velocity
 
     def propagator(self, s: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch 2 2"]:
-        """Transition matrix exp(A s): maps (y - g, y') at 0 to the same at `s`.
+        """Transition matrix exp(A s), which maps (y - g, y') at 0 to (y - g, y') at `s`.
 
         exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
-        The matrix of a number is cached: do not change it in place.
+        If `s` is a plain number, the result is cached: do not change it in place.
         """
         if not isinstance(s, Tensor):
             return _cached_propagator(self, s)
@@ -91,9 +92,10 @@ class SpringDamper:
         return entries.view(*s.shape, 2, 2)
 
     def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
-        """exp(-alpha s / 2) times cosh(r s) and sinh(r s) / r, r^2 = alpha^2 / 4 - alpha beta.
+        """C and S: exp(-alpha s / 2) times cosh(r s), and times sinh(r s) / r.
 
-        Trigonometric for imaginary r, 1 and s for r = 0.
+        r^2 = alpha^2 / 4 - alpha beta. If r is imaginary, cos and sin take the place of cosh
+        and sinh; for r = 0, the factors are 1 and s.
 
         Args:
             s: Normalised time, of a type that `xp` accepts.
@@ -106,7 +108,7 @@ class SpringDamper:
             C = xp.exp(-half * s)
             return C, s * C
         if discriminant > 0:
-            # Both exponents are negative: unlike cosh, nothing overflows at large s.
+            # Both exponents are negative, so nothing overflows at large s, as cosh would.
             slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
             return (slow + fast) / 2, (slow - fast) / (2 * rate)
         envelope = xp.exp(-half * s)
@@ -127,7 +129,7 @@ def _cached_propagator(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
 
 
 def approach_curve(s: Float[Tensor, "*batch"], fraction: float, order: int) -> Tensor:
-    """Derivative of m(s) - 1, m the curve from 0 to 1 over the first `fraction` of a motion."""
+    """Derivative of m(s) - 1, where the minimum-jerk curve m reaches 1 at s = `fraction`."""
     coefficients = (-1.0, 0.0, 0.0, 10.0, -15.0, 6.0)
     for _ in range(order):
         coefficients = tuple(k * c for k, c in enumerate(coefficients))[1:]
@@ -167,7 +169,7 @@ class ExponentialPhase:
 
     @property
     def smooth_interval(self) -> float:
-        """Length over which the phase is a polynomial of low degree."""
+        """Normalised time over which the phase is nearly a polynomial of low degree."""
         return 1 / self.decay
 
 
@@ -181,9 +183,9 @@ class GaussianBasis:
     is resolved alike; sigma_i is `width` times the distance to the next centre.
 
     In the domain `"time"`, x = s, and one more Gaussian without a weight follows the last one.
-    As it takes over, the forcing term ends with the motion, which then settles at its goal. In
-    the domain `"phase"`, x = z, as in the paper. There all Gaussians return in equal parts as
-    z -> 0, and the motion wanders after its end before it settles.
+    After the end it dominates the sum, so the forcing term vanishes and the motion settles at
+    its goal. In the domain `"phase"`, x = z, as in the paper. As z -> 0, all Gaussians become
+    equally active again, and the motion wanders after its end before it settles.
     """
 
     count: int = 50
@@ -211,17 +213,17 @@ class GaussianBasis:
         """Normalised time after which the forcing is lost in float64 rounding."""
         if self.domain == "phase":
             return self.phase.horizon
-        # Past the end, the last Gaussian falls behind its follower by
-        # exp((1/2 - x) / width^2) at x spacings; exp(-39) = 1e-17.
+        # At x spacings past the end, the last Gaussian is exp((1/2 - x) / width^2) times the
+        # one without a weight; exp(-39) = 1e-17.
         end = 1 + (0.5 + 39 * self.width**2) / (self.count - 1)
         return min(end, self.phase.horizon)
 
     @property
     def smooth_interval(self) -> float:
-        """Length over which the forcing is a polynomial of low degree.
+        """Normalised time over which the forcing is nearly a polynomial of low degree.
 
-        The ratio of two neighbours is a logistic function of scale width^2 times the spacing,
-        which is analytic within pi times that.
+        Between two neighbours, a normalised Gaussian is a logistic function of s, whose scale
+        is width^2 times the spacing. Its nearest pole is pi times this scale away.
         """
         # 1.4 width^2 is 0.45 of the distance to the nearest pole, pi width^2.
         handover = min(0.5, 1.4 * self.width**2) / (self.count - 1)
@@ -258,8 +260,8 @@ class PeriodicBasis:
 
     psi_i(s) = exp(h (cos(2 pi (s - c_i)) - 1)),  phi_i = psi_i / sum_j psi_j
 
-    (Ijspeert et al. 2013, section 2.2.2). Centres c_i = (i - 1) / N; h such that a bell has
-    the standard deviation `width` times the distance between centres.
+    (Ijspeert et al. 2013, section 2.2.2). The centres are c_i = (i - 1) / N. The sharpness h
+    gives a bell the standard deviation `width` times the distance between centres.
     """
 
     count: int = 25
@@ -270,7 +272,7 @@ class PeriodicBasis:
     horizon = 1.0
     """The period."""
     knot_spacing = 1.0
-    """The period: the table of the response has to close on itself."""
+    """The period, so that whole pieces of the response's table cover it."""
 
     def __post_init__(self):
         check_positive("width", self.width)
@@ -278,7 +280,7 @@ class PeriodicBasis:
 
     @property
     def smooth_interval(self) -> float:
-        """Length over which the forcing is a polynomial of low degree."""
+        """Normalised time over which the forcing is nearly a polynomial of low degree."""
         # Neighbours behave like Gaussians; see `GaussianBasis.smooth_interval`.
         return min(0.5, 1.4 * self.width**2) / self.count
 
@@ -313,9 +315,9 @@ class SplineBasis:
     before c_i - 2 h, to the last bit, and at most four weights act at a time. The splines add
     up to one without normalisation (de Boor 1978, "A practical guide to splines", chapter IX).
 
-    Centres are c_i = (i - 2) h, i = 1 ... N, with the spacing h = 1 / (N - 1): from one
-    spacing before the start, which completes the first interval, to one before the end. The
-    forcing term fades over the last two spacings and is zero from 1 + h on.
+    The centres are c_i = (i - 2) h, i = 1 ... N, with the spacing h = 1 / (N - 1). The first
+    lies one spacing before the start, so that the first interval is complete; the last lies
+    one spacing before the end. The forcing term fades from 1 - 2 h on and is zero from 1 + h.
     """
 
     count: int = 50
@@ -339,7 +341,7 @@ class SplineBasis:
 
     @property
     def smooth_interval(self) -> float:
-        """Length over which the forcing, between knots, is a polynomial of low degree."""
+        """Normalised time over which the forcing, between knots, is nearly a polynomial."""
         return min(self.knot_spacing, self.phase.smooth_interval)
 
     def centre_times(self) -> Float[Tensor, "N"]:
@@ -358,7 +360,7 @@ class SplineBasis:
 
 def cubic_spline(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Cubic B-spline on the knots -2, -1, 0, 1, 2; exactly zero beyond them."""
-    # Truncated powers of the distance to the nearer end: nothing cancels there.
+    # Truncated powers of the distance to the nearer end, near which no digits cancel.
     inwards = 2 - x.abs()
     outer, inner = inwards.clamp_min(0), (inwards - 1).clamp_min(0)
     return (outer**DEGREE - 4 * inner**DEGREE) / math.factorial(DEGREE)
@@ -367,9 +369,10 @@ def cubic_spline(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 type Basis = GaussianBasis | PeriodicBasis | SplineBasis
 """Functions that the weights of a forcing term multiply; frozen and hashable.
 
-`horizon` is the normalised time after which the forcing is lost in rounding, or the period;
-`smooth_interval` the length over which the forcing, between knots, is a polynomial of low
-degree; `knot_spacing` the spacing of the points where it is not smooth, None if there are none.
+`horizon` is the normalised time after which the forcing is lost in rounding, or the period.
+`smooth_interval` is the time over which the forcing, between knots, is nearly a polynomial of
+low degree. `knot_spacing` is the distance between points where the forcing is not smooth, None
+if there are none.
 """
 BASES: dict[str, type[Any]] = {
     kind.__name__: kind for kind in (GaussianBasis, PeriodicBasis, SplineBasis)
@@ -377,7 +380,7 @@ BASES: dict[str, type[Any]] = {
 
 
 def basis_config(basis: Basis) -> dict[str, Any]:
-    """Description of a basis as JSON values, from which `restored_basis` makes it again."""
+    """Description of a basis as JSON values, from which `restored_basis` restores the basis."""
     return {"type": type(basis).__name__, **asdict(basis)}
 
 
@@ -385,7 +388,7 @@ def restored_basis(config: dict[str, Any]) -> Basis:
     """Basis that `basis_config` described.
 
     Raises:
-        ValueError: Unknown type, or values that it refuses.
+        ValueError: Unknown type, or values that the type refuses.
         TypeError: Fields that the type does not have.
         KeyError: The type is missing.
     """
@@ -403,8 +406,8 @@ def balanced_units(
 ) -> Float[Tensor, "unknown"]:
     """Units in which a ridge penalises the weights and the next `others` columns alike.
 
-    Late weights act through a small phase, and the columns of start and goal are not
-    integrated.
+    Late weights act through a small phase, so the unit of a weight is 1 / phase at its centre.
+    The other columns, such as the start velocity, take the size of the largest weight column.
     """
     unit = 1 / basis.phase(basis.centre_times().to(A))
     norm = A.norm(dim=0)

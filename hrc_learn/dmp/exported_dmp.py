@@ -1,6 +1,6 @@
 """Primitives for other programs: a NumPy stepper, and the step as a `torch.export` program.
 
-The program accepts batches of any size as dictionaries of tensors, so that a loop runs it
+The program accepts batches of any size as dictionaries of tensors, so a control loop can run it
 without this package:
 
     program = torch.export.load("place/step.pt2").module()
@@ -32,11 +32,11 @@ from hrc_learn.geometry import Pose, quaternion
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
 FRAMES = "reference", "goal_velocity"
-"""Names of the frame in the states of different kinds."""
+"""Fields with the frame of the columns, in the states of different kinds of primitive."""
 TRACED_BATCH = 3
-"""Any size but 0 and 1, which a tracer would take for constants."""
+"""Batch size during tracing: any but 0 and 1, which the tracer would treat as constants."""
 ROUNDINGS = 8
-"""Machine epsilons below which an angle counts as zero: a quaternion product takes seven."""
+"""Machine epsilons up to which an angle counts as zero: a quaternion product rounds 7 times."""
 TRACED_STEP = 1e-3
 """Step [s] with which a program is traced; it accepts any other when it runs."""
 
@@ -45,24 +45,25 @@ type Tensors = dict[str, Tensor]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExportedDMP:
-    """A primitive ready to leave the training environment."""
+    """Primitive in forms that run outside of the training environment."""
 
     dmp: MotionPrimitive
     stepper: Stepper | None
-    """One motion of joints in NumPy, float64; None for other kinds, which the program steps."""
+    """NumPy stepper of a joint primitive (float64); None for other kinds: use `program`."""
     program: ExportedProgram
-    """Maps (state, dt, inputs) to a state: dictionaries of tensors (B, ...), dt (B,) [s].
+    """Program that maps (state, dt, inputs) to the next state.
 
-    A state is what `state_tensors` returns. Inputs are `phase_stopping`, `coupling` and `goal`;
-    a pose has `goal_position`, `goal_orientation` and `goal_body` instead of `goal`, and its
-    coupling is (B, 6). All are required; `resting_inputs` change nothing.
+    State and inputs are dictionaries of tensors (B, ...); dt is (B,) [s]. A state is what
+    `state_tensors` returns. Inputs are `phase_stopping`, `coupling` and `goal`; a pose has
+    `goal_position`, `goal_orientation` and `goal_body` instead of `goal`, and its coupling is
+    (B, 6). All inputs are required; those of `resting_inputs` have no effect.
     """
 
     def save(self, folder: str | Path) -> None:
         """Write the primitive and `step.pt2` into `folder`, replacing an older export.
 
         Raises:
-            InTheWayError: A ValueError: `folder` holds anything else; it is left alone.
+            InTheWayError: `folder` holds something else, which stays unchanged (a ValueError).
             BusyError: Another process is writing there.
         """
         with store.replacing(folder, store.EXPORT, overwrite=True) as new:
@@ -76,7 +77,7 @@ def export_dmp(dmp: MotionPrimitive, *, goal_filter: float | None = None) -> Exp
 
     Args:
         dmp: A single primitive of any kind.
-        goal_filter: Goal filter of the program, as in `step`; goals of the stepper jump.
+        goal_filter: Goal filter of the program, as in `step`; in the stepper, goals jump.
 
     Raises:
         ValueError: The primitive is a batch.
@@ -92,7 +93,8 @@ def load_stepper(folder: str | Path) -> Stepper:
 
     Raises:
         FileNotFoundError: The folder holds no export.
-        ValueError: Another kind, or a wrong field; the message names the file and the field.
+        ValueError: Another kind of primitive, or a wrong field; the message names the file and
+            the field.
     """
     folder = Path(folder)
     store.settle(folder)
@@ -122,16 +124,16 @@ class StepModule(nn.Module):
 
 
 def state_tensors(state: Any) -> Tensors:
-    """State as the program takes it: tensors (*batch, ...) by name, with a batch axis."""
+    """State for the program, as tensors (*batch, ...) by name; one motion is a batch of one."""
     tensors = _named(state)
     if not tensors["duration"].ndim:
         tensors = {name: x[None] for name, x in tensors.items()}
-    # Copies, because a tracer takes one tensor in two places for one input.
+    # Copies, because the tracer treats one tensor in two places as one input.
     return {name: x.detach().clone() for name, x in tensors.items()}
 
 
 def _named(state: Any) -> Tensors:
-    """Tensors of a state, by name; those of its columns first."""
+    """Tensors of a state by name, including those of its columns."""
     tensors: Tensors = {}
     for name, part in vars(state).items():
         tensors |= _named(part) if isinstance(part, DMPState) else {name: part}
@@ -146,7 +148,7 @@ def _restored_state(dmp: MotionPrimitive, tensors: Tensors) -> Any:
 
 
 def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:
-    """Inputs of the program that change nothing: the current goal, and no coupling."""
+    """Inputs of the program that have no effect: the current goal, and no coupling."""
     target, errors = state["target"], dmp.error_columns
     rest = {
         "phase_stopping": torch.zeros_like(state["pace"]),
@@ -174,9 +176,10 @@ def _goals(inputs: Tensors) -> dict[str, Any]:
 
 
 def _where_new[S: (OrientationState, PoseState)](new: S, old: S) -> S:
-    """State with a new goal where the goal differs from the old one.
+    """The new state for motions whose goal has changed, the old state for the others.
 
-    An orientation whole turns away from a constant goal would otherwise lose velocity.
+    An orientation that is whole turns away from an unchanged goal would otherwise lose
+    velocity.
     """
     difference = quaternion.angle(new.reference, old.reference)
     changed = difference > ROUNDINGS * torch.finfo(difference.dtype).eps

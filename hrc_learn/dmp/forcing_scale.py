@@ -2,10 +2,10 @@
 
 - `"none"`: no scaling. Weights are accelerations; a new goal shifts the motion smoothly.
   Defined for every start and goal, hence the default.
-- `"paper"`: g - y_0, as the paper prints it. The motion grows with the distance to the goal;
-  undefined for g = y_0, and mirrored if the goal lies on the other side.
+- `"paper"`: g - y_0, as printed in the paper. The motion grows with the distance to the goal,
+  and is mirrored if the goal lies on the other side; undefined for demonstrations with g = y_0.
 - `"amplitude"`: the range of each coordinate in the demonstration. Weights are dimensionless,
-  so scaled demonstrations have the same ones; defined for g = y_0.
+  so a scaled demonstration has the same weights; also defined for g = y_0.
 - `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
   space; see `_rotated`.
 """
@@ -21,13 +21,13 @@ from torch import Tensor
 from hrc_learn.dmp.samples import demo_label
 
 MINIMUM_DISPLACEMENT = 1e-3
-"""Smallest |g - y_0| to divide by, relative to the range: weights would be a thousand times the
-forces they stand for."""
+"""Smallest |g - y_0| that may divide weights, relative to the range. A smaller one would make
+them over a thousand times as large as division by the range does."""
 HALF_TURN = 1e-3
-"""Angle [rad] to half a turn below which a rotation counts as half a turn."""
+"""Difference [rad] from half a turn below which a rotation counts as half a turn."""
 NO_DIRECTION = 1e-24
-"""Squared displacement, relative to the demonstrated one, below which it has no direction:
-start and goal agree to rounding, 1e-12."""
+"""Squared ratio of a displacement to the demonstrated one below which it has no direction:
+start and goal then agree to rounding, 1e-12."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Demonstrated:
     """Range of each coordinate."""
 
     def leading(self, columns: int | None) -> "Demonstrated":
-        """The first coordinates only; None: all."""
+        """Start, goal and range of the first `columns` coordinates; None: of all."""
         return Demonstrated(**{k: values[..., :columns] for k, values in vars(self).items()})
 
 
@@ -105,7 +105,7 @@ class Scaling:
         """Inverse of `scale` for the start and goal of the demonstration."""
         if self.name == "none":
             return values
-        # There every scaling is a factor per coordinate.
+        # For the demonstrated start and goal, every scaling is a factor per coordinate.
         ones = torch.ones_like(values[..., :1, :])
         return values / self.scale(ones, reference.start, reference.goal, reference)
 
@@ -148,15 +148,15 @@ class Scaling:
 def _rotated(values: Any, displacement: Any, reference: Demonstrated, xp: ModuleType) -> Any:
     """Rotation and dilation with the displacement from start to goal, in 2 dimensions or more.
 
-    c R, with c = |g - y_0| / |g_0 - y_0| and R the rotation from a, the direction of the
-    demonstrated displacement g_0 - y_0, to b, that of the new one, in their common plane (as
-    in space by Hoffmann et al. 2009): R = H(a + b) H(a), H(x) v = v - 2 x (x'v) / x'x.
-    The start velocity is scaled too, so that the whole motion turns and grows with its ends.
+    Values are multiplied by c R with c = |g - y_0| / |g_0 - y_0|. The rotation R turns a, the
+    direction of the demonstrated displacement g_0 - y_0, to b, the direction of the new one, in
+    their common plane (Hoffmann et al. 2009 do this in space). It consists of two reflections,
+    R = H(a + b) H(a), H(x) v = v - 2 x (x'v) / x'x. The start velocity is scaled too, so that
+    the whole motion turns and grows with its ends.
 
-    No such rotation exists for half a turn. Within `HALF_TURN` of it, R turns in the plane of a
-    and the coordinate axis most orthogonal to it. R jumps there, depending on the side from
-    which it is approached, and its derivative grows as 1 / |a + b| on the way; both stay
-    finite.
+    For half a turn, the common plane is not unique. Within `HALF_TURN` of half a turn, R turns
+    in the plane of a and the coordinate axis most orthogonal to a. R is discontinuous there,
+    and its derivative grows as 1 / |a + b| towards it; both stay finite.
     """
     shown = reference.goal - reference.start
     length = _squared(shown) ** 0.5
@@ -168,7 +168,7 @@ def _rotated(values: Any, displacement: Any, reference: Demonstrated, xp: Module
 
 
 def _bisector(a: Any, b: Any, xp: ModuleType) -> Any:
-    """Unit vector along a + b, or orthogonal to a where that vanishes."""
+    """Unit vector along a + b, or orthogonal to a where the sum vanishes."""
     axis = xp.arange(a.shape[-1], device=a.device) == abs(a).argmin(-1)[..., None]
     orthogonal = -a * (a * axis).sum(-1)[..., None] + axis
     middle = a + b
@@ -198,7 +198,7 @@ SCALINGS: dict[str, Callable[[Any, Any, Demonstrated, ModuleType], Any]] = {
 
 
 def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
-    """Scaling with this name, for the first `columns` coordinates; an instance is returned.
+    """Scaling of this name, for the first `columns` coordinates; a `Scaling` is returned as is.
 
     Raises:
         ValueError: Unknown scaling.

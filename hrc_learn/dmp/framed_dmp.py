@@ -1,11 +1,11 @@
 """Motions relative to the frames of objects.
 
-Each demonstration is seen from every frame; the demonstrations agree in a frame where it
-determines the motion. For frames at new places, the Gaussians of all frames are transformed
+Each demonstration is expressed in every frame. While a frame determines the motion, the
+demonstrations agree in it. For frames at new places, the Gaussians of all frames are moved
 there and multiplied, as in task-parameterised models (Calinon 2016, "A tutorial on
 task-parameterized movement learning and retrieval", eqs. 5 and 6). Here the Gaussians are over
-the coordinates of a primitive, that is over whole motions instead of single moments: a motion
-that deviates at its start keeps deviating. The result is an ordinary primitive.
+the coordinates of a primitive, that is over whole motions instead of single times: a motion
+that deviates at its start continues to deviate. The result is an ordinary primitive.
 """
 
 import math
@@ -24,21 +24,21 @@ from hrc_learn.dmp.probabilistic_dmp import mean_primitive
 from hrc_learn.geometry import Pose, quaternion
 
 PERSISTENCE = 0.3
-"""Fraction of a motion over which deviations persist that no demonstration showed; with 0.1 the
-error on synthetic motions is twice as large (benchmarks/bench_frames.py)."""
+"""Correlation length of the assumed smooth deviations, as a fraction of the motion; with 0.1,
+the error on synthetic motions is twice as large (benchmarks/bench_frames.py)."""
 MODES = 12
-"""Modes of such deviations: the next one has 1e-6 of the variance."""
+"""Number of modes of these deviations: the next mode has 1e-6 of the variance."""
 FREEDOM = 1e-3
-"""Independent standard deviation of each coordinate, relative to that over all frames. It makes
-the covariance invertible where frames agree; motions do not visibly change."""
+"""Standard deviation added independently to each coordinate, relative to its mean over all
+frames. It makes the covariance invertible; motions do not visibly change."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
     """F frames of a motion, y = A y_in_frame + b.
 
-    A is any invertible matrix. A column that belongs to no place, such as a gripper opening,
-    has a one on the diagonal of A and zero in b.
+    A is any invertible matrix. A coordinate that is not spatial, such as a gripper opening, has
+    a one on the diagonal of A and a zero in b.
     """
 
     A: Float[Tensor, "*batch F D D"]
@@ -53,17 +53,17 @@ class Frames:
 
     @staticmethod
     def of(*poses: Pose) -> "Frames":
-        """Frames for positions in space, from poses of (*batch) each."""
+        """Frames for positions in space, from one pose (*batch) for each frame."""
         A = torch.stack([quaternion.to_matrix(pose.orientation) for pose in poses], dim=-3)
         return Frames(A, torch.stack([pose.position for pose in poses], dim=-2))
 
     def inwards(self, x: Float[Tensor, "*batch D M"]) -> Float[Tensor, "*batch F D M"]:
-        """Coordinates of primitives relative to each frame."""
+        """Convert coordinates of primitives from the base frame to each frame."""
         x = x[..., None, :, :].to(self.A)
         return torch.linalg.solve(self.A, x - self._offset(x.shape[-1]))
 
     def outwards(self, x: Float[Tensor, "F D M"]) -> Float[Tensor, "*batch F D M"]:
-        """Coordinates in the base frame of primitives relative to each frame."""
+        """Convert coordinates of primitives from each frame to the base frame."""
         return self.A @ x + self._offset(x.shape[-1])
 
     def _offset(self, M: int) -> Float[Tensor, "*batch F D M"]:
@@ -76,8 +76,8 @@ class FramedDMP:
     """Gaussians over the coordinates of a primitive relative to each of F frames (float64).
 
     x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`. The covariance is that
-    of n demonstrations plus that of smooth deviations in any direction, as large as those
-    observed, with the weight of one more demonstration.
+    of the n demonstrations plus that of smooth deviations in all directions, which are as large
+    as the observed ones and have the weight of one more demonstration.
     """
 
     primitive: JointDMP
@@ -115,7 +115,7 @@ class FramedDMP:
             options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Fewer than two demonstrations, or frames of another number or size.
+            ValueError: Fewer than two demonstrations, or frames of a wrong number or size.
         """
         dmps = JointDMP.fit(
             time, position, n_basis, mask=mask, joint_names=joint_names, units=units, **options
@@ -150,7 +150,7 @@ class FramedDMP:
         """Most likely primitive for frames, (*batch, F); gradients flow to them.
 
         Raises:
-            ValueError: Frames of another number or size.
+            ValueError: Frames of a wrong number or size.
         """
         F, D, M = self.mean.shape
         if frames.b.shape[-2:] != (F, D):
@@ -171,9 +171,9 @@ class FramedDMP:
 
 
 def _precision(root: Float[Tensor, "F D M columns"]) -> Float[Tensor, "F DM DM"]:
-    """Inverse covariance from a square root of the covariance, with some freedom added."""
+    """Inverse covariance from a square root of the covariance, with `FREEDOM` added."""
     D = root.shape[1]
-    # One unit per weight and end for all columns: it is invariant to rotations.
+    # Each weight and end has one unit for all D columns, which rotations do not change.
     unit = root.square().sum(-1).mean((0, 1)).sqrt()
     root = (root / unit[:, None]).flatten(1, 2)
     eye = torch.eye(root.shape[1]).to(root)
@@ -194,7 +194,7 @@ def _smooth_deviations(
     n, F, D, _ = off.shape
     s = torch.linspace(0, 1, REFIT_SAMPLES * dmps.basis.count + 1).to(off)
     rows = dmps.response.evaluate(s)[:, 0]
-    # Variance along the motion, the mean over all directions.
+    # Variance along the motion, averaged over all directions.
     variance = (off @ rows.mT).square().sum(0).mean(-2) / (n - 1)
     size = (variance / (n + 1) + least**2).sqrt()
     # Modes of a Gaussian process with squared exponential covariance.

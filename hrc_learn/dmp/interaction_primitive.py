@@ -1,10 +1,10 @@
-"""Prediction of a person's motion, and the matching robot motion, from its beginning.
+"""Prediction of a person's and the robot's motion from the beginning of the person's motion.
 
 Interaction primitives (Ben Amor et al. 2014; Maeda et al. 2017, "Probabilistic movement
-primitives for coordination of multiple human-robot collaborative tasks"): the motions of both
-are jointly Gaussian, so that the robot's motion follows from the observed part of the person's.
-The kind of interaction and its duration are inferred too: each combination has a likelihood in
-closed form.
+primitives for coordination of multiple human-robot collaborative tasks"): the motions of person
+and robot are jointly Gaussian, so the robot's motion follows from the observed part of the
+person's. The kind of interaction and its duration are inferred too: each combination of kind
+and duration has a likelihood in closed form.
 """
 
 import math
@@ -21,22 +21,22 @@ from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, gaussian
 from hrc_learn.dmp.samples import padded
 
 DURATIONS = 31
-"""Durations compared for each kind, over three standard deviations to either side: a fifth of
-one apart, below which the likelihoods of a few samples hardly differ."""
+"""Number of durations compared for each kind, within three standard deviations. They are 0.2
+standard deviations apart; closer ones hardly differ in the likelihood of a few samples."""
 MINIMUM_SPREAD = 0.05
-"""Standard deviation of the logarithm of durations: people repeat a motion to about five
-percent at best, and a few demonstrations may agree better by chance."""
+"""Smallest standard deviation of the logarithm of durations: a person repeats a motion to about
+five percent at best, and a few demonstrations may agree better by chance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InteractionPrimitive:
-    """Joint Gaussians over the motions of a person and a robot, one for each kind."""
+    """Joint Gaussians over the motions of a person and a robot, one per kind of interaction."""
 
     kinds: tuple[str, ...]
     models: tuple[ProbabilisticDMP[JointDMP], ...]
-    """Gaussian over all columns of each kind, those of the person first."""
+    """Gaussian of each kind over all columns, the person's columns first."""
     prior: Float[Tensor, "K"]
-    """Fraction of the demonstrations of each kind."""
+    """Fraction of the demonstrations that are of each kind."""
     log_duration: Float[Tensor, "K 2"]
     """Mean and standard deviation of the logarithm of durations [s]."""
     observed: int
@@ -56,7 +56,7 @@ class InteractionPrimitive:
         """Learn from demonstrations of a person and a robot.
 
         Args:
-            time: [s], (T,), (B, T) or a list of (T_i,), the same for both.
+            time: [s], (T,), (B, T) or a list of (T_i,), the same for person and robot.
             person: Observed columns of the person, (B, T, H) or a list of (T_i, H).
             robot: (B, T, R) or a list of (T_i, R).
             kinds: Kind of each demonstration; None: all are of one kind.
@@ -103,8 +103,8 @@ class InteractionPrimitive:
         Args:
             time: Time since the person started [s], (n,), increasing.
             person: (n, H); NaN where nothing was observed.
-            noise: Standard deviation of each value: the sensor's, and a person's variation from
-                sample to sample.
+            noise: Standard deviation of each value, from the sensor and from the person's
+                variation between samples.
 
         Raises:
             ValueError: Wrong shapes, or no observation at all.
@@ -177,7 +177,7 @@ class InteractionEstimate:
     phase: float
     """Elapsed fraction of the duration, 0 to 1."""
     motion: ProbabilisticDMP[JointDMP]
-    """Motion of both, given the observation, on the time scale of its primitive."""
+    """Motion of person and robot given the observation, on the time scale of its primitive."""
     observed: int
     """Number of columns of the person."""
 
@@ -194,8 +194,8 @@ class InteractionEstimate:
     def stiffness(self, time: Times, largest: float, tolerance: float) -> Float[Tensor, "T R"]:
         """Stiffness for tracking the mean, lower where the prediction is uncertain.
 
-        largest tolerance^2 / (tolerance^2 + variance): the weight of the prediction in its
-        product with a Gaussian of standard deviation `tolerance`.
+        It is `largest` times tolerance^2 / (tolerance^2 + variance), the weight of the
+        prediction in a product with a Gaussian of standard deviation `tolerance`.
         """
         variance = self.robot(time)[1].square()
         return largest * tolerance**2 / (tolerance**2 + variance)

@@ -1,4 +1,4 @@
-"""Movement primitive of joints, or of any coordinates that add up like them."""
+"""Movement primitive of joints, or of other coordinates that can be added and scaled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,10 +29,10 @@ from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples, normal_products, 
 from hrc_learn.dmp.trajectory import Trajectory
 
 LIMIT_SAMPLES = 2001
-"""Times at which limits are checked: 40 per basis function, between which a peak is higher by
-less than 1e-3."""
+"""Number of times at which limits are checked: 40 for each of 50 basis functions. A peak
+between two of these times is higher by less than 1e-3 of its height."""
 TOLERANCE = 1.05
-"""Ratio to the smallest held-out error that still counts as equal to it."""
+"""Ratio to the smallest held-out error up to which an error counts as equal to it."""
 DEFAULT_COUNT = 50
 """Default number of basis functions: they follow recordings of arms to 5e-5 of the range, and
 fewer would not make a motion without noise smoother."""
@@ -41,7 +41,8 @@ fewer would not make a motion without noise smoother."""
 STRONG_RIDGE = 1e-5
 """Ridge where the samples do not determine all functions: its square is well above rounding."""
 TIMESTAMPS = 1000
-"""Samples of the default rollout, because the demonstrations have no common grid."""
+"""Number of samples in the default rollout of `fit_shared`: the demonstrations have no common
+grid."""
 
 
 class FitOptions(TypedDict, total=False):
@@ -51,7 +52,7 @@ class FitOptions(TypedDict, total=False):
     """`"trajectory"` (default), least squares on the positions, the closest reproduction;
     `"ridge"`, regression on the force; `"lwr"`, the paper's method."""
     approach: float | int | None
-    """Fraction of the motion, 0 to 1, over which it moves smoothly to a new start and goal; 0:
+    """Fraction of the motion, 0 to 1, over which it adapts smoothly to a new start and goal; 0:
     at once, as in the paper. None (default): 1, but 0 for rhythms and the scaling `"paper"`."""
     basis: Basis | None
     """Basis of the forcing term; `n_basis` Gaussians by default."""
@@ -60,8 +61,8 @@ class FitOptions(TypedDict, total=False):
     regularization: float
     """Ridge, relative to the largest singular value; 1e-7 by default."""
     smooth: bool | None
-    """True to remove noise from the samples first, as much as they give evidence of; see
-    `samples.py`. None (default): unless the number of basis functions is given."""
+    """True to estimate the noise of the samples and remove it before the fit; see `samples.py`.
+    None (default): True unless `n_basis` or `basis` is given."""
 
 
 def _fit(
@@ -79,9 +80,9 @@ def _fit(
     """Fit in float64; arguments as in `FitOptions`.
 
     Returns:
-        Response of spring and basis; the fitted samples, without noise if it was removed; its
-        standard deviation (B, D), or None; weights (B, D, N) of the unscaled forcing term; and
-        start velocities dy/ds (B, D).
+        Response of spring and basis; the fitted samples, without noise if it was removed; the
+        standard deviation (B, D) of the removed noise, or None; weights (B, D, N) of the
+        unscaled forcing term; and start velocities dy/ds (B, D).
     """
     chosen = n_basis is not None or basis is not None
     if basis is None:
@@ -112,7 +113,8 @@ def _unscaled(
     if scaling.name == "none":
         return weights
     amplitude = samples.amplitude.double()
-    # Noise, or its removal, may separate a start and a goal that agree: both are checked.
+    # Noise or its removal may separate a start and a goal that agree: check the samples with
+    # and without noise.
     for each in (recorded, samples):
         shown = Demonstrated(each.first.double(), each.last.double(), amplitude)
         scaling.check(shown, each.batch, names)
@@ -150,14 +152,16 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
 
         Args:
             time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
-            position: (T, D) or (*B, T, D); D = 1 if its shape is that of `time`. Or a list of
-                (T_i, D) with a list of (T_i,), for demonstrations of different lengths. Its
-                floating-point dtype is that of the primitive; the fit runs in float64.
+            position: (T, D) or (*B, T, D); D = 1 if its shape is that of `time`. For
+                demonstrations of different lengths, a list of (T_i, D), with a list of (T_i,)
+                as `time`. Its floating-point dtype is that of the primitive; the fit runs in
+                float64.
             n_basis: N, unless `basis` is given. None: 50, and noise is removed from the
-                samples; see `FitOptions.smooth`. Between fewer than 1.5 N samples the motion
-                follows a cubic spline.
-            velocity: Recorded velocity per second, like `position`. Without it, the default
-                method also fits the start velocity, and the others differentiate positions.
+                samples; see `FitOptions.smooth`. If there are at most 1.5 N samples, the motion
+                follows piecewise cubics between them.
+            velocity: Recorded velocity per second, shaped like `position`. Without it, the
+                default method also fits the start velocity, and the others differentiate
+                positions.
             mask: (*B, T), false at samples to ignore, such as padding and dropouts.
             scaling: Scaling of the forcing term: `"none"`, `"paper"`, `"amplitude"` or
                 `"rotation"`.
@@ -215,8 +219,8 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
     ) -> Float[Tensor, "*batch"]:
         """Shortest duration [s] in which the path keeps limits, for use in `rollout`.
 
-        A slower motion keeps its path if its start velocity is scaled too: velocities fall as
-        1 / duration and accelerations as its square.
+        A slower motion keeps its path if its start velocity is scaled too. Velocities then fall
+        as 1 / duration and accelerations as 1 / duration^2.
 
         Args:
             velocity: Limit of each coordinate [1/s], (D,) or one for all; None: no limit.
@@ -240,7 +244,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
 
 @dataclass(frozen=True, kw_only=True)
 class BasisSelection:
-    """Held-out error over the number of basis functions."""
+    """Held-out error as a function of the number of basis functions."""
 
     count: int
     """Smallest number whose error is within 5 % of the best."""
@@ -319,10 +323,11 @@ def fit_shared(
     The rows [A B] of min |A X - B|^2 enter through their products [A B]'[A B], which add up in
     any order and over any number of processes.
 
-    Minimises the distance of all samples to one primitive that takes start, goal and duration
-    from each demonstration; all have the same weights and start velocity (per duration).
-    For demonstrations on one grid the result is the mean of a primitive each. With several
-    processes, each reads its part of the demonstrations, and all return the same result.
+    The fit minimises the distance of all samples to one primitive, which has the start, goal
+    and duration of each demonstration in turn, but the same weights and start velocity (per
+    duration) for all. For demonstrations on one grid, the result is the mean of their separate
+    primitives. With several processes, each reads its part of the demonstrations, and all
+    return the same result.
 
     Args:
         demonstrations: Timestamps (T,) [s] and positions (T, D) of each. They are read one by
