@@ -143,6 +143,8 @@ def _code(node: ast.AST) -> Iterator[ast.expr]:
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import)):
                 continue
+            if isinstance(child, ast.keyword) and child.arg == "strict":
+                continue  # zip(strict=True) is an assertion
             if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
                 continue  # a docstring
             if settings and isinstance(child, ast.Assign | ast.AnnAssign):
