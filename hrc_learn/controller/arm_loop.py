@@ -52,9 +52,9 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# Fraction of the task given up by the constraint layer that exceeds rounding.
+# Smallest fraction of the task given up by the constraint layer that is not rounding.
 _SLOWED = 1e-3
-# Twist below which the task counts as resting (metres and radians mixed) [1/s].
+# Twist below which the task counts as at rest (linear and angular together) [m/s, rad/s].
 _AT_REST = 1e-3
 
 
@@ -161,7 +161,7 @@ class ArmLoop:
     def act(
         self, state: ArmLoopState, reading: ArmReading, request: ArmRequest
     ) -> tuple[Float[Tensor, "*batch n"], ArmLoopState, ArmReport]:
-        """Second half of a step: make a request a joint velocity.
+        """Second half of a step: turn a request into a joint velocity.
 
         Arguments and results are those of `step`; the state is that of `observe`.
         """
@@ -180,7 +180,7 @@ class ArmLoop:
     def _eased_push(
         self, state: ArmLoopState, reading: ArmReading
     ) -> tuple[Tensor, tuple[Limitation, ...]]:
-        """Null-space velocity requested by the push now, and the limitations of it."""
+        """Null-space velocity for the present push, and its limitations."""
         requested = self._requested_null_velocity(reading)
         acts = (requested.norm(dim=-1) > 0) | state.pushed
         if not bool(acts.any()):
@@ -209,7 +209,7 @@ class ArmLoop:
         )
 
     def _requested_null_velocity(self, reading: ArmReading) -> Tensor:
-        """Joint velocity whose null-space part is requested, by people or the repulsion."""
+        """Joint velocity of which a push or the repulsion requests the null-space part."""
         config = self.config
         push = null_space_input(
             reading.nullspace_input, _distances(reading), config.way_making, config.damping
@@ -275,7 +275,8 @@ class ArmLoop:
         state = replace(_without_path(state), safety=safety, pace=pace)
         report = ArmReport(command.safety)
         if reading.explain:
-            # Without the part that the controller's own joint region asks for.
+            # Compare with the request of push and joint-space feedback together, as the law
+            # does.
             push = state.null_velocity - command.xi_q / self.config.damping
             wanted, bounds = null_projection(J, push), self.safety.velocity_bounds(q)
             kept = fraction_kept(wanted, command.null_velocity)
@@ -288,7 +289,7 @@ class ArmLoop:
     def _slowed_by_people(
         self, reading: ArmReading, sent: Tensor, report: SafetyReport
     ) -> Tensor:
-        """True where people near the arm hold it back, or their distance is not known."""
+        """True where people slow the arm down or stop it, or their distance is unknown."""
         slowed, people = reading.stop, reading.people
         if slowed is None:
             slowed = torch.zeros_like(reading.pause)
@@ -306,7 +307,7 @@ class ArmLoop:
     def _explained(
         self, reading: ArmReading, report: ArmReport, velocity: Tensor, sent: Tensor
     ) -> ArmReport:
-        """The report with the part of a push that the safety filter removes."""
+        """The report, with the null-space motion before and after the safety filter."""
         J, people, config = reading.jacobian, reading.people, self.safety.config
         slowed = torch.zeros_like(reading.pause)
         if people is not None:
@@ -327,6 +328,6 @@ def _distances(reading: ArmReading) -> Distances | None:
 
 
 def _scaled(velocity: Tensor, reading: ArmReading) -> Tensor:
-    """Joint values scaled by the speed that people leave."""
+    """Joint values times the speed scale that people near the arm impose."""
     people = reading.people
     return velocity if people is None else people.speed_scale.unsqueeze(-1) * velocity

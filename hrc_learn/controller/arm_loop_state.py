@@ -22,7 +22,8 @@ from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import Hindrance
 from hrc_learn.pytree import pytree, static
 
-# Distance by which joints must come nearer not to be stuck [rad]: 1 s of the slowest returns.
+# Joints are stuck unless they come nearer to their path by this distance [rad]: the slowest
+# returns take 1 s for it.
 _NEARER = 0.05
 
 
@@ -33,14 +34,15 @@ class ArmLoopConfig(YieldingConfig):
     dt: float = 0.01
     """Control step [s]."""
     command_delay: float = 0.01
-    """Time from a command until the arm follows it, with the lag of its servos [s]. By default
-    that of the simulated servos; networks and schedulers add to it on real arms."""
+    """Time from a command until the arm follows it, including servo lag [s]. The default is
+    that of the simulated servos; on real arms, networks and schedulers add to it."""
     limit_margin: float = 0.1
-    """Distance from the joint limits that a push leaves to the task, beyond the margin of the
-    safety filter [rad]: some centimetres of the end effector."""
+    """Range before the joint limits that is reserved for the task and closed to pushes, in
+    addition to the margin of the safety filter [rad]. It moves the end effector by some
+    centimetres."""
     speed: float = 1.0
-    """Speed of the task relative to its planned speed, above 0 to 1, as for a first run on a
-    real arm. Motions of the null space off a path are not slowed down."""
+    """Speed of the task relative to its planned speed, in (0, 1]; for example low for a first
+    run on a real arm. It does not slow down null-space motions off a path."""
     longest_wait: float = 300.0
     """Longest time for which people may block or displace the arm before the task fails [s]."""
     back_after: float = 2.0
@@ -48,7 +50,7 @@ class ArmLoopConfig(YieldingConfig):
     direct_return_after: float = 20.0
     """Time without progress after which the joints return to their path directly [s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Safety filter, with what the arm's driver can do."""
+    """Settings of the safety filter, including those that describe the arm's driver."""
     way_making: WayMakingConfig | None = None
     """Source of null-space motion: a person's push, the repulsion from people near the arm, or
     both; None: a person's push."""
@@ -61,12 +63,12 @@ class ArmLoopConfig(YieldingConfig):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class WatchedPeople:
-    """People near the arm, as far as they may have moved since they were observed."""
+    """People near the arm, with the distance that they may have moved since the observation."""
 
     distances: Distances
     """Distances of the most urgent pairs, reduced by the distance that people may have moved
-    since the observation. NaN, for which the arm brakes, while there is no observation and
-    where people may touch the arm and must not."""
+    since the observation. NaN, which brakes the arm, without an observation and where people
+    may touch the arm but must not."""
     nearest: Float[Tensor, "*batch"]
     """Smallest distance between people as observed and the arm as it is now [m]."""
     age: Float[Tensor, "*batch"]
@@ -93,7 +95,7 @@ class ArmReading:
     pause: Bool[Tensor, "*batch"]
     """True while a person pauses the task."""
     load: Float[Tensor, "*batch 3"] | None = None
-    """Far end of a load in the frame of the end effector, whose speed is capped as well [m];
+    """Far end of a load in the frame of the end effector [m]; its speed is capped as well.
     None: no load."""
     people: WatchedPeople | None = None
     """People near the arm, which slow it down and whose distances the safety filter keeps;
@@ -101,7 +103,7 @@ class ArmReading:
     stop: Bool[Tensor, "*batch"] | None = None
     """True where the arm must come to rest for the sake of people; None: nowhere."""
     explain: bool = static(False)
-    """Report what limits the push."""
+    """True to report what limits the push."""
 
 
 @pytree
@@ -110,29 +112,30 @@ class PathState:
     """Progress along a joint path, and how the last step tracked it."""
 
     progress: Float[Tensor, "*batch"]
-    """Number of the sample to track."""
+    """Sample of the path to track, interpolated between whole numbers."""
     rate: Float[Tensor, "*batch"]
     """Rate relative to the path's own speed, -1 to 1."""
     last: Float[Tensor, "*batch"]
-    """Number of the last sample."""
+    """Index of the last sample."""
     followed: Bool[Tensor, "*batch"]
     """True if the last step followed the path."""
     goal: Float[Tensor, "*batch n"]
     """Joint positions that were tracked [rad]."""
     pose: Pose
-    """Pose of the end effector at them."""
+    """Pose of the end effector at `goal`."""
     twist: Float[Tensor, "*batch 6"]
     """Velocity of that pose along the path (linear [m/s], angular [rad/s])."""
     blocked: Bool[Tensor, "*batch"]
     """True if the arm, off its path, would have hit something if the path had advanced."""
     narrow_ahead: Bool[Tensor, "*batch"]
-    """True if the path becomes narrow before it can stop: there the joints cannot leave it."""
+    """True if the path becomes narrow, so that the joints cannot leave it, before it can
+    stop."""
     waited: Float[Tensor, "*batch"]
     """Waiting time in which the joints came no nearer to the path [s]."""
     nearest: Float[Tensor, "*batch"]
     """Distance of the joints from the path when they last came nearer [rad]."""
     held: Float[Tensor, "*batch"]
-    """Time for which it has waited while the arm was pushed [s]."""
+    """Time for which the path has waited while the arm was pushed [s]."""
     direct_return: DirectReturn
 
     @classmethod
@@ -172,7 +175,7 @@ class PathState:
         Args:
             off: Distance of the joints from the path now [rad].
             counts: False for steps in which the arm is pushed or slowed down by people.
-            stuck_after: Waiting time from which on coming nearer does not count any more [s].
+            stuck_after: Waiting time after which coming nearer no longer counts [s].
             dt: Control step [s].
         """
         nearer = counts & (off < self.nearest - _NEARER) & (self.waited <= stuck_after)
@@ -189,7 +192,7 @@ class PathState:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class ArmLoopState:
-    """All that the loop remembers from one step to the next."""
+    """State of the loop between two steps."""
 
     safety: SafetyState
     pace: TaskPace
@@ -212,7 +215,7 @@ class ArmLoopState:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class FollowPath:
-    """Request to follow joint paths; the null space yields, and returns to them."""
+    """Request to follow joint paths; the null space yields to a push and returns afterwards."""
 
     paths: JointPaths
     path: Int[Tensor, "*batch"]
@@ -222,7 +225,7 @@ class FollowPath:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class TrackPose:
-    """Request to track a moving pose of the end effector; the null space yields."""
+    """Request to track a moving pose of the end effector; the null space yields to a push."""
 
     pose: Pose
     twist: Float[Tensor, "*batch 6"]
@@ -273,7 +276,7 @@ class ArmReport(NamedTuple):
 
 
 class WantedMotion(NamedTuple):
-    """Joint velocity before the safety filter, with the parts of the report known by then."""
+    """Joint velocity before the safety filter, with the parts of the report known so far."""
 
     joint_velocity: Tensor
     limitations: tuple[Limitation, ...] = ()

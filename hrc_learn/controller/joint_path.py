@@ -27,32 +27,34 @@ from hrc_learn.pytree import pytree
 CHANGE_OF_RATE = 0.2
 """Time in which a path comes to rest, or to its full speed [s]."""
 FAR_ASIDE = 1.8
-"""Largest distance of the joints from a path that still advances [rad]. From 1.4 rad, with the
-elbow about 0.2 m off, all joints returned to their path; from 2 rad some did not."""
+"""Largest distance of the joints from a path that still advances [rad]. In simulation, all
+joints returned to their path from 1.4 rad, with the elbow about 0.2 m off it; from 2 rad some
+did not."""
 WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
-"""Alignment (`return_alignment`) from which on a push counts in full, and below which the null
-space may lead to another posture than that of the path. An elbow that has gone a quarter of its
-circle has 0.7, after half of the circle it has none."""
+"""Alignments (`return_alignment`): above the first, pushes are followed in full; below the
+second, the null space may lead to a posture other than the path's. The alignment is 0.7 when
+the elbow has moved a quarter of its circle, and 0 after half of the circle."""
 NARROW = 0.07
-"""Smallest singular value of the Jacobian along a path below which the joints cannot leave it.
-Damping begins at 0.05."""
+"""Smallest singular value of the Jacobian below which the joints cannot leave a path. Damping
+begins at 0.05."""
 
 # Distance at which a path that has waited goes on [rad].
 _NEAR_AGAIN = 1.4
-# Distances from the path [rad]: joints nearer than the first find back whatever the alignment,
-# which counts in full from the second on.
+# Distances from the path [rad]: below the first, joints return whatever their alignment; above
+# the second, the alignment counts in full.
 _NEARBY = 0.3, 0.5
-# Tolerated distance of the end effector from its path [m], and the time by which servos lag
-# [s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
+# Tolerated distance of the end effector from its path [m], half the deviation that a push may
+# cause; and tolerated lag [s], twice the servo lag of an arm with a delay of 20 ms.
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
-# Length that converts a rotation of the end effector: the size of gripper and object [m/rad].
+# Length that converts rotations of the end effector to distances: the size of gripper and
+# object [m/rad].
 _METRES_PER_RADIAN = 0.1
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class JointPaths:
-    """Joint paths, sampled at the control step and padded by their last sample."""
+    """Joint paths, sampled at the control step and padded with their last sample."""
 
     position: Float[Tensor, "paths samples n"]
     """Joint positions [rad]."""
@@ -101,7 +103,7 @@ class JointPaths:
         Args:
             samples: `position` or `velocity`.
             path: Index of each path.
-            progress: Sample number, not negative. Beyond the last one the last one counts.
+            progress: Sample number, not negative; clamped to the last sample.
         """
         last = self.last[path]
         k = torch.minimum(progress.long(), last)
@@ -133,8 +135,9 @@ def may_not_return(
     Args:
         error: Path minus joint positions [rad].
         alignment: `return_alignment` of that error.
-        waited: True if the path has waited for the joints, which are pushed no more. It goes on
-            only once they are well on their way: otherwise it would lead them astray again.
+        waited: True if the path has waited for the joints and they are no longer pushed. The
+            path then goes on only once they are well on their way back; otherwise it would lead
+            them off again.
     """
     waited = torch.as_tensor(waited)
     farthest = torch.where(waited, _NEAR_AGAIN, FAR_ASIDE)
@@ -150,7 +153,8 @@ def push_fraction(
     """Fraction of a push that is followed, 0 to 1; it fades where joints might not return.
 
     Args:
-        push: Null-space velocity that is asked for [rad/s]. One towards the path counts fully.
+        push: Requested null-space velocity [rad/s]; a push towards the path is followed in
+            full.
         null_error: Null-space part of the path error [rad].
         alignment: `return_alignment` of the error.
     """
@@ -201,26 +205,27 @@ def deviation_ratio(
     """Distance of the end effector from its path, relative to the tolerated one.
 
     Args:
-        error: Motion to where it should be (linear [m], angular [rad]).
+        error: Motion of the end effector to its pose on the path (linear [m], angular [rad]).
         twist: Velocity of the path there (linear [m/s], angular [rad/s]).
     """
     return _length(error) / (_ON_PATH + _SERVO_LAG * _length(twist))
 
 
 def _length(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
-    """Length of a motion, its rotation converted to metres [m]."""
+    """Length of a motion, with its rotation converted to metres [m]."""
     return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)
 
 
-# Samples of a path that a direct return may lead to, and postures checked on the way.
+# Least number of samples of a long path that a direct return may lead to, and number of
+# postures checked on the way to each.
 _RETURN_GOALS, _CHECKED = 20, 51
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class DirectReturn:
-    """A straight joint motion back to a path that null-space motion cannot reach. The joints
-    pass between two postures of one pose, so the end effector leaves its path.
+    """A straight joint motion back to a path that null-space motion cannot reach. The end
+    effector leaves its path meanwhile.
     """
 
     start: Float[Tensor, "*batch n"]
@@ -236,7 +241,7 @@ class DirectReturn:
     active: Bool[Tensor, "*batch"]
     """True while the joints return directly."""
     blocked: Bool[Tensor, "*batch"]
-    """True where the arm would hit something on the way to each sample."""
+    """True where the arm would hit something on the way to every sample."""
 
     @classmethod
     def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:
@@ -256,15 +261,16 @@ class DirectReturn:
         config: YieldingConfig,
         clearance: Clearance | None,
     ) -> DirectReturn:
-        """Plan a return to the sample where a path waits, or the nearest that is clear.
+        """Plan a return to the waiting sample, or else to the nearest one without contact.
 
         Args:
             paths: Table of paths.
             path: Index of the path.
             progress: Sample at which it waits.
             joint_position: Joint positions now [rad].
-            config: Highest speed, and the clearance that need not be exceeded.
-            clearance: Distance of the arm from obstacles; None: every way is clear.
+            config: Highest speed, and the clearance to keep; a return may start and end with
+                less.
+            clearance: Distance of the arm from obstacles; None: there are no obstacles.
         """
         goals, order = _return_goals(paths, path, progress, joint_position)
         start = joint_position.unsqueeze(0).expand_as(goals)
@@ -276,7 +282,7 @@ class DirectReturn:
             distance = clearance(torch.lerp(start, goals, fraction))
             ends = distance[[0, -1]].amin(0)
             clear = (distance >= ends.clamp(max=config.clearance)).all(0)
-        # The first candidate that is clear.
+        # The first candidate with a return that is clear.
         chosen = clear.to(torch.int64).argmax(0, keepdim=True)
         goal = goals.gather(0, chosen.unsqueeze(-1).expand_as(goals[:1])).squeeze(0)
         # A minimum-jerk motion peaks at 1.875 times its mean speed.
@@ -303,11 +309,11 @@ def _return_goals(
     progress: Float[Tensor, "*batch"],
     joint_position: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "goals *batch n"], Float[Tensor, "goals *batch"]]:
-    """Candidate goals of a direct return and their samples: the waiting one, then others."""
+    """Goals of a direct return and their samples: the waiting one, then others by distance."""
     last = paths.last[path]
     stride = ((last + 1) // _RETURN_GOALS).clamp(min=1)
     k = torch.arange(2 * _RETURN_GOALS).reshape(-1, *(1 for _ in last.shape)) * stride
-    # Short lists are padded by the first sample.
+    # Short lists are padded with the first sample.
     k = torch.where(k <= last, k, 0)
     others = paths.position[path.expand_as(k), k]
     far = (others - joint_position).norm(dim=-1)

@@ -8,16 +8,17 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-# Fraction of the limits that a correction counts on; the motion followed needs the rest.
+# Fraction of the limits that corrections of errors use; the requested motion needs the rest.
 _USABLE = 0.8
-# Fastest decay of errors, as fractions of the sampling rate: of those tried, the fastest with
-# which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a second.
+# Decay rates of position and velocity errors, as fractions of the sampling rate: the fastest
+# ones tried with which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a
+# second.
 _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
-# Differences of rounded numbers, float32 too, may exceed a limit in the last digits.
+# Factor on limits for differences of rounded numbers, also in float32.
 _ROUNDING = 1 + 1e-6
-# Fraction of a limit of velocity left unused, as sums of rounded numbers must not exceed it.
+# Fraction of a velocity limit left unused, so that rounded sums do not exceed it.
 _UNUSED = 1e-12
-# Larger numbers are taken for invalid: squares of much larger ones overflow.
+# Larger numbers count as invalid: squares of much larger ones overflow.
 _LARGEST_VALID = 1e50
 
 
@@ -34,9 +35,9 @@ class MotionState:
     reference: Float[np.ndarray, "*batch D"]
     """Last position requested."""
     reference_velocity: Float[np.ndarray, "*batch D"]
-    """Velocity of the motion, zero after a jump [1/s]."""
+    """Velocity of the requested motion without its jumps [1/s]."""
     reference_acceleration: Float[np.ndarray, "*batch D"]
-    """Acceleration of the motion, zero after a jump [1/s^2]."""
+    """Difference quotient of `reference_velocity` at the last step [1/s^2]."""
 
     @classmethod
     def moving(
@@ -66,17 +67,17 @@ class MotionState:
 
 @final
 class MotionFilter:
-    """Follows positions within limits of position, velocity, acceleration and jerk.
+    """Filter that follows positions within limits of position, velocity, acceleration and jerk.
 
-    Positions that keep the limits and continue the last ones are returned unchanged. Otherwise
-    the motion departs from them and returns: with e the distance to the requested position, e'
-    its rate and a_r the requested acceleration,
+    Positions that keep the limits and continue the previous ones are returned unchanged.
+    Otherwise the motion departs from them and returns later. With the position error e, its
+    rate e' and the requested acceleration a_r,
 
         a = a_r - h'(e; A, lambda) e' - h(e' + h(e; A, lambda); j, mu)
         h(x; b, k) = sign(x) (sqrt((b/k)^2 + 2 b |x|) - b/k)
 
-    so that e' follows -h(e), along which e brakes with A while it is large and decays at the
-    rate lambda once it is small. A step counts as error, not as motion.
+    so that e' follows -h(e): a large e shrinks with the deceleration A, a small e decays at the
+    rate lambda. A step in the requested positions counts as an error, not as a motion.
 
     The limits hold for *any* input, because they apply to differences of the returned
     positions: v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt.
@@ -85,9 +86,9 @@ class MotionFilter:
 
         v + (a + A)^2/(2 j) <= min(h(d; A, 1/dt), v_max + A^2/(2 j))
 
-    remains true, a set that braking with A, ramped up with j, never leaves. The start must lie
-    in it: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from the limits of position. A is lowered
-    where that would be more than a tenth of their range.
+    remains true. Braking with A, ramped up with j, never leaves this set. The start must lie in
+    it: at rest, it must be at least A^3/(8 j^2) + A^2 dt/(2 j) away from the position limits. A
+    is lowered where this distance would exceed a tenth of their range.
     """
 
     def __init__(
@@ -117,8 +118,8 @@ class MotionFilter:
             raise ValueError(f"dt must be positive and finite, but is {dt}")
         self.dt, self.velocity, self.jerk = dt, velocity, jerk
         j, margin = jerk, 0.05 * (upper - lower)
-        # The larger of both terms of the way that braking needs at rest stays below the margin,
-        # so that together they take at most a tenth of the range.
+        # Each of the two terms of the distance needed at rest stays below the margin, so
+        # together they take at most a tenth of the range.
         ramped = np.minimum(np.cbrt(8 * j**2 * margin), np.sqrt(2 * j * margin / dt))
         self.acceleration = A = np.minimum(acceleration, ramped)
         self._walls = np.stack([-lower, upper])
@@ -130,12 +131,12 @@ class MotionFilter:
         self._rate_of_velocity = _VELOCITY_RATE / dt
 
     def step(self, state: MotionState, asked: Float[np.ndarray, "*batch D"]) -> MotionState:
-        """Go towards a position, dt after the state.
+        """Move towards a position for one step dt.
 
         Args:
-            state: After the position before.
-            asked: Requested values. NaN and absurdly large ones are replaced by the previous
-                value.
+            state: State after the previous step.
+            asked: Requested position. NaN and absurdly large values are replaced by the
+                previous request.
         """
         dt = self.dt
         asked = np.where(np.abs(asked) < _LARGEST_VALID, asked, state.reference)
@@ -159,8 +160,9 @@ class MotionFilter:
         self, state: MotionState, asked: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Velocity and acceleration of the requested motion, without its jumps. Where the
-        request breaks a limit, the velocity approaches its slope within the acceleration limit,
-        which ignores single steps but follows a new slope; the acceleration is then zero.
+        request breaks a limit, the velocity approaches the slope of the request within the
+        acceleration limit, which nearly ignores single jumps but follows a new slope; the
+        returned acceleration is then zero.
         """
         dt, A = self.dt, self.acceleration
         change = ((asked - state.reference) / dt - state.reference_velocity) / dt
@@ -170,7 +172,7 @@ class MotionFilter:
         return state.reference_velocity + limited * dt, np.where(motion, limited, 0.0)
 
     def _allowed(self, wanted: np.ndarray, state: MotionState) -> np.ndarray:
-        """The nearest acceleration with which the limits are kept, now and later [1/s^2]."""
+        """Nearest acceleration that keeps the limits now and later [1/s^2]."""
         A, j, dt = self.acceleration, self.jerk, self.dt
         margin = self._walls + self._sides * state.position[..., None, :]
         # Past a limit the motion returns as fast as from the same distance inside it.
@@ -182,7 +184,8 @@ class MotionFilter:
         # Negative far outside the set, where no acceleration is enough: brake hard.
         most = np.sqrt(np.maximum(offset**2 + 2 * j * slack, 0.0)) - offset
         a = np.minimum(np.maximum(wanted, -most[..., 0, :]), most[..., 1, :])
-        # Last what the motors cannot exceed: outside the set the rest may ask for more.
+        # Clamp to jerk and acceleration last: outside the set, the bounds above may exceed
+        # them.
         least = np.maximum(state.acceleration - j * dt, -A)
         greatest = np.minimum(state.acceleration + j * dt, A)
         return np.minimum(np.maximum(a, least), greatest)
@@ -193,7 +196,8 @@ def _braking_rate(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The function h and its slope: the fastest rate at which x can still come to rest at zero.
 
-    Square root far from zero (constant deceleration), a line of slope `rate` close to it.
+    Far from zero, h is a square root (constant deceleration); near zero, a line of slope
+    `rate`.
     """
     knee = strength / rate
     root = np.sqrt(knee**2 + 2 * strength * np.abs(x))

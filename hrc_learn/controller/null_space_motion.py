@@ -21,37 +21,39 @@ from hrc_learn.geometry.numerics import check_settings, null_projection
 from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain
 
 LOOK_AHEAD = 0.15
-"""Horizon over which a null-space motion is checked [s]; an elbow at 1 m/s stops in 0.1 s."""
+"""Time ahead over which a null-space motion is checked [s]: about its stopping time."""
 
-# Largest acceleration of the end effector that the joints may have to compensate [m/s^2], where
-# 1 rad counts as 0.1 m. Servos that lag 10 ms more than assumed, corrected with 4 1/s, leave
-# an error of 0.5 mm.
+# Largest acceleration of the end effector that a null-space motion may cause [m/s^2]; 1 rad
+# counts as 0.1 m. If servos lag 10 ms more than assumed, it moves the end effector by 0.5 mm at
+# a pose gain of 4 1/s.
 _BENDING, _METRES_PER_RADIAN = 0.2, 0.1
 _DIFFERENCE_STEP = 1e-4  # [s]
-# Highest speed of the elbow under guidance [m/s]: the reduced speed of ISO 10218-1:2025.
-# Fraction of a cap on speed that a guided elbow may use: the speed barrier follows it without
-# lag, as its bound allows for braking and delay (0.15 m/s of 0.25 m/s on a Panda).
+# Highest speed of a guided elbow [m/s]: the reduced speed of ISO 10218-1:2025. Fraction of a
+# speed cap that a guided elbow may use. The bound of the speed barrier includes braking and
+# delay, so nearer to the cap it would slow the elbow down (on a Panda with a cap of 0.25 m/s,
+# above 0.15 m/s).
 _GUIDED_SPEED, _GUIDED_FRACTION = 0.25, 0.6
-# Highest speed of a joint under guidance [rad/s]: it stops within 0.2 rad by the acceleration
-# reserved for pushes.
+# Highest speed of a guided joint [rad/s]. With `_STOP_EFFORT`, every joint of a Panda stops
+# within 0.11 rad.
 _GUIDED_JOINT_SPEED = 1.0
-# Fractions of a motion, or of the time ahead, at which it is checked.
+# Fractions of a motion at which it is checked.
 _FRACTIONS = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
 # Smallest singular values between which a motion towards a singularity fades out: below the
 # lower one the task itself is damped.
 _SINGULAR, _REGULAR = SINGULAR_BELOW, 1.6 * SINGULAR_BELOW
-# Fractions of the joint acceleration that a push and its end may use. The task needs the rest,
-# and is slowed down as well where both together exceed the limits.
+# Fractions of the acceleration limits with which null-space motions may speed up and slow down.
+# The task needs the rest; if both together exceed the limits, the task slows down as well.
 _PUSH_EFFORT, _STOP_EFFORT = 0.3, 0.6
-# Lowest speed for which singularities are looked for ahead of the arm [rad/s].
+# Lower bound on the null-space speed with which the arm looks ahead for singularities [rad/s].
 _SLOW = 0.2
-# Null-space part of a correction below which the correction is not in the null space [rad/s].
+# A correction has no null-space part if that part is smaller than this [rad/s]. A joint does
+# not move if its ratio to the fastest joint is smaller.
 _NEGLIGIBLE = 1e-6
-# Closing speed that remains allowed at the clearance margin [m/s], and depth within the margin
-# at which it reaches zero [m]. An arm that slides along a surface would otherwise stop and
-# start with every reading, and its task with it.
+# Closing speed allowed at the clearance margin [m/s], and depth inside the margin at which it
+# has fallen to zero [m]. Without it, an arm that slides along a surface, and its task, would
+# stop and start with every reading.
 _SLIDING_SPEED, _DEEPEST = 0.002, 0.005
-# Fraction of a push in the null space below which it asks for a motion of the end effector.
+# Null-space fraction of a push below which the push counts as one of the end effector.
 _ACROSS = 0.1
 
 type Clearance = Callable[[Float[Tensor, "*batch n"]], Float[Tensor, "*batch"]]
@@ -60,31 +62,33 @@ type Clearance = Callable[[Float[Tensor, "*batch n"]], Float[Tensor, "*batch"]]
 
 @dataclass(frozen=True, kw_only=True)
 class YieldingConfig:
-    """Response of the null space to a push, and return of the joints afterwards."""
+    """Null-space response to a push, and the return of the joints afterwards."""
 
     damping: float = 3.0
     """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
     nullspace_rise: float = 0.15
-    """Time constant with which the null-space input is smoothed [s]."""
+    """Time constant of the null-space velocity when a push begins or grows, and on the return
+    [s]."""
     pose_gain: float = 4.0
     """Decay rate of the pose error on prescribed motions [1/s]."""
     after_push: Literal["return", "stay"] = "return"
-    """Behaviour after a push: the joints return to their planned path, and a servoed arm to its
-    posture, or they stay off it."""
+    """Behaviour after a push: the joints return to their planned path (a servoed arm to its
+    posture), or they stay off it until the path waits for them."""
     elbow_speed: float = _GUIDED_SPEED
-    """Highest speed of the elbow while its null space moves [m/s]: `guided_elbow_speed`."""
+    """Highest speed of the elbow in null-space motions [m/s], at most `guided_elbow_speed` of
+    the cap on the arm's speed."""
     return_speed: float = 0.4
     """Highest speed of the return, norm over all joints [rad/s]."""
     clearance: float = 0.03
-    """Distance from obstacles that a push cannot reduce further [m]: three times the
-    calibration errors of base and table."""
+    """Distance that pushes keep from obstacles [m], up to 5 mm less while the arm slides along
+    them: three times the calibration errors of base and table."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["damping", "nullspace_rise", "return_speed"])
 
 
 def guided_elbow_speed(cap: float) -> float:
-    """Highest speed of a guided elbow that an arm with a cap on its speed follows [m/s].
+    """Highest speed of a guided elbow that the arm follows without lag under a speed cap [m/s].
 
     An arm that lags behind a curved null-space motion moves its end effector.
 
@@ -128,7 +132,8 @@ def null_space_slowdown(
     Returns:
         Factor of at most 1.
     """
-    # At the joints now, and where the arm will be once it could have slowed down.
+    # Check the present joints and those after the look-ahead, by which time the arm can slow
+    # down.
     times = null_velocity.new_tensor([0.0, LOOK_AHEAD])
     times = torch.stack([times, times + _DIFFERENCE_STEP])
     steps = times.reshape(2, 2, *(1 for _ in null_velocity.shape)) * null_velocity
@@ -197,7 +202,7 @@ def eased_null_velocity(
     dt: float,
     config: YieldingConfig,
 ) -> EasedVelocity:
-    """Null-space velocity of the next step towards a requested one.
+    """Null-space velocity of the next step, which approaches a requested one.
 
     Arms follow late and with limited acceleration, so a velocity that jumps or is too fast
     would move the end effector.
@@ -208,7 +213,8 @@ def eased_null_velocity(
         jacobian: Jacobian of the end effector there.
         previous: Null-space velocity of the last step [rad/s].
         requested: Joint velocity whose null-space part is requested [rad/s].
-        bounds: Lowest and highest joint velocities that leave the task its margin [rad/s].
+        bounds: Lowest and highest joint velocities that keep the limit margin reserved for the
+            task [rad/s].
         dt: Control step [s].
         config: Response to pushes.
     """
@@ -216,7 +222,7 @@ def eased_null_velocity(
     projected = null_projection(jacobian, requested)
     slowdown = null_space_slowdown(chain, joint_position, projected, config.elbow_speed)
     unbounded = projected * slowdown.unsqueeze(-1)
-    # Singularities are looked for as far ahead as the arm gets while it slows down.
+    # Look for singularities as far ahead as the arm may move while it slows down.
     last, size = previous.norm(dim=-1, keepdim=True), unbounded.norm(dim=-1, keepdim=True)
     speed = last.clamp(min=_SLOW) / size.clamp(min=1e-9)
     fade = singularity_fade(chain, joint_position, speed * unbounded)
@@ -241,8 +247,8 @@ def null_space_giving_way(
     """The null-space velocity nearest to a given one that keeps task plus null space in bounds.
 
     At a limit to which a person has pushed the arm, the null space thus gives way to the task.
-    The correction runs along one direction of the null space, which for seven joints is all of
-    it. Where none fits, the bounds are exceeded by as little as possible.
+    The correction has a single direction, which for seven joints spans the whole null space. If
+    no correction is sufficient, the bounds are exceeded as little as possible.
 
     Args:
         jacobian: Jacobian of the end effector.
@@ -273,7 +279,8 @@ class ClearMotion(NamedTuple):
     null: Float[Tensor, "*batch n"]
     """Null-space velocity [rad/s]."""
     blocked: Bool[Tensor, "*batch"]
-    """True where the task alone takes the arm below the margin: the task has to wait."""
+    """True where the task alone would bring the arm inside the margin, or nearer if it is
+    inside: the task has to wait."""
     distance: Float[Tensor, "*batch"]
     """Clearance of the arm now [m]."""
 
@@ -293,8 +300,8 @@ def kept_clear(
         null: Null-space velocity [rad/s].
         clearance: Distance from obstacles. Called once, with a leading axis of the postures
             that are compared.
-        margin: Clearance to keep [m]. Where the task alone leaves less, the null space does
-            not reduce it further.
+        margin: Clearance to keep [m]. Where the task alone leaves less, the null space reduces
+            it by at most 2 mm/s, and not at all from 5 mm inside the margin on.
     """
     ahead = joint_position + LOOK_AHEAD * (task + _fractions_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
@@ -305,7 +312,7 @@ def kept_clear(
     spare = without - margin
     sliding = LOOK_AHEAD * _SLIDING_SPEED * (1.0 + spare / _DEEPEST).clamp(0.0, 1.0)
     allowed = spare.clamp(min=0.0) + sliding
-    # Closing grows with the fraction of the motion: scale it down in proportion.
+    # The distance falls with the fraction of the motion: scale the motion down in proportion.
     fractions = _FRACTIONS[1:].to(closing).reshape(-1, *(1 for _ in now.shape))
     factor = torch.where(closing > allowed, fractions * allowed / closing, 1.0).amin(0)
     return ClearMotion(factor.unsqueeze(-1) * null, blocked, now)
@@ -314,11 +321,11 @@ def kept_clear(
 def fraction_kept(
     before: Float[Tensor, "*batch n"], after: Float[Tensor, "*batch n"], rest: float = 1e-6
 ) -> Float[Tensor, "*batch"]:
-    """Fraction of a velocity that is left along its direction, 0 to 1; 1 at rest.
+    """Fraction of a velocity that remains along its direction, 0 to 1; 1 at rest.
 
     Args:
         before: Velocity of the joints [rad/s], or a twist.
-        after: What is left of it.
+        after: Velocity, or twist, that remains.
         rest: Length below which a velocity counts as rest.
     """
     square = torch.linalg.vecdot(before, before)
@@ -329,16 +336,16 @@ def fraction_kept(
 def fraction_in_null_space(
     requested: Float[Tensor, "*batch n"], projected: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch"]:
-    """Fraction of a push in the null space if it is below a tenth; 1 otherwise.
+    """Null-space fraction of a push if it is below a tenth; otherwise 1.
 
     Args:
-        requested: Joint velocity that is asked for [rad/s].
+        requested: Joint velocity requested by the push [rad/s].
         projected: Its null-space part [rad/s].
     """
     square = torch.linalg.vecdot(requested, requested)
     # For an orthogonal projection N, |N w|^2 = w^T N w.
     inside = torch.linalg.vecdot(requested, projected).clamp(min=0)
-    fraction = (inside / square).sqrt()  # not a number, and not below a tenth, at rest
+    fraction = (inside / square).sqrt()  # NaN at rest, which counts as 1
     return torch.where(fraction < _ACROSS, fraction, 1.0)
 
 
@@ -347,7 +354,7 @@ def limiting_joint(
     lower: Float[Tensor, "*batch n"],
     upper: Float[Tensor, "*batch n"],
 ) -> Int[Tensor, "*batch"]:
-    """Joint, from 0, whose bounds allow the smallest fraction of a velocity.
+    """Index, from 0, of the joint with bounds that reduce a velocity most.
 
     Args:
         velocity: Joint velocity [rad/s].

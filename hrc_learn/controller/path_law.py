@@ -1,6 +1,6 @@
-"""Joint velocities for poses and joint paths, from which a push may move the null space.
+"""Joint velocities that track poses and joint paths while a push may move the null space.
 
-A path goes on, waits or goes back as the arm, pushed aside, can follow.
+A path advances, waits or is retraced, depending on how well an arm pushed aside can follow it.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# Distance from the path at which joints that were pushed count as aside when a path begins, and
-# at which they count as back [rad]. Servos lag by 0.03 rad at the speed of transfers.
+# Distance from the path beyond which joints count as aside when a path begins, and within which
+# pushed joints count as back [rad]. Servos lag by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
 
 
@@ -53,9 +53,9 @@ class TrackedPose(NamedTuple):
     """Fraction of the null-space velocity that obstacles leave."""
     distance: Tensor
     within: Tensor
-    """Fraction of it that the joint limits leave."""
+    """Fraction of the remaining null-space velocity that joint limits leave."""
     joint: Tensor
-    """Joint that limits it most."""
+    """Index of the joint that limits the velocity most."""
 
     def limitations(self) -> tuple[Limitation, ...]:
         """Limitations of the null space, for the report."""
@@ -76,11 +76,11 @@ class PathTarget(NamedTuple):
     narrow: Tensor
     """True where the joints cannot leave the path."""
     narrow_ahead: Tensor
-    """True where they could not before the path stops."""
+    """True where the path becomes narrow before it can stop."""
 
 
 class OffPath(NamedTuple):
-    """Joints off their path, and the null-space velocity that they have there."""
+    """State of joints off their path, and the parts of their null-space velocity."""
 
     aside: Tensor
     lost: Tensor
@@ -95,12 +95,13 @@ class OffPath(NamedTuple):
 class PathLaw:
     """Joint velocities for poses of the end effector and along joint paths.
 
-    The null space yields to a push. Where it does,
+    Where the null space yields to a push,
 
         u = J^+ (twist + gain error) + N w,
 
-    with w reduced until the arm is slow enough to keep the pose, clear of obstacles, and leaves
-    the task its margin before the joint limits. Joints off their path track its poses so.
+    with w reduced until the arm can keep the pose, stays clear of obstacles, and leaves the
+    task a margin before the joint limits. In this way, joints off their path track the poses of
+    the path.
     """
 
     def __init__(self, chain: SerialChain, config: ArmLoopConfig, clearance: Clearance | None):
@@ -135,9 +136,9 @@ class PathLaw:
             pose: Pose that the end effector should have.
             twist: Velocity of that pose.
             null_velocity: Joint velocity whose null-space part is wanted [rad/s].
-            which: Elements of the batch that track it; the others are left out.
-            slows: Limit the null-space velocity by `null_space_slowdown`: a push and a path
-                together may bend the null space more than the push alone, which is eased.
+            which: Elements of the batch that track the pose; the others get a velocity of zero.
+            slows: True to limit the null-space velocity by `null_space_slowdown`: a push alone
+                is limited already, but not the sum of a push and a path.
         """
         q, config = reading.joint_position, self.config
         zero = q.new_zeros(q.shape[:-1])
@@ -145,7 +146,8 @@ class PathLaw:
 
         def track(part: tuple[Any, ...]) -> TrackedPose:
             q, velocity, here, pose, twist, null_velocity = part
-            # The null space is that of the joints by the time the arm follows.
+            # Jacobian at the joint positions predicted for the time when the arm follows the
+            # command.
             J = self.chain.jacobian(q + config.command_delay * velocity)
             correction = config.pose_gain * here.twist_to(pose)
             task, null = resolved_rate(J, twist + correction, null_velocity)
@@ -234,7 +236,7 @@ class PathLaw:
         waited, nearest = path.waiting(off, counts, self.config.back_after, dt)
         waited = torch.where(state.aside, waited, 0.0)
         held = torch.where((path.rate <= 0) & pushed, path.held + dt, 0.0)
-        # Joints that found no way back here do so where they left the path.
+        # Joints that find no way back here may find one where they left the path.
         backs = (waited > self.config.back_after) & (path.progress > 0)
 
         def astray(part: tuple[Any, ...]) -> tuple[Tensor, Tensor]:
@@ -302,7 +304,7 @@ class PathLaw:
         """Joint positions and velocities of the paths now."""
         paths, which, config = request.paths, request.path, self.config
         rate = path.rate * speed_override
-        # The velocity is that of the time at which the arm follows.
+        # Velocity of the path at the time when the arm follows the command.
         later = (path.progress + rate * config.command_delay / config.dt).clamp(min=0)
         velocity = rate.unsqueeze(-1) * paths.interpolated(paths.velocity, which, later)
         sample = torch.minimum(path.progress.long(), paths.last[which])
@@ -331,7 +333,7 @@ class PathLaw:
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        # Joints that lag without a push touch something: they go on along the path.
+        # Joints that lag without a push touch something: they keep following the path.
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
@@ -380,7 +382,7 @@ class PathLaw:
     def _returning(
         self, path: PathState, joint_position: Tensor, request: FollowPath
     ) -> PathState:
-        """The path with direct returns begun where it has waited too long, and ended."""
+        """The path, with direct returns begun after too long a wait and ended on arrival."""
         direct, dt = path.direct_return, self.config.dt
         arrived = direct.active & (direct.time > direct.duration + dt)
         if bool(arrived.any()):
