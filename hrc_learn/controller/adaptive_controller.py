@@ -48,9 +48,9 @@ class ControllerConfig:
     angular_speed: float = 1.0
     """Cap on the angular part of the twist [rad/s]."""
     vision_rate: float = 4.0
-    """Fastest decay of the pixel error [1/s], as predicted by the estimate. The gain of the law
-    grows with the square of the image Jacobian: without a cap it can exceed the gain that is
-    stable with images at 15 to 30 Hz and a delay of one frame or more."""
+    """Fastest decay of the pixel error [1/s], as predicted by the estimated image Jacobian. The
+    gain of the law grows with the square of the image Jacobian: without a cap it can exceed the
+    gain that is stable with images at 15 to 30 Hz and a delay of one frame or more."""
     approach_linear_speed: float = 0.5
     """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
     approach_angular_speed: float = 2.0
@@ -61,13 +61,13 @@ class ControllerConfig:
     null_damping: float = 3.0
     """c_d: null-space velocity is null-space input divided by c_d."""
     yields_to_limits: bool = True
-    """Near the limits of single joints, free joints take over motion of the task that limits
-    deny to others (saturation in the null space), the whole task slows down where a limit would
-    make the tool faster than requested, and the whole null-space motion is scaled. False: the
-    safety filter alone keeps the limits."""
+    """True: near joint limits, free joints take over the motion that limited joints cannot make
+    (saturation in the null space); the task slows down where a limit would make the tool faster
+    than requested; the null-space motion is scaled as a whole. False: only the safety filter
+    keeps the limits."""
     drift_compensation_rate: float = 2.0
-    """Decay rate of the tool's pose drift while a person moves the null space [1/s]; 0:
-    none."""
+    """Decay rate of the tool's pose drift under a null-space input [1/s]; 0: no
+    compensation."""
     blending: BlendingConfig = field(default_factory=BlendingConfig)
     """Blending of vision feedback."""
     way_making: WayMakingConfig | None = None
@@ -87,7 +87,7 @@ class ControllerConfig:
 
     @classmethod
     def paper(cls) -> ControllerConfig:
-        """The law as printed: no extension between it and the safety filter."""
+        """Settings of the law as printed, without the extensions; the safety filter stays."""
         return cls(
             linear_speed=math.inf,
             angular_speed=math.inf,
@@ -106,9 +106,9 @@ class ControllerState:
     blending: BlendingState
     """State of the vision blending."""
     task_level: Float[Tensor, "*batch"]
-    """Level of task-space feedback after a joint-space approach, 0 to 1."""
+    """Fraction of task-space feedback in the command after a joint-space approach, 0 to 1."""
     pose_drift: PoseDrift
-    """Drift of the tool while a person moves the null space."""
+    """Drift of the tool under a null-space input."""
     safety: SafetyState
     """State of the safety filter, with its counts of interventions."""
     estimator: Any
@@ -116,7 +116,7 @@ class ControllerState:
 
 
 class _Given(NamedTuple):
-    """Values that a step computes with, valid or replaced."""
+    """Inputs of a step; `dt` and `q` are replaced where they are invalid."""
 
     observation: Observation
     goals: Goals
@@ -153,10 +153,10 @@ class AdaptiveController(nn.Module):
     near singularities, vision feedback fades in and out, null-space motion yields to the task
     near limits, and a safety filter has the last word.
 
-    Goals for less than the whole tool pose (`Goals.task`) leave more null space: with the rows
-    J_t = B J of the Jacobian, u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q), along which the
-    potential falls as with six rows. An arm whose task is the nearest pose (`Arm.task`) is led
-    so by goals for the whole pose.
+    Goals for a part of the tool pose (`Goals.task`) leave more null space. With a basis B of
+    that part and J_t = B J, u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q), and the potential
+    still falls. An arm with the task "nearest pose" (`Arm.task`) also follows this law for
+    goals of the whole pose.
 
     A step is a pure function `(state, observation) -> (command, state)`; the module stores no
     state. Run real-time loops under `torch.inference_mode()`.
@@ -236,7 +236,7 @@ class AdaptiveController(nn.Module):
         joint_velocity: ArrayLike | None = None,
         joint_acceleration: ArrayLike | None = None,
     ) -> ControllerState:
-        """State at the start, of an arm at rest or in motion.
+        """Initial state of an arm at rest or in motion.
 
         Args:
             joint_position: Measured joint positions (*batch, n) [rad].
@@ -272,9 +272,9 @@ class AdaptiveController(nn.Module):
     ) -> tuple[Command, ControllerState]:
         """One step of the law.
 
-        Invalid values (NaN, infinity, a tensor `dt` beyond `SafetyConfig.longest_step`) brake
-        the arm, flagged `invalid`; an invalid feature counts as not visible. They are neither
-        learned from nor stored: the next step is healthy.
+        Invalid values (NaN, infinity, a tensor `dt` outside (0, `SafetyConfig.longest_step`])
+        brake the arm and set the flag `invalid`; an invalid feature counts as not visible.
+        Invalid values are neither learned from nor stored, so they do not affect later steps.
 
         Args:
             state: State after the last step.
@@ -284,9 +284,9 @@ class AdaptiveController(nn.Module):
             The command and the next state.
 
         Raises:
-            ValueError: The joint positions do not fit the arm; a number dt is not in
-                (0, longest_step] of the safety settings; or the observation's goals control
-                more than the arm has joints for.
+            ValueError: The joint positions do not fit the arm; a number dt is outside the range
+                (0, `longest_step`] of the safety settings; or the goals of the observation need
+                more joints than the arm has.
         """
         state = self._restored(state)
         self.safety.joint_vector(observation.joint_position, "joint_position")
@@ -330,7 +330,8 @@ class AdaptiveController(nn.Module):
             safety=report,
         )
         if goals.posture is not None:
-            # The approach, which vision does not guide, shows how the marker moves, too.
+            # A joint-space approach does not use vision, but the estimator learns from its
+            # images.
             seen = visible & (self.blending.inside(observation.feature) >= 0)
             if observation.feature_age is not None:
                 seen = seen & ~self.blending.late(observation.feature_age)
@@ -360,7 +361,7 @@ class AdaptiveController(nn.Module):
             stop = observation.stop if stop is None else stop | observation.stop
         distances = observation.distances
         if self.config.safety.constraints is None and self.config.way_making is not None:
-            distances = None  # used for way-making alone, not kept
+            distances = None  # used for way-making only
         load = observation.load
         return self.safety.step(
             state,
@@ -376,7 +377,7 @@ class AdaptiveController(nn.Module):
         )
 
     def _restored(self, state: ControllerState) -> ControllerState:
-        """The state with invalid values replaced by those of the start."""
+        """The state, with invalid values replaced by defaults."""
         if has_numbers(state):
             return replace(state, safety=self.safety.restored(state.safety))
         return ControllerState(
@@ -390,7 +391,7 @@ class AdaptiveController(nn.Module):
     def _motion(
         self, state: ControllerState, given: _Given, task_level: Tensor, s: Tensor
     ) -> _Motion:
-        """Joint velocity of the law, with drift compensation while a person acts."""
+        """Joint velocity of the law, with drift compensation under a null-space input."""
         observation, goals, _, q, pose, J = given
         descent = s
         rate, damping = self.config.drift_compensation_rate, self.config.null_damping
@@ -417,7 +418,7 @@ class AdaptiveController(nn.Module):
 
         delay = self.config.command_delay
         if delay > 0:
-            # Null space at the predicted joints.
+            # Jacobian at the predicted joint positions.
             pose, J = self.chain.forward_and_jacobian(q + delay * state.safety.velocity)
             basis = self._basis(goals, pose, J)
         task, null = self._resolved(given, J, basis, twist, null, task_level)
@@ -439,7 +440,7 @@ class AdaptiveController(nn.Module):
         if basis is not None:
             J_task, rows = basis @ J, (basis @ twist.unsqueeze(-1)).squeeze(-1)
         task, null = law.resolved_rate(J_task, rows, null)
-        # Constraints resolve the conflict of task and null space themselves.
+        # Constraints resolve conflicts between task and null space themselves.
         yields = config.yields_to_limits and config.safety.constraints is None
         if yields:
             task = law.saturate_in_null_space(task, J_task, rows, *bounds)
@@ -476,7 +477,7 @@ class AdaptiveController(nn.Module):
         return replace(motion.pose_drift, planned=planned)
 
     def _basis(self, goals: Goals, pose: Pose, J: Tensor) -> Tensor | None:
-        """Basis of the controlled tool motion; None: all of it."""
+        """Basis of the controlled tool motion; None: the whole tool motion is controlled."""
         task = goals.task
         if task == "pose" and not self._nearest:
             return None

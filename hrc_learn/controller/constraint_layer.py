@@ -1,8 +1,9 @@
 """Joint velocities that keep joint limits and distances at once, by a quadratic program.
 
 The program finds the joint velocity nearest to a wanted one, with priority for the task. It has
-one unknown more than the arm has joints, and one for conflicts. The distances are those of the
-arm from itself, from objects and from people (`SeparationConfig`).
+two unknowns more than the arm has joints: the speed of the task, and the excess where distances
+conflict. The distances are those of the arm from itself, from objects and from people
+(`SeparationConfig`).
 
 The solver is the dual active-set method of Goldfarb and Idnani (1983), batched, in a fixed
 number of steps and without branches. It starts at the optimum without limits and adds one limit
@@ -34,8 +35,9 @@ from hrc_learn.pytree import pytree, zero_where
 
 # Violations of a limit up to this are rounding.
 _TOLERANCE = 1e-10
-# A row depends linearly on the active ones if its projection on their null space is relatively
-# shorter than this: rounding leaves 1e-16, and weights of 1e7 make 1e-7 of a row significant.
+# A row counts as linearly dependent on the active rows if its projection onto their null space
+# is relatively shorter than this. Rounding leaves 1e-16; with weights of 1e7, a fraction of
+# 1e-7 of a row is significant.
 _DEPENDENT = 1e-12
 
 
@@ -60,14 +62,16 @@ class _Step:
     side: Tensor
     """1 for an active upper limit, -1 for an active lower one, 0 otherwise (rows)."""
     operators: Tensor
-    """Projector on the null space of the active rows (p, p) and, to its right, their
-    pseudo-inverse, each column times its side, zero for inactive limits (p, rows)."""
+    """Projector onto the null space of the active rows (p, p) and, to its right, the
+    pseudo-inverse of these rows (p, rows); each of its columns is multiplied by `side`, so it
+    is zero for inactive limits."""
     pending: Tensor
-    """True while a limit is only partly added: another one had to be dropped first (1)."""
+    """True while a limit is only partly added, because another one had to be dropped first
+    (1)."""
     index: Tensor
-    """Number of that limit (1)."""
+    """Index of the partly added limit (1)."""
     multiplier: Tensor
-    """Multiplier of that limit so far (1)."""
+    """Multiplier of the partly added limit so far (1)."""
 
 
 def least_change(
@@ -86,8 +90,8 @@ def least_change(
             code works on vectors of limits.
         lower: Lower limits, not above `upper`; minus infinity: none.
         upper: Upper limits; infinity: none.
-        steps: Number of steps. Each active limit takes one, and each limit added and dropped
-            on the way takes two.
+        steps: Number of steps. Each active limit takes one step, and each limit that is added
+            and dropped again takes two.
     """
     *batch, p, _ = rows.shape
     nothing = torch.zeros_like(lower)
@@ -133,8 +137,8 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     excess = torch.maximum(a, b)
     wanted = now.pending | (excess > _TOLERANCE)
 
-    # Direction towards the limit that keeps the active ones, and the rates at which their
-    # multipliers fall on the way.
+    # Direction towards the limit along which the active limits stay satisfied, and the rates at
+    # which their multipliers fall on the way.
     p = rows.shape[-2]
     c = side * _column(rows, index)
     passed = _combine(c, now.operators)
@@ -158,8 +162,8 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     direction = torch.where(adds, z, v)
     square = torch.where(adds, zz, (v * v).sum(-1, keepdim=True))
     scale = torch.where(acts, 1 / torch.where(acts, square, 1.0), 0.0)
-    # A rank-one update: the projector loses the direction of an added limit and gains that of
-    # a dropped one; both make the pseudo-inverse orthogonal to it.
+    # A rank-one update: the projector loses the direction of an added limit or gains that of a
+    # dropped one; in both cases the pseudo-inverse becomes orthogonal to that direction.
     entering = torch.cat([z, lost - enters.to(c.dtype)], dim=-1)
     exiting = torch.cat([-v, _combine(v, now.operators[..., p:])], dim=-1)
     turn = scale * torch.where(adds, entering, exiting)
@@ -192,11 +196,11 @@ def _column(matrix: Tensor, index: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class ConstraintConfig:
-    """Distances to keep, and the priorities among what yields to keep them."""
+    """Distances to keep, and the priorities with which the motion yields to them."""
 
     clearance: float = 0.03
     """Distance kept from objects and from the arm itself [m]: three times the calibration error
-    of base and table. From people the protective distance is kept (`SeparationConfig`)."""
+    of base and table. People are kept at the protective distance (`SeparationConfig`)."""
     rate: float = 5.0
     """Fastest decay of a distance towards the clearance [1/s], as for joints towards their
     limits; at most 1/dt."""
@@ -211,7 +215,8 @@ class ConstraintConfig:
     steps: int = 16
     """Steps of the solver; the arm brakes where they are not enough. Arms approached by a
     person never needed more than 12; random limits need more than 16 in 4 % of the states, and
-    more than 24 in 0.1 %. Each takes about 3 % of a compiled control step."""
+    more than 24 in 0.1 %. Each step of the solver takes about 3 % of the time of a compiled
+    control step."""
 
     def __post_init__(self):
         positive = "rate", "task_weight", "path_weight", "distance_weight"
@@ -247,8 +252,8 @@ class Distances:
     allows, and does not retreat from a person who approaches. False for objects; None: all
     pairs are objects."""
     contact_speed: Float[Tensor, "*batch pairs"] | None = None
-    """Highest relative speed of an allowed contact with the person [m/s]; zero where none is
-    allowed, None: nowhere."""
+    """Highest relative speed of an allowed contact with the person [m/s]; zero where no contact
+    is allowed. None: no contact is allowed at all."""
 
     def known(self) -> Bool[Tensor, "*batch"]:
         """True where all values are finite."""
@@ -268,8 +273,8 @@ class Distances:
     def closing_speed(
         self, config: ConstraintConfig, separation: SeparationConfig
     ) -> Float[Tensor, "*batch pairs"]:
-        """Speed allowed to the arm towards each other body [m/s]; negative: it has to
-        retreat.
+        """Highest speed of the arm towards the other body of each pair [m/s]; negative: the arm
+        has to retreat.
         """
         towards_object = config.rate * (self.distance - config.clearance) - self.approach_speed
         if self.person is None:
@@ -305,14 +310,14 @@ def constrained_velocity(
     task_fraction: Float[Tensor, "*batch"] | None = None,
     separation: SeparationConfig | None = None,
 ) -> tuple[Float[Tensor, "*batch n"], ConstraintReport]:
-    """The joint velocity nearest to a wanted one that keeps all limits, the task first.
+    """Joint velocity nearest to a wanted one that keeps all limits, with priority for the task.
 
-    With the task's velocity t, an orthonormal basis N of the null space of J, and P of the
-    range of J^T, every joint velocity is
+    With the joint velocity t of the task and orthonormal bases N of the null space of J and P
+    of the range of J^T, every joint velocity is
 
         u = wanted + sigma t + N z + P e,
 
-    and the one returned solves
+    and the returned one solves
 
         min  |z|^2 + W_t^2 sigma^2 + W_p^2 |e|^2 + W_d^2 delta^2
         s.t. lower <= u <= upper,   -task_fraction <= sigma <= 0,
@@ -327,8 +332,8 @@ def constrained_velocity(
     The task keeps as much of its speed as possible. The null space yields first. Where no limit
     binds, the result is the wanted velocity.
 
-    On the path the tool never moves faster than wanted, whatever the null space does: a cap on
-    its speed is a cap on the wanted velocity.
+    On the path the tool never moves faster than wanted, whatever the null space does: to cap
+    its speed, cap the wanted velocity.
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
@@ -377,7 +382,8 @@ def constrained_velocity(
     change = least_change(rows, least, most, config.steps)
     y, solved = change.point, change.solved
     u = wanted + matmul(y[..., None, :-1], basis).squeeze(-2)
-    # An arm that brakes goes to zero; the clamp removes the rounding of the solver.
+    # Without a solution the arm brakes towards zero; the clamp also removes rounding of the
+    # solver.
     u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(lower, upper)
     slowed = torch.where(solved, -y[..., m] / config.task_weight, fraction)
     violation = torch.where(solved, y[..., -1] / config.slack_cost, 0.0)
@@ -388,8 +394,8 @@ def constrained_velocity(
 
 
 def _unit_cost_directions(jacobian: Tensor, task: Tensor, config: ConstraintConfig) -> Tensor:
-    """Joint velocities of one unit of cost each (directions, n): m off the path, one along it,
-    null space.
+    """Joint velocities that cost one unit each (directions, n): m off the path, one along it,
+    and those of the null space.
     """
     m = jacobian.shape[-2]
     basis = orthonormal_basis(jacobian).mT
@@ -403,8 +409,8 @@ def _unit_cost_directions(jacobian: Tensor, task: Tensor, config: ConstraintConf
 def _limit_rows(
     basis: Tensor, gradient: Tensor | None, m: int, config: ConstraintConfig
 ) -> Tensor:
-    """Columns of `least_change` (unknowns, limits): limits of the joints, of the task, of the
-    distances. The last unknown is the common excess of the distances.
+    """Columns for `least_change` (unknowns, limits): first the limits of the joints, then those
+    of the task and of the distances. The last unknown is the common excess of the distances.
     """
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
     slower = torch.zeros_like(joints[..., :1])

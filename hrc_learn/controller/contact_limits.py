@@ -1,15 +1,15 @@
-"""Speed of an arm near a person: its protective distance, and the speed of allowed contacts.
+"""Speed limits of an arm near a person, from the protective distance and from allowed contacts.
 
 Speed and separation monitoring keeps a distance (`SeparationConfig`). For power and force
-limiting, arm and body region are two masses with the spring of the region between them (ISO
-10218-2:2025, Annex M; before it ISO/TS 15066:2016, A.3.4). A contact at the relative speed v
-has the peak force v sqrt(mu k), with 1/mu = 1/m_H + 1/m_R and the effective mass of the arm at
-its posture
+limiting, arm and body region are modelled as two masses with the spring of the region between
+them (ISO 10218-2:2025, Annex M; formerly ISO/TS 15066:2016, A.3.4). A contact at the relative
+speed v has the peak force v sqrt(mu k), where 1/mu = 1/m_H + 1/m_R, and the effective mass m_R
+of the arm at its posture is given by
 
     1/m_R = n^T J M^-1 J^T n
 
-along the direction n of approach. A part of the body between the arm and furniture cannot
-yield: there the arm is also taken to push on until it has stopped.
+for the direction n of approach. A part of the body between the arm and furniture cannot yield:
+there the arm is also assumed to push on until it has stopped.
 
 The values are those of ISO/TS 15066:2016, tables A.2 and A.3, as commonly quoted; secondary
 sources confirm the spring constants and masses, and that the edition of 2025 kept the tables.
@@ -44,9 +44,10 @@ class BodyRegion(NamedTuple):
     """Limits and mechanics of a region of the body."""
 
     force: float
-    """Largest quasi-static force [N], the smallest of the region; 0: no contact is allowed."""
+    """Limit of the quasi-static force [N], the lowest within the region; 0: no contact is
+    allowed."""
     pressure: float
-    """Largest quasi-static pressure [N/cm^2], the smallest of the region."""
+    """Limit of the quasi-static pressure [N/cm^2], the lowest within the region."""
     stiffness: float
     """Effective spring constant [N/mm]."""
     mass: float
@@ -61,26 +62,28 @@ BODY_REGIONS = {name: BodyRegion(**row) for name, row in _REGIONS.items()}
 _TABLE = Constant(torch.tensor(list(BODY_REGIONS.values()), dtype=torch.float64))
 # Transient limits are this many times the quasi-static ones (table A.2).
 _TRANSIENT = 2.0
-# Furniture clamps a part of the body that the arm pushes towards it, within 60 degrees.
+# Cosine of 60 degrees: within this angle of the arm's direction to the person, furniture clamps
+# the person.
 _FACING = 0.5
-# Smallest distance that has a direction [m].
+# Distance below which its direction is undefined [m].
 _TOUCHING = 1e-6
-# Excess of a speed that counts as rounding, as the solver of constraints leaves it [m/s].
+# Excess speed that counts as rounding of the constraint solver [m/s].
 _TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContactConfig:
-    """Surface of the arm, and the part of the limits that is used."""
+    """Surface and inertia of the arm, and the fraction of the contact limits that is used."""
 
     area: float = 1.0
-    """Smallest contact area [cm^2]: that of the examples of ISO/TS 15066, table A.4."""
+    """Smallest contact area [cm^2], as in the examples of ISO/TS 15066, table A.4."""
     padding: float = math.inf
     """Stiffness of a padding [N/mm]; infinite: none."""
     used: float = 0.9
-    """Fraction of the limits that is used, for errors of the masses of arm and load."""
+    """Fraction of the limits that is used; the rest allows for errors of the masses of arm and
+    load."""
     rotor_inertia: float = 0.1
-    """Inertia of motor and gear at each joint [kg m^2]: that of MuJoCo's Panda."""
+    """Inertia of motor and gear at each joint [kg m^2], as of MuJoCo's Panda."""
     load: float = 0.5
     """Mass of an object in the gripper, at the tool centre point [kg]."""
 
@@ -91,10 +94,10 @@ class ContactConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SeparationConfig:
-    """Speed allowed near a person: speed and separation monitoring, power and force limiting.
+    """Settings of speed and separation monitoring and of power and force limiting.
 
     The first fields are the terms of the protective separation distance (ISO 10218-2:2025,
-    Annex L; before it ISO/TS 15066:2016, 5.5.4.2.3).
+    Annex L; formerly ISO/TS 15066:2016, 5.5.4.2.3).
     """
 
     human_speed: float = 1.6
@@ -104,16 +107,17 @@ class SeparationConfig:
     """T_r, time from the person's motion to the arm's response [s]: sensing, transport, and
     about 20 ms for a control step and the ramp of the acceleration."""
     deceleration: float = 2.0
-    """Deceleration a of the tool while the arm stops [m/s^2]: T_s = v/a, S_s = v^2/(2 a)."""
+    """Deceleration a of the tool while the arm stops [m/s^2]: it gives the stopping time v/a
+    and the stopping distance v^2/(2 a)."""
     clearance: float = 0.2
-    """C + Z_d + Z_r, intrusion and the uncertainty of both positions [m]: the distance left
-    when both have come to rest."""
+    """C + Z_d + Z_r, intrusion distance and position uncertainties of person and arm [m]: the
+    distance that is left when the arm has stopped."""
     mode: PersonMode = "ssm"
     """Speed and separation monitoring ("ssm"), power and force limiting wherever contact is
-    allowed ("pfl"), or the one that allows the higher speed ("ssm+pfl"). From regions of the
-    body that must not be touched the protective distance is kept in all modes."""
+    allowed ("pfl"), or the one that allows the higher speed ("ssm+pfl"). Body regions that must
+    not be touched are kept at the protective distance in all modes."""
     contact: ContactConfig = field(default_factory=ContactConfig)
-    """Surface and load of the arm, for power and force limiting."""
+    """Surface and inertia of the arm, for power and force limiting."""
 
     def __post_init__(self):
         if self.mode not in (modes := get_args(PersonMode)):
@@ -170,9 +174,9 @@ class SeparationConfig:
 
         Args:
             distance: Distance between person and arm [m].
-            human_speed: v_h, as of `highest_speed` [m/s].
+            human_speed: v_h, as in `highest_speed` [m/s].
             contact_speed: Highest relative speed of an allowed contact (`contact_limits`), zero
-                where none is allowed [m/s]; None: nowhere.
+                where no contact is allowed [m/s]; None: no contact is allowed at all.
         """
         kept = self.highest_speed(distance, human_speed)
         if contact_speed is None or self.mode == "ssm":
@@ -192,8 +196,8 @@ class SeparationConfig:
 
         Args:
             speed: Closing speed of the arm [m/s].
-            human_speed: v_h, as of `highest_speed` [m/s].
-            contact_speed: As of `allowed_speed` [m/s].
+            human_speed: v_h, as in `highest_speed` [m/s].
+            contact_speed: As in `allowed_speed` [m/s].
         """
         if contact_speed is None or self.mode == "ssm":
             return torch.zeros_like(speed, dtype=torch.bool)
@@ -202,10 +206,10 @@ class SeparationConfig:
 
 
 def region_numbers(names: Sequence[str]) -> Int[Tensor, " parts"]:
-    """Numbers of body regions, for `contact_speed`.
+    """Indices of body regions, as `contact_speed` takes them.
 
     Raises:
-        ValueError: There is no such region.
+        ValueError: A name is not in `BODY_REGIONS`.
     """
     known = list(BODY_REGIONS)
     for name in names:
@@ -220,15 +224,15 @@ def contact_speed(
     clamped: Bool[Tensor, "*#batch"],
     separation: SeparationConfig,
 ) -> Float[Tensor, "*batch"]:
-    """Highest relative speed of a contact that keeps force and pressure [m/s].
+    """Highest relative speed of a contact within the limits of force and pressure [m/s].
 
-    A free contact is transient. In a clamped one the body does not yield, and quasi-static
-    limits hold for both extremes of the arm: a mass without drive, and a stiff drive that goes
-    on for the reaction time and then brakes.
+    A free contact is transient. In a clamped contact the body cannot yield, and the
+    quasi-static limits apply to two extreme models of the arm: a free mass, and a stiff drive
+    that moves on for the reaction time and then brakes.
 
     Args:
         inverse_mass: 1/m_R of the arm in the direction of the contact [1/kg].
-        region: Number of the body region.
+        region: Index of the body region.
         clamped: True where the body is between the arm and furniture.
         separation: Surface, reaction time and deceleration of the arm.
     """
@@ -244,7 +248,7 @@ def contact_speed(
 
 
 class ContactSpeeds(NamedTuple):
-    """Highest relative speeds of contacts [m/s]; zero where none is allowed."""
+    """Highest relative speeds of contacts [m/s]; zero where no contact is allowed."""
 
     first: Float[Tensor, "*batch C H"]
     """Speeds at which arm and person may meet."""
@@ -253,18 +257,18 @@ class ContactSpeeds(NamedTuple):
 
 
 class ContactLimits:
-    """Contact speeds of an arm beside furniture, for power and force limiting."""
+    """Contact speeds of an arm near furniture, for power and force limiting."""
 
     def __init__(self, arm: CapsuleArm, separation: SeparationConfig, furniture: Sequence[Box]):
         """Prepare the mass matrix of the arm.
 
         Args:
             arm: Capsules of arm and tool.
-            separation: Reaction and deceleration of the arm, its surface and load.
+            separation: Reaction time, deceleration, surface and inertia of the arm.
             furniture: Boxes against which the arm may clamp people, in the base frame.
 
         Raises:
-            ValueError: The chain of the capsules is no arm with masses.
+            ValueError: The kinematics of the capsules are not an `Arm`, which has masses.
         """
         if not isinstance(arm.chain, Arm):
             raise ValueError(

@@ -37,8 +37,8 @@ class SafetyConfig:
     margin: float = 0.02
     """Distance kept from every joint position limit [rad]."""
     velocity_margin: float = 0.02
-    """Unused fraction of every joint velocity limit. The arm's own servo overshoots its command
-    by up to 1.2 % of the limit (in MuJoCo)."""
+    """Unused fraction of every joint velocity limit. In MuJoCo, the servos overshoot their
+    command by up to 1.2 % of the limit."""
     rate: float = 5.0
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
     braking: float = 1.0
@@ -107,12 +107,14 @@ class SafetyReport:
     flags: Bool[Tensor, "*batch kinds"]
     """True for each of `INTERVENTIONS` that changed the command by more than rounding."""
     speed_excess: Float[Tensor, "*batch"]
-    """Speed above the cap of the fastest point [m/s]. Above zero where no admissible motion
-    keeps the cap: it fell faster than the arm can brake, or a start was too fast."""
+    """Excess of the fastest point's speed over the cap [m/s]. It is positive where no
+    admissible motion keeps the cap, because the cap fell faster than the arm can brake, or the
+    arm was too fast at the start."""
     speed_excess_time: Float[Tensor, "*batch"]
     """Time for which the cap has been exceeded, up to the end of this step [s]."""
     constraints: ConstraintReport | None = None
-    """Effect of the constraints, where the filter has them; none on an arm that brakes."""
+    """Effect of the constraints, none while the arm brakes to rest; None: the filter has no
+    constraints."""
 
     def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
         """True where one kind of intervention changed the command."""
@@ -141,15 +143,15 @@ _PAPER_IMAGE = (1440, 1080)
 class Goals:
     """The attracting regions.
 
-    All fields are tensors, so a task changes them between two steps without rebuilding or
+    All fields are tensors, so a task can change them between two steps without rebuilding or
     recompiling the controller.
     """
 
     position: PositionRegion
     """Box for the tool centre point."""
     orientation: OrientationRegion | AxisRegion | None
-    """Cone for the tool orientation. An `AxisRegion` leaves rotation about its axis free, None
-    all rotation: for tasks, and arms, with fewer than six degrees of freedom."""
+    """Cone for the tool orientation. An `AxisRegion` leaves rotation about its axis free and
+    None leaves all rotation free, for tasks and arms with fewer than six degrees of freedom."""
     vision: VisionRegion
     """Region of the feature in the image."""
     vision_enabled: Bool[Tensor, "*#batch"]
@@ -185,7 +187,7 @@ class Goals:
             centre: Centre of the box for the tool centre point [m].
             orientation: Orientation of the tool, a unit quaternion (w, x, y, z).
             target: Target of the feature in the image [px], u and v of each of its points; None
-                switches the camera off.
+                switches vision feedback off.
             half_size: Half edges of the box [m].
             image_size: Width and height of the image [px].
             task: Controlled part of the tool pose: all of it, position and z axis, or position.
@@ -211,7 +213,8 @@ class Goals:
     def approached_by(self, posture: Float[Tensor, "*#batch n"] | None) -> Goals:
         """The goals, first approached in joint space towards a posture [rad].
 
-        Use an inverse-kinematics solution of the box centre that is near the arm.
+        Use an inverse-kinematics solution for the box centre that is close to the present
+        joints.
         """
         region = None if posture is None else PostureRegion(goal=posture)
         return replace(self, posture=region)
@@ -229,7 +232,8 @@ class Goals:
         in time takes joints to their limits and the arm into singularities.
 
         Args:
-            posture: Posture that suits the box; None: the null space stays where it is.
+            posture: Posture that has the tool in the box; None: the null space stays where it
+                is.
             rate: Convergence rate near the posture [1/s].
             speed: Highest speed, norm over all joints [rad/s].
 
@@ -263,32 +267,33 @@ class Observation:
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
     joint_velocity: Float[Tensor, "*batch n"] | None = None
-    """Measured joint velocities [rad/s]. In the first step after a start they take the place of
-    those of the start, where they differ. None: not measured."""
+    """Measured joint velocities [rad/s]. In the first step after a start they replace the
+    velocities of the initial state if they differ from them. None: not measured."""
     nullspace_input: Float[Tensor, "*batch n"] | None = None
     """Null-space input d of the paper: joint torques exerted by a person [N m]; None: none."""
     goals: Goals | None = None
     """Regions to go to; None: those of the controller."""
     feature_new: Bool[Tensor, "*batch"] | None = None
-    """True if `feature` is from an image that no earlier step has used; None: it is."""
+    """True if `feature` is from an image that no earlier step has used; None counts as True."""
     feature_age: Float[Tensor, "*batch"] | None = None
     """Time since the image was taken [s]; None: zero."""
     image_joint_position: Float[Tensor, "*batch n"] | None = None
     """Joint positions when the image was taken [rad]; None: the present ones. Pairing an image
     with a later pose teaches the estimator a wrong Jacobian."""
     joint_state_stale: Bool[Tensor, "*batch"] | None = None
-    """True if the joint position is too old to be used; None: it is not."""
+    """True if the joint position is too old to be used; None counts as False."""
     human_distance: Float[Tensor, "*batch"] | None = None
-    """Distance of the nearest person from the tool [m], which slows and stops the tool; NaN
-    (unknown): stop. None: no person is monitored."""
+    """Distance of the nearest person from the tool [m]; a short one slows down or stops the
+    arm. NaN (unknown): stop. None: no person is monitored."""
     load: Float[Tensor, "*batch 3"] | None = None
-    """Far end of a load in the frame of the tool centre point, whose speed is capped as well
-    [m]; None: no load."""
+    """Far end of a load in the frame of the tool centre point [m]; its speed is capped as well.
+    None: no load."""
     distances: Distances | None = None
     """Distances of the arm from itself, the scene and people, kept by
     `SafetyConfig.constraints`; None: none."""
     stop: Bool[Tensor, "*batch"] | None = None
-    """True to brake to rest and stay there, for a watchdog or a person; None: no."""
+    """True to brake to rest and stay there, for a watchdog or a person; None counts as
+    False."""
 
     @classmethod
     def unseen(
@@ -299,7 +304,7 @@ class Observation:
 
         Args:
             joint_position: Joint positions [rad].
-            target: Place in the image that stands for the feature [px].
+            target: Image position that stands for the unseen feature [px].
             dt: Time until the next step [s]; a tensor in the observation, so that one compiled
                 step serves all rates.
         """

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from hrc_learn.kinematics import MotionLimits
 
-# Rounding of a velocity, relative to v_max and in units of the dtype's resolution: that of the
-# sum v + a dt, and a reserve of one for sums and products before it.
+# Rounding error of a velocity, in units of the dtype's resolution times v_max: one for the sum
+# v + a dt, and one in reserve for the sums and products before it.
 _ROUNDING = 2.0
 # Margin [rad/s] that libfranka 0.21 also subtracts from position-dependent velocity limits to
 # absorb rounding errors (kJointVelocityLimitsTolerance).
@@ -32,9 +32,9 @@ class LimitBarrier(nn.Module):
     v_hat instead of v, takes a distance that is longer by (a + A)^3/(6 j^2). So one curve h is
     safe for every a.
 
-    The set is invariant in discrete time. Assume that step k starts inside the set with
-    v_hat_k, that the joint moves by v_k dt, and that the next acceleration is
-    max(a_k - j dt, -A). Then v_hat_{k+1} <= v_hat_k - A dt, and for every dt <= 1/rate
+    The set is invariant in discrete time. Assume that step k starts with v_hat_k inside the
+    set, that the joint moves by v_k dt, and that the next acceleration is max(a_k - j dt, -A).
+    Then v_hat_{k+1} <= v_hat_k - A dt, and for every dt <= 1/rate
 
         Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt,
 
@@ -252,9 +252,10 @@ class LimitBarrier(nn.Module):
         return velocity + dt * lowest, velocity + dt * highest
 
 
-# Velocity that ramps of the acceleration may add while the arm eases off, as a fraction of the
-# velocity limits at a cap of 1 m/s: it decides how gently the arm eases off. It falls with the
-# square of the cap, as the turning of the links does that gentle braking has to allow for.
+# Velocity that ramps of the acceleration may add during gentle braking, as a fraction of the
+# velocity limits at a cap of 1 m/s. The smaller it is, the more gently the arm brakes. It falls
+# with the square of the cap, like the turning of the links that gentle braking has to allow
+# for.
 _RAMP = 0.005
 
 
@@ -264,8 +265,8 @@ class SpeedBarrier(nn.Module):
 
     Let J be the linear Jacobian of a point, v and a the joint velocity and acceleration. The
     speed |J v| changes although v rests, because J turns with the joints. The set therefore
-    bounds the speed on the whole way to rest along one braking motion, v(t) = y v, in which y
-    falls from 1 to 0 with  dy/dt = -1/T,  T = max(kappa |v_i|/A_i) + tau  of the present v.
+    bounds the speed throughout one braking motion to rest, v(t) = y v, in which y falls from 1
+    to 0 with dy/dt = -1/T, where T = max(kappa |v_i|/A_i) + tau for the present v.
 
     *Turning.* For joints i, j of a chain, d^2 p/dq_i dq_j = z_min(i,j) x J_max(i,j), at most as
     long as the column J_max(i,j). Let R_i be the longest column from joint i on, and x = |v|.
@@ -273,30 +274,29 @@ class SpeedBarrier(nn.Module):
 
         |J(q + d) v - J(q) v| <= sum_ij R_max(i,j) d_j x_i,
 
-    and B = sum_ij R_max(i,j) x_i x_j bounds |dJ/dt v|. Until y the joints move by at most
-    x_j (T (1 - y^2)/2 + dt), the second term for the step itself. So the speed is at most
+    and B = sum_ij R_max(i,j) x_i x_j bounds |dJ/dt v|. Until y, joint j moves by at most
+    x_j (T (1 - y^2)/2 + dt), where dt is for the step itself. So the speed is at most
 
         y (|J v| + dt B + Gamma (1 - y^2)),    Gamma = B (T + tau)/2.
 
     Its largest value over y is |J v| + dt B as long as that exceeds 2 Gamma: braking outruns
-    the turning. It is a barrier, because each term of the bound uses up its part of the next:
-    one step of braking, of any length, does not increase it. The columns grow as well, by
-    at most exp(sum of all d).
+    the turning. The bound is a barrier, because one step of braking, of any length, does not
+    increase it. The columns R_i grow as well, by a factor of at most exp(sum of all d).
 
-    *Jerk.* While its acceleration ramps down, a joint is faster than y v by at most
-    (a + b)^2/(2 j) with its braking b = |v|/T. kappa makes these ramps small.
+    *Jerk.* While its acceleration a ramps down, a joint is faster than y v by at most
+    (a + b)^2/(2 j), where b = |v|/T is its deceleration. A large kappa keeps these ramps small.
 
     *Joint limits.* Near its position limits a joint follows its own barrier, whose velocity
-    decays at most at the rate A/c. Braking faster than y v, it leaves y v by at most
-    (1 - (1 + log rho)/rho) v with rho = T A/c > 1.
+    decays at most at the rate A/c. If it brakes faster than y v, it deviates from y v by at
+    most (1 - (1 + log rho)/rho) v with rho = T A/c > 1.
 
-    *Delay and jitter.* Positions that are read a time D before the motion have changed since by
-    at most D (x + A D), which turns the links further, and from one reading to the next by
-    dt (x + A D). A step lasts up to (1 + jitter) dt.
+    *Delay and jitter.* If positions are read a time D before the motion, the joints have since
+    moved by at most D (x + A D), which turns the links further; from one reading to the next
+    they move by at most dt (x + A D). A step lasts up to (1 + jitter) dt.
     """
 
     deceleration: Tensor
-    """A/kappa [rad/s^2], at which joints ease off."""
+    """A/kappa, deceleration of gentle braking [rad/s^2]."""
     jerk: Tensor
     """j [rad/s^3]."""
     fade: Tensor
@@ -304,7 +304,7 @@ class SpeedBarrier(nn.Module):
     decay: Tensor
     """Largest A/c of the joints [1/s]."""
     distal: Tensor
-    """1 at (i, j) for j not before i (n, n)."""
+    """1 at (i, j) for j >= i, otherwise 0 (n, n)."""
     slowing: Tensor
     """A D, by which a joint may have been faster when its position was read [rad/s]."""
 
@@ -315,7 +315,7 @@ class SpeedBarrier(nn.Module):
 
         Args:
             joints: Barrier of the joint limits.
-            cap: The usual cap [m/s]; the barrier holds for any other as well.
+            cap: The usual cap [m/s]; the barrier holds for any other cap as well.
             delay: D, time from a reading to the motion that results from it [s].
             jitter: Largest relative excess of a step over its dt.
         """
@@ -352,15 +352,15 @@ class SpeedBarrier(nn.Module):
         Args:
             points: Linear Jacobians of the points at the positions read last.
             velocity: Joint velocity of the step [rad/s].
-            acceleration: Acceleration with which it was reached [rad/s^2].
+            acceleration: Acceleration with which this velocity is reached [rad/s^2].
             dt: The step [s].
         """
         T = self.braking_time(velocity)
         x, towards = velocity.abs(), torch.sign(velocity) * acceleration
         braking = x / T
-        # Faster than y v while the acceleration ramps down; slower if it brakes harder than
-        # that, and past zero if it cannot end the braking before.
-        # Then |a| > |v|/T, as T > max(A_i/j_i)/(2 kappa).
+        # Deviation from y v: a joint is faster while its acceleration ramps down, and slower if
+        # it brakes harder. If it cannot end the braking before zero, it reverses. Then
+        # |a| > |v|/T, as T > max(A_i/j_i)/(2 kappa).
         hard = towards.clamp(max=0) ** 2
         ramp = torch.where(hard > 2 * self.jerk * x, hard, (towards + braking) ** 2)
         excess = ramp / (2 * self.jerk)

@@ -1,13 +1,13 @@
-"""Terms of the control law: regional feedback, and one joint velocity from its twist.
+"""Terms of the control law: regional feedback, and the joint velocity that realises its twist.
 
 *Feedback.* Two levels between 0 and 1 set the blend. The *vision level* fades vision feedback
 in, on top of Cartesian feedback, while the camera sees the feature. The *task level* fades from
 a joint-space approach towards a posture to task-space feedback. Invalid measurements are
 replaced before any feedback is computed.
 
-*Resolved rate.* A tool twist and a null-space velocity become one joint velocity. The projector
-holds to first order of a step only, so the pose drift that null-space motion causes is measured
-and corrected.
+*Resolved rate.* A tool twist and a null-space velocity become one joint velocity. The
+null-space projector is exact only to first order in the step, so the pose drift that null-space
+motion causes is measured and corrected.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from hrc_learn.kinematics.inverse import SINGULAR_BELOW, position_first
 from hrc_learn.pytree import pytree, zero_where
 from hrc_learn.regions import PostureRegion
 
-# Keeps the Cholesky factorisation possible at a singularity. It serves to judge how near that
-# is, and never enters a solution.
+# Keeps the Cholesky factorisation possible at a singularity. It enters only the estimated
+# distance from a singularity, never a solution.
 _FLOOR = 1e-9
 _EYE = {rows: Constant(torch.eye(rows, dtype=torch.float64)) for rows in range(1, 7)}
 
@@ -61,9 +61,10 @@ def task_descent(
 ) -> Float[Tensor, "*batch 6"]:
     """Part of a gradient along which a task of fewer than six dimensions descends.
 
-    With J_t = B J the joints move by J_t^+ y for a motion y of the task, and the tool by
-    J J_t^+ y, which includes rotations outside the task. So the gradient over y is
-    (J J_t^+)^T s, and the potential falls by its square. It is B s where s lies in the task.
+    With J_t = B J and a motion y of the task, the joints move by J_t^+ y, and the tool moves by
+    J J_t^+ y, which includes rotations outside the task. So the gradient over y is (J J_t^+)^T
+    s, and the potential falls at the rate of its square. The gradient is B s where s lies in
+    the task.
 
     Args:
         J: Geometric Jacobian.
@@ -87,15 +88,17 @@ def resolved_rate(
 
         J^+ v = J^T (J J^T + lambda^2 I)^-1 v,   N w = w - Q Q^T w,   J^T = Q R
 
-    The damping lambda is exactly zero unless J is near a singularity. The distance from one is
-    |(J J^T)^-1|_F^(-1/2), which is at most sigma_min and close to it where sigma_min is small.
+    The damping lambda is exactly zero unless J is near a singularity. The distance from a
+    singularity is estimated as |(J J^T)^-1|_F^(-1/2), which is at most sigma_min, and close to
+    sigma_min where that is small.
 
-    N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. There
-    the null space gains a dimension, of which N keeps n - 6 that may change from one step to
-    the next; the safety filter limits the resulting acceleration.
+    N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. At a
+    singularity the null space has more dimensions; N keeps only as many as elsewhere, and which
+    ones may change from one step to the next. The safety filter limits the resulting
+    acceleration.
 
-    Of an arm with fewer joints than rows the position follows the twist, and the rotation as
-    nearly as it can (`position_first`); it has no null space.
+    An arm with fewer joints than rows has no null space: its position follows the twist, its
+    rotation as nearly as possible (`position_first`).
 
     Args:
         J: Geometric Jacobian, or its rows in the task: at most 6.
@@ -142,10 +145,11 @@ def saturate_in_null_space(
 ) -> Float[Tensor, "*batch n"]:
     """Shift the motion of joints at a limit to the other joints.
 
-    Joints beyond a limit move at it, and the others are solved for the rest of the twist: one
-    round of the saturation in the null space (Flacco, De Luca and Khatib, "Control of redundant
-    robots under hard joint constraints", T-RO 2015). Without it an arm with a joint at its
-    limit may stop short of its goal, where the smallest velocity is one of that joint alone.
+    Joints that would exceed a limit move at the limit, and the other joints make up for the
+    rest of the twist: one iteration of the saturation in the null space (Flacco, De Luca and
+    Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015). Without it,
+    an arm with a joint at its limit may stop short of its goal, where the smallest velocity
+    moves that joint alone.
 
     Args:
         task: Joint velocity of the task, by `resolved_rate` [rad/s].
@@ -155,8 +159,8 @@ def saturate_in_null_space(
         upper: Highest allowed velocity [rad/s].
 
     Returns:
-        The velocity, in which only joints that were within their bounds may leave them; or the
-        given one, if that comes nearer to the twist once it is limited [rad/s].
+        The shifted velocity, which may exceed the bounds of joints that were within them; or
+        the given velocity, if that comes at least as near to the twist after clamping [rad/s].
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
     free = cut == task
@@ -172,7 +176,7 @@ def saturate_in_null_space(
         missing = twist - torch.linalg.vecdot(J, within.unsqueeze(-2))
         return torch.linalg.vecdot(missing, missing).unsqueeze(-1)
 
-    # Both are equal, but for rounding, where no limit acts.
+    # Where no limit acts, both velocities are equal up to rounding.
     better = (off(shared) < off(task)) & ~free.all(-1, keepdim=True)
     return torch.where(better, shared, task)
 
@@ -195,7 +199,7 @@ def scale_task(
         J: Geometric Jacobian of the tool.
         lower: Lowest allowed velocity [rad/s].
         upper: Highest allowed velocity [rad/s].
-        caps: Highest linear and angular speed [m/s, rad/s], as a scale for both.
+        caps: Highest linear and angular speed [m/s, rad/s], used to weight both speeds.
 
     Returns:
         The velocity, scaled down at most until no limit acts [rad/s].
@@ -224,10 +228,10 @@ def scale_null_space(
 ) -> Float[Tensor, "*batch n"]:
     """Scale the null-space velocity as a whole to keep the limits of single joints.
 
-    Limiting single joints would move the tool. The factor is the largest from 0 to 1 that fits;
-    where none fits because the task alone is too fast, the one that comes closest. (Factors
-    beyond would let the redundant joints give way to the task. In measurements they whipped the
-    elbow into the limits near singularities.)
+    Limiting single joints would move the tool. The factor is the largest from 0 to 1 that keeps
+    the limits. If the task alone is too fast for any factor, it is the one that comes closest.
+    (Factors outside this range would let the redundant joints give way to the task, but in
+    measurements they drove the elbow fast into the limits near singularities.)
 
     Args:
         task: Joint velocity of the task [rad/s].
@@ -241,8 +245,8 @@ def scale_null_space(
     at_rest = null == 0
     if everywhere(at_rest):
         return null
-    # A joint at rest does not bound the factor: divided by the smallest number its bounds are
-    # infinite, or of the wrong sign where the task alone is too fast.
+    # A joint without null-space motion does not bound the factor: divided by the smallest
+    # number, its bounds become infinite, or of the wrong sign where the task alone is too fast.
     null_or_tiny = torch.where(at_rest, torch.finfo(null.dtype).tiny, null)
     at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
     least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
@@ -253,7 +257,7 @@ def scale_null_space(
     return factor * null
 
 
-# Bound on each component of the accumulated drift [m, rad], against windup while a person
+# Bound on each component of the accumulated drift [m, rad]; prevents windup while a person
 # blocks the arm.
 _MAX_DRIFT = 0.005
 
@@ -264,7 +268,7 @@ class PoseDrift:
     """Deviation of the tool from the motion of its task, and the data of the last step."""
 
     drift: Float[Tensor, "*batch 6"]
-    """Motion still to be made up for (linear [m], angular [rad])."""
+    """Motion that remains to be corrected (linear [m], angular [rad])."""
     joint_position: Float[Tensor, "*batch n"]
     """Joint positions of the last step [rad]."""
     jacobian: Float[Tensor, "*batch 6 n"]
@@ -272,7 +276,8 @@ class PoseDrift:
     planned: Float[Tensor, "*batch 6"]
     """Motion the task had planned for the last step (linear [m], angular [rad])."""
     active: Bool[Tensor, "*batch"]
-    """True if the drift was measured in the last step; otherwise the rest may be old."""
+    """True if the drift was measured in the last step; otherwise the other fields may be
+    outdated."""
 
 
 def restored_drift(drift: PoseDrift) -> PoseDrift:
@@ -290,15 +295,15 @@ def measure_drift(
 ) -> PoseDrift:
     """Add the drift of the last step: planned motion minus motion of the tool.
 
-    The motion of the tool is (J_0 + J_1)/2 dq to third order of the step. It was planned by
-    J_0 dq, which holds to second order: the difference is the drift.
+    The motion of the tool is (J_0 + J_1)/2 dq, up to an error of third order in the step. It
+    was planned with J_0 dq, which has an error of second order: the difference is the drift.
 
     Args:
         before: Drift after the last step.
         joint_position: Joint positions now [rad].
         jacobian: Jacobian now.
-        active: True where to compensate. Elsewhere, and in the first step of a null-space
-            input, the drift is zero.
+        active: True where drift is compensated. Elsewhere, and in the first step of a
+            null-space input, the drift is zero.
     """
     step = (joint_position - before.joint_position).unsqueeze(-2)
     moved = torch.linalg.vecdot(before.jacobian + jacobian, step)  # twice the motion
@@ -324,9 +329,9 @@ def planned_motion(
     """Motion of the tool that the task plans for the coming step (linear [m], angular [rad]).
 
     Limits may slow the motion down. That is no drift, so only the fraction that the filtered
-    joint velocity executes counts as planned. It is the fraction of the whole twist: for a slow
-    task the correction of measured noise is as large as the task's own twist, and would hide
-    the fraction of the task alone.
+    joint velocity executes counts as planned. This fraction is measured on the whole twist: for
+    a slow task, the correction of measurement noise is as large as the task's own twist and
+    would hide the fraction of the task alone.
 
     Args:
         task_twist: Twist of the task alone.
@@ -392,7 +397,7 @@ class VisionBlending(nn.Module):
         """State before the first image.
 
         Args:
-            like: Joint positions, of which batch shape, dtype and device are taken.
+            like: Joint positions with the batch shape, dtype and device of the state.
             points: Number of points of the feature.
         """
         level = like.new_zeros(like.shape[:-1])
@@ -410,12 +415,12 @@ class VisionBlending(nn.Module):
         return replace(zero_where(~known, state), feature=feature)
 
     def late(self, age: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
-        """True where a measurement of an age [s] is too old."""
+        """True where the age of a measurement [s] is too high or unknown."""
         # NaN is an unknown age; an age far below zero means that the clocks differ.
         return ~(age.abs() <= self.config.max_feature_age)
 
     def inside(self, feature: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*batch"]:
-        """Distance to the nearest edge of the image [px]; NaN compares as not seen."""
+        """Distance to the nearest image border [px], negative outside; NaN for NaN."""
         points = feature.shape[-1] // 2
         centre = self.centre if points == 1 else self.centre.repeat(points)
         return (centre - (feature - centre).abs()).amin(-1)
@@ -502,8 +507,9 @@ def next_task_level(
     """Level of task-space feedback after a joint-space approach, 0 to 1.
 
     It rises inside the posture region: task-space feedback from an arbitrary posture often ends
-    at a joint limit. Then it stays up, also where a person or the task moves the joints out of
-    the region, unless the posture is far away, as at the start of a new phase.
+    at a joint limit. Then it stays up, even if a person or the task moves the joints out of the
+    region, unless the posture is far away, as at the start of a new phase, and no feature is
+    followed.
 
     Args:
         task_level: Level after the last step.
@@ -520,7 +526,7 @@ def next_task_level(
     return fade(task_level, stays | (f <= 0), dt, blend_time)
 
 
-# Pixel rate that is always allowed [px/s]: keeps the cap above zero at the target.
+# Pixel rate that is always allowed [px/s]; it keeps the cap above zero at the target.
 _LEAST_PIXEL_RATE = 1.0
 
 
@@ -585,7 +591,7 @@ def _excess_rate(
 def validated_position(
     observation: Observation, expected: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
-    """Joint positions [rad]: measured, or the expected ones where those are NaN or stale.
+    """Joint positions [rad]: measured, or expected where the measurement is NaN or stale.
 
     Returns:
         The positions, and True where they are the expected ones.

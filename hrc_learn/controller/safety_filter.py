@@ -36,15 +36,15 @@ from hrc_learn.pytree import zero_where
 _REPORTED = 1e-6
 # Fraction of the acceleration and jerk limits left unused. A check of the sent positions
 # divides differences of rounded numbers by powers of the step: for the jerk at 1 kHz by 1e-9
-# s^3, which turns rounding of 4e-16 rad into 2e-6 rad/s^3, of thousands.
+# s^3, which turns rounding of 4e-16 rad into 2e-6 rad/s^3, compared with limits of thousands.
 _ROUNDING = 1e-9
 # Smaller joint velocities are rounded to rest [rad/s].
 _REST = 1e-15
-# Step assumed for braking before the first valid one [s]: that of the fastest arms, so the
-# gentlest.
+# Step assumed for braking before the first valid one [s]: the shortest that arms use, with
+# which braking is gentlest.
 _SHORTEST_STEP = 1e-3
-# Fraction of the velocity limits by which a measured velocity may differ from the one of a
-# start: encoders at 1 kHz err by some hundredths of a radian per second.
+# Fraction of the velocity limits by which measured velocities may differ from those of the
+# initial state: encoders at 1 kHz err by some hundredths of a radian per second.
 _START_ERROR = 0.03
 
 
@@ -76,29 +76,30 @@ class SafetyFilter(nn.Module):
 
     The limits hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), if
     the arm follows its commands with an error below the margins. Otherwise the limits of
-    acceleration and jerk hold, and the others as soon as those allow. A joint outside its
+    acceleration and jerk hold, and the other limits as soon as these allow. A joint outside its
     limits, or within their margin, does not move further out. It may rest there, and returns
     when the command asks for it: a stop never causes a motion.
 
-    The cap on the speed of tool, elbow and load holds by a barrier as well (`SpeedBarrier`).
-    Where no admissible motion keeps it, because the cap has fallen faster than the arm can
-    brake, or a start was faster, the arm brakes as hard as it can, and the report says by how
-    much and for how long the cap is exceeded.
+    The cap on the speed of tool, elbow and load holds by a barrier as well (`SpeedBarrier`). If
+    no admissible motion keeps the cap, because it has fallen faster than the arm can brake or
+    the arm was too fast at the start, the arm brakes as hard as it can, and the report says by
+    how much and for how long the cap is exceeded.
 
-    Any NaN or infinity, in an argument or in the state, brakes the arm to rest and is
-    forgotten: neither a command nor a state is ever NaN or infinite.
+    Any NaN or infinity, in an argument or in the state, brakes the arm to rest and is not
+    stored: neither a command nor a state is ever NaN or infinite.
 
     Velocity, speed, acceleration and jerk are limited by scaling the whole vector, which keeps
     its direction; only the barrier of the joint limits cuts single joints. The acceleration
-    fades in time for the velocity to arrive without overshoot, so stops and resumes are smooth.
+    fades out early enough for the velocity to arrive without overshoot, so the arm stops and
+    starts smoothly.
     """
 
     def __init__(self, limits: MotionLimits | SerialChain, config: SafetyConfig | None = None):
         """Prepare the filter.
 
         Args:
-            limits: The arm or chain, whose elbow is capped like its tool; or joint limits
-                alone.
+            limits: The arm or chain, for which the speed of the elbow is capped as well; or
+                joint limits alone.
             config: Margins and caps; default: the recommended ones.
         """
         super().__init__()
@@ -222,16 +223,16 @@ class SafetyFilter(nn.Module):
                 rest.
             joint_velocity_command: Wanted joint velocities (*batch, n) [rad/s]. Not finite:
                 brake to rest.
-            dt: Time until the next step [s], or since the last where steps are irregular. A
-                tensor outside (0, longest_step]: brake to rest, with the last valid step.
+            dt: Time until the next step [s], or since the last step where steps are irregular.
+                A tensor outside (0, longest_step]: brake to rest, using the last valid step.
             jacobian: Jacobian of the tool centre point, linear rows first; enables the cap on
                 the speed of tool, elbow and load. Not finite: brake to rest.
             load: Vector from the tool centre point to the far end of a load, in the base frame
                 [m]; needs all six rows of the Jacobian. Not finite: brake to rest.
-            joint_velocity: Measured joint velocities [rad/s]. Where they differ from those of a
-                start, in the first step after it, the filter goes on from them.
-            human_distance: Distance of the tool from the nearest person [m], which slows and
-                stops it; NaN (unknown): stop. None: no person is monitored.
+            joint_velocity: Measured joint velocities [rad/s]. If they differ from the initial
+                state in the first step, the filter continues from them.
+            human_distance: Distance of the tool from the nearest person [m]; a short one slows
+                down or stops the arm. NaN (unknown): stop. None: no person is monitored.
             stop: True where the arm has to brake to rest for another reason.
             distances: Distances to keep, by `SafetyConfig.constraints`. Not finite: brake to
                 rest.
@@ -241,8 +242,8 @@ class SafetyFilter(nn.Module):
 
         Raises:
             ValueError: A vector does not have one value for each joint; a number dt is not in
-                (0, longest_step]; or a distance is given without a Jacobian or without the
-                constraints that would keep it.
+                (0, longest_step]; a distance is given without a Jacobian or without the
+                constraints that would keep it; or constraints are set without a Jacobian.
         """
         self._check_arguments(jacobian, human_distance, distances)
         q = self.joint_vector(joint_position, "joint_position")
@@ -341,7 +342,7 @@ class SafetyFilter(nn.Module):
     def _from_measured_start(
         self, given: _Inputs, measured: Tensor | None
     ) -> tuple[_Inputs, Tensor]:
-        """The arguments with a start that agrees with the measured velocity, and the flag."""
+        """The arguments, with the measured velocity at a start that differs, and the flag."""
         state = given.state
         if measured is None:
             return given, torch.zeros_like(given.invalid)
@@ -354,7 +355,7 @@ class SafetyFilter(nn.Module):
         return given._replace(state=state), wrong
 
     def _with_capped_points(self, given: _Inputs, load: Tensor | None) -> _Inputs:
-        """The arguments with the Jacobians of tool, elbow and far end of a load."""
+        """The arguments, with the Jacobians of tool, elbow and far end of a load."""
         J, invalid = given.jacobian, given.invalid
         if J is None:
             return given
@@ -385,13 +386,14 @@ class SafetyFilter(nn.Module):
             u = u / excess.clamp(min=1)
         inside = u.clamp(*given.bounds)
         cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _REPORTED
-        # Constraints cut no single joint: the null space may give way to all of the task.
+        # With constraints, no single joint is cut: the null space can give way to the whole
+        # task.
         return inside if self.config.constraints is None else u, _acts(excess), cut
 
     def _cap_speed(
         self, given: _Inputs, u: Tensor, human_distance: Tensor | None
     ) -> tuple[Tensor, Tensor | float, Tensor, Tensor]:
-        """The velocity slowed down, the cap, and the flags `tcp_speed` and `separation`."""
+        """The slowed velocity, the cap, and the flags `tcp_speed` and `separation`."""
         never = torch.zeros_like(given.invalid)
         if given.points is None:
             return u, math.inf, never, never
@@ -411,9 +413,9 @@ class SafetyFilter(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The velocity nearest to a target within limits of acceleration and jerk.
 
-        The wanted acceleration is the largest fraction of change/dt, alike
-        for all joints, with which they keep their acceleration limits and can still fade it out
-        in time:  a dt + a^2/(2 j) <= change.
+        The wanted acceleration is the largest fraction of change/dt, the same for all joints,
+        with which every joint keeps its acceleration limit and can still fade its acceleration
+        out in time: a dt + a^2/(2 j) <= change.
 
         Args:
             given: Arguments of the step.
@@ -473,7 +475,7 @@ class SafetyFilter(nn.Module):
             fraction.clamp(0, 1),
             self.config.separation,
         )
-        # The solver's rounding is a motion where a velocity limit is zero.
+        # Rounding of the solver would move joints that have a velocity limit of zero.
         v = torch.where(v.abs() < _REST, 0, v)
         braking = given.invalid | given.stopped
         if not everywhere(~braking):
@@ -484,11 +486,12 @@ class SafetyFilter(nn.Module):
     def _keep_speed(
         self, given: _Inputs, v: Tensor, cap: Tensor | float
     ) -> tuple[Tensor, Bool[Tensor, "*batch 1"]]:
-        """The velocity braked as far as the cap on the speed of points requires, and a flag.
+        """The velocity, reduced as far as the cap on the speed of points requires, and a flag.
 
-        Between the wanted velocity and the one that eases off, both within the limits, it is
-        the last one inside the barrier. Where easing off is not enough, it lies between that
-        and the one that brakes as hard as the arm can. A stop brakes hard in any case.
+        It is the nearest velocity to the wanted one inside the barrier, on the line to the
+        velocity of gentle braking (`_easing`). Where gentle braking is not enough, it lies on
+        the line from there to the hardest braking (`_stopping`). A stop always brakes as hard
+        as possible.
         """
         cap = cap * (1 - 8 * torch.finfo(v.dtype).eps)
         speed = self._highest_speed(given, v)
@@ -501,7 +504,8 @@ class SafetyFilter(nn.Module):
         low, high = torch.where(eases, easing, stopping), torch.where(eases, v, easing)
         at_low, at_high = torch.where(eases, gentle, hard), torch.where(eases, speed, gentle)
         fraction = _secant(at_low, at_high, cap)
-        # The bound is almost straight on so short a line; where it bulges, once more.
+        # The bound is almost linear along this short line; a second step corrects for its
+        # curvature.
         at = self._highest_speed(given, torch.lerp(low, high, fraction))
         fraction = fraction * _secant(at_low, at, cap)
         kept = torch.where(passes, v, torch.lerp(low, high, fraction))
@@ -526,7 +530,8 @@ class SafetyFilter(nn.Module):
         too_fast = torch.where(excess > _REPORTED, before.too_fast + before.dt, 0.0)
         state = SafetyState(
             velocity=v,
-            # Of the rounded velocities: errors do not add up, and a check finds the same.
+            # From the rounded velocities, so errors do not add up and a check finds the same
+            # value.
             acceleration=(v - before.velocity) / given.dt,
             position=given.joint_position + v * given.dt,
             dt=before.dt,

@@ -18,8 +18,8 @@ from hrc_learn.pytree import pytree, static
 
 # Step of a difference quotient along a motion [s].
 _STEP = 1e-4
-# Margin of the closing speed below which a distance counts as binding [m/s]: what the solver
-# leaves unused is rounding. And the scale below which the arm counts as blocked.
+# Unused closing speed up to which a distance counts as binding [m/s]: the solver leaves only
+# rounding unused. Speed scale below which the arm counts as blocked.
 _BINDING, _BLOCKED = 1e-3, 0.01
 
 
@@ -70,7 +70,8 @@ class TaskPace:
         motion.
 
         Args:
-            people_scale: That fraction. The scale may drop at once; it rises as paths do.
+            people_scale: That fraction. The speed scale may drop at once, but rises only as
+                fast as the rate of paths.
             dt: Control step [s].
         """
         scale = torch.minimum(people_scale, self.people_scale + dt / CHANGE_OF_RATE)
@@ -165,7 +166,7 @@ class WayMakingConfig:
 
     @property
     def expert(self) -> bool:
-        """True if the null-space input of a person moves it."""
+        """True if the null-space input of a person moves the null space."""
         return self.mode in ("expert", "both")
 
 
@@ -174,9 +175,9 @@ def way_making_velocity(
 ) -> Float[Tensor, "*batch n"]:
     """Joint velocity away from nearby bodies [rad/s]; only its null-space part acts.
 
-    It follows the gradient of the smoothed least distance d = -k log sum exp(-d_i/k), as down
-    the potential of a repulsion (Khatib 1986). Its speed rises smoothly from zero at `far` to
-    `speed` at `near`. Zero where a distance is not a number: the arm brakes there.
+    It follows the gradient of the smoothed least distance d = -k log sum exp(-d_i/k), like a
+    repulsive potential (Khatib 1986). Its speed rises smoothly from zero at `far` to `speed` at
+    `near`. It is zero where a distance is not a number: the arm brakes there.
 
     Args:
         distances: Distances from the bodies to keep away from.
@@ -203,13 +204,13 @@ def null_space_input(
     """Null-space input of a person, plus the input equivalent to way-making [N m].
 
     Args:
-        push: Input of a person [N m]; None: none.
-        distances: Distances from the bodies to keep away from; None: none is near.
+        push: Input of a person [N m]; None: no person pushes.
+        distances: Distances from the bodies to keep away from; None: no body is near.
         config: Source of null-space motion; None: a person.
         damping: c_d, null-space input per unit of joint velocity [N m s/rad].
 
     Returns:
-        The input; None: none.
+        The input; None: there is no input.
     """
     if config is None:
         return push

@@ -29,7 +29,8 @@ class WantedVelocity:
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
     load: Float[Tensor, "*batch 3"] | None = None
-    """Far end of a load in the frame of the tool centre point [m]; None: no load."""
+    """Far end of a load in the frame of the tool centre point [m]; its speed is capped as well.
+    None: no load."""
 
 
 class FilteredVelocity(NamedTuple):
@@ -50,7 +51,7 @@ class VelocityStepState(NamedTuple):
 
 @final
 class VelocityStep(nn.Module):
-    """Joint velocities within the limits of an arm and the cap on tool, elbow and load.
+    """Joint velocities within the limits of an arm and the speed cap of tool, elbow and load.
 
     Attributes:
         chain: Kinematics and limits of the arm.
