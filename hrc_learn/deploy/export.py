@@ -37,19 +37,19 @@ def export_step(
 ) -> Path:
     """Compile the step of a controller, unless an equal one has been compiled before.
 
-    The machine code comes from LLVM, so no compiler needs to be installed. It runs on the
-    processor that built it. Next to it are `step.h`, a header for C and C++, and `step.json`, a
-    description for other languages. The name of their folder is a hash of torch's version, of
-    the processor, of the source of this library, and of all settings and weights of the
-    controller. With classes from outside this library, whose source is unknown, the hash is
-    that of the traced step, which takes seconds longer.
+    The machine code comes from LLVM, so no compiler needs to be installed. It runs only on
+    processors like the one that built it. Next to it are `step.h`, a header for C and C++, and
+    `step.json`, a description for other languages. The name of their folder is a hash of
+    torch's version, of the processor, of the source of this library, and of all settings and
+    weights of the controller. With classes from outside this library, whose source is unknown,
+    the hash is that of the traced step, which takes seconds longer.
 
     Args:
         controller: Controller with the step.
         observation: An example with exactly the fields of later observations. Missing fields,
-            and a `dt` that is a number, become constants; so do the controller's own goals if
-            it has none. It sets batch dimensions and dtype of the step; float32 counts
-            interventions to 16 million only.
+            and a `dt` that is a number, become constants; so do the controller's goals if the
+            example has none. The example sets batch dimensions and dtype of the step; in
+            float32, interventions are counted up to 16 million only.
         folder: Folder of the compiled steps; default: the user's cache.
 
     Returns:
@@ -98,11 +98,11 @@ def _compile(step: PackedStep, observation: StepObservation, folder: Path) -> No
 def _few_arms(
     step: PackedStep, observation: StepObservation
 ) -> tuple[PackedStep, StepObservation]:
-    """The same step for a few arms of a batch, enough to see that they do not mix."""
+    """The same step for a few arms of a batch: enough to check that they do not interact."""
     batch = step.layouts.state.batch
     if not batch:
         return step, observation
-    # A size that no unbatched field has by chance: then the layouts are equal.
+    # Choose a size that no unbatched field has by chance, so that the layouts are equal.
     for size in (2, 3, 5, 11):
         part = (slice(size), *(slice(1) for _ in batch[1:]))
         few = _pytree.tree_map_only(
@@ -116,7 +116,7 @@ def _few_arms(
             for ours, theirs in zip(smaller.layouts, step.layouts, strict=True)
         ):
             return smaller, few
-    raise UnknownOperationError("the fields of a batch cannot be told from those of one arm")
+    raise UnknownOperationError("batched fields cannot be distinguished from unbatched ones")
 
 
 def trace(step: PackedStep, observation: StepObservation) -> torch.export.ExportedProgram:
@@ -181,11 +181,11 @@ def content_hash(*objects: Any) -> str:
 
 
 def _hashed(x: Any, seen: dict[int, Any]) -> Iterator[bytes]:
-    """All values in an object, in a fixed order; each object once, then by its number.
+    """All values in an object, in a fixed order; repeated objects only by their number.
 
     Args:
         x: The object.
-        seen: Objects so far by their id; it keeps them alive, so ids stay unique.
+        seen: Objects so far by their id; the dictionary keeps them alive, so ids stay unique.
     """
     kind = type(x)
     yield f"{kind.__module__}.{kind.__qualname__}\n".encode()
@@ -212,7 +212,7 @@ def _parts(x: Any) -> Iterable[Any]:
     if isinstance(x, list | tuple):
         return x
     if isinstance(x, SerialChain):
-        # The shape of an arm, which may be a function that reads it, is no part of a step.
+        # The shape of an arm, which may be a function that reads it, does not affect a step.
         return x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds
     if type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(x, "__dict__"):
         return (x.__getstate__(),)

@@ -47,7 +47,7 @@ class Steppable(Protocol):
         joint_acceleration: Float[Tensor, "*batch n"] | None = None,
         /,
     ) -> Any:
-        """State of an arm at rest, or in motion, a pytree."""
+        """State of an arm at rest or in motion, as a pytree."""
         ...
 
     def step(self, state: Any, observation: Any, /) -> tuple[Any, Any]:
@@ -125,7 +125,7 @@ class IOLayout:
         return torch.cat(parts)
 
     def unpack(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
-        """Tensors of a vector: views of it, except those of another dtype."""
+        """Tensors in a vector: views of it, or copies for another dtype."""
         views = zip(self.views(vector), self.fields, strict=True)
         return [view.to(field.dtype) for view, field in views]
 
@@ -173,7 +173,7 @@ class StepLayouts(NamedTuple):
 
 @final
 class PackedStep(nn.Module):
-    """Step of a controller on vectors, in place.
+    """Step of a controller that reads vectors and updates them in place.
 
     It reads the vectors of state and observation, and writes those of the command and of the
     next state. Missing fields of the observation, and a `dt` that is a number, are constants.
@@ -235,7 +235,7 @@ _LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtyp
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
 LANES, WORKSPACE = "hrc_learn.lanes", "hrc_learn.workspace"
-"""Keys of machine code alone: arms at once, and numbers in its workspace."""
+"""Keys of the machine code: number of arms at once, and size of its workspace in numbers."""
 
 CODE, DESCRIPTION = "step.o", "step.json"
 """Files of a compiled step: machine code, and the metadata as one JSON object."""
@@ -273,8 +273,8 @@ def load(path: Path) -> tuple[Callable[[list[Tensor]], object], StepLayouts, Ten
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It was not written by this library, it has changed since, or it was
-            written for another machine.
+        ValueError: The file was not written by this library, has changed since, or was written
+            for another machine.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no compiled step {path}")
@@ -297,7 +297,7 @@ def load(path: Path) -> tuple[Callable[[list[Tensor]], object], StepLayouts, Ten
 
 
 def _layouts(metadata: Mapping[str, str]) -> StepLayouts:
-    """Layouts of the vectors that `describe` has described."""
+    """Layouts of the vectors from the metadata that `describe` returns."""
     fields: dict[str, list[Field]] = {vector: [] for vector in StepLayouts._fields}
     for line in metadata[_LAYOUT].splitlines():
         vector, name, kind, batched, *shape = line.split()
@@ -309,7 +309,7 @@ def _layouts(metadata: Mapping[str, str]) -> StepLayouts:
 
 
 def machine() -> str:
-    """Description of the machine that compiled code depends on: torch and processor."""
+    """Description of what compiled code depends on: version of torch, and processor."""
     capability = torch.backends.cpu.get_cpu_capability()
     extensions = binding.get_host_cpu_features().flatten()
     return (
@@ -327,7 +327,7 @@ def _name(dtype: torch.dtype) -> str:
 
 
 def c_header(metadata: Mapping[str, str]) -> str:
-    """Header of the machine code for C and C++: its function, and where each field is."""
+    """Header of the machine code for C and C++: its function and the rows of each field."""
     dtype = {"float64": "double", "float32": "float"}[metadata[_DTYPE]]
     layouts = _layouts(metadata)
     places = []

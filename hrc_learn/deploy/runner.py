@@ -38,11 +38,11 @@ class StepRunner:
     Attributes:
         observation: Arrays that the step reads, by field, for example "joint_position" or
             "goals.vision.target"; flags are 0 or 1.
-        state: Fields of the state, for example "safety.counts"; write into one for example
-            after an arm ignored a command.
+        state: Fields of the state, for example "safety.counts"; they can be overwritten, for
+            example after an arm has ignored a command.
         command: Fields of the last command, for example "xi_x" or "safety.flags"; overwritten
             by the next step.
-        joint_velocity: That field of the command [rad/s].
+        joint_velocity: Field "joint_velocity" of the command [rad/s].
     """
 
     def __init__(
@@ -109,14 +109,14 @@ class StepRunner:
 
 @final
 class PackageRunner(StepRunner):
-    """A step compiled ahead of time; a step allocates nothing."""
+    """A control step compiled ahead of time, which allocates no memory."""
 
     def __init__(self, package: Path):
         """Load machine code written by `export_step`, in milliseconds.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: This library did not write the file, it has changed since, or it was
+            ValueError: The file was not written by this library, has changed since, or was
                 written for another machine.
         """
         super().__init__(*load(package))
@@ -127,7 +127,7 @@ class EagerRunner(StepRunner):
     """A step without compilation."""
 
     def __init__(self, controller: Steppable, observation: StepObservation):
-        """Prepare the step; later observations have the fields of this one."""
+        """Prepare the step; later observations must have the fields of this one."""
         self._packed = PackedStep(controller, observation)
         super().__init__(self._run_eagerly, self._packed.layouts, self._packed.first_state)
         self.observe(observation)
@@ -158,7 +158,8 @@ def open_step(
     return runner
 
 
-# Last part of a wait, spent spinning [s]: a sleeping process wakes up late by about as much.
+# Last part of a wait, spent in a busy loop [s]: sleeping processes wake up about this much
+# late.
 _SPIN = 0.0002
 
 
@@ -173,8 +174,8 @@ class Rate:
 
     Attributes:
         ticks: Number of returns of `wait`.
-        missed: Number of skipped ticks: the loop was busy, or woken too late, until the next
-            one was due.
+        missed: Number of skipped ticks: the loop was busy, or woke up too late, until the
+            following tick was due.
         latest: Largest lateness of a tick so far [s].
     """
 

@@ -1,9 +1,9 @@
 """A traced step as straight-line arithmetic on single numbers.
 
-A tensor of the trace is replaced by a tensor of value numbers, one for each of its elements.
-PyTorch itself then does all that only moves elements (views, slices, concatenations), and the
-arithmetic that is left is one instruction an element. Equal instructions are kept once, and
-those of constants are carried out here.
+Each tensor of the trace becomes a tensor of value numbers, one for each element. PyTorch itself
+then carries out operations that only move elements (views, slices, concatenations); the
+remaining arithmetic becomes one instruction per element. Equal instructions are kept once, and
+instructions on constants are evaluated here.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ type Instruction = tuple[Any, ...]
 """
 
 BOOLEAN = frozenset({"gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"})
-"""Operations with a truth value as their result, besides selections of truth values."""
+"""Operations with a truth value as their result; "select" has one if it selects truth
+values."""
 
 
-# Complements of comparisons, true as well if a number is NaN.
+# Complements of comparisons, also true if a number is NaN.
 _COMPLEMENTS = {"gt": "not gt", "lt": "not lt", "ge": "not ge", "le": "not le", "eq": "ne"}
 
 
@@ -46,13 +47,13 @@ class ScalarProgram:
     """Straight-line program of one step.
 
     Attributes:
-        instructions: Each has operands before itself.
-        boolean: For each instruction, whether its result is a truth value.
-        results: For each mutated vector, the value number of each row.
+        instructions: The instructions, each after its operands.
+        boolean: True for each instruction that results in a truth value.
+        results: Value number of each row, for each vector that the step writes.
     """
 
     def __init__(self, dtype: torch.dtype):
-        """Begin an empty program whose numbers are of one floating-point type."""
+        """Begin an empty program on numbers of one floating-point type."""
         self.instructions: list[Instruction] = []
         self.boolean: list[bool] = []
         self.results: dict[str, list[int]] = {}
@@ -63,7 +64,7 @@ class ScalarProgram:
         """Value number of a constant."""
         if isinstance(value, bool):
             return self._add(("constant", value), boolean=True)
-        # `repr` keeps the sign of zero apart, and NaN equal to itself.
+        # As text, the two signs of zero differ and NaN equals itself.
         return self._add(("constant", repr(float(self.number(value)))), boolean=False)
 
     def input(self, vector: str, row: int, element: int) -> int:
@@ -176,7 +177,7 @@ _ELEMENTWISE = {
         "logical_and __and__ bitwise_or logical_or __or__ bitwise_not logical_not where"
     ).items()
 }
-# Operations that move elements and calculate nothing: PyTorch does them on value numbers.
+# Operations that only move elements: PyTorch carries them out on value numbers.
 _MOVES = {operator.getitem} | set(
     _operations(
         "alias broadcast_tensors cat clone copy copy_ detach detach_ diagonal expand expand_as "
@@ -185,14 +186,14 @@ _MOVES = {operator.getitem} | set(
         "stack t transpose unbind unflatten unsqueeze view"
     )
 )
-# Operations of shapes and constants alone.
+# Operations that depend only on shapes and constants.
 _FILLS = set(
     _operations(
         "arange eye full full_like new_zeros ones ones_like scalar_tensor zeros zeros_like"
     )
 )
 type _Each = Callable[..., Tensor]
-# Operations made of others, which the first argument calculates; the rest as in PyTorch.
+# Operations composed of others: the first argument emits one, the rest are as in PyTorch.
 _COMPOSED: dict[str, _Each] = {
     "addcdiv": lambda of, x, a, b, value=1: of("add", x, of("div", of("mul", a, value), b)),
     "addcmul": lambda of, x, a, b, value=1: of("add", x, of("mul", of("mul", a, value), b)),
@@ -284,7 +285,7 @@ class _Unroller:
         if operation in _MOVES:
             return node.target(*args, **keywords)
         if operation in _FILLS:
-            # Of a tensor, only shape and type count.
+            # Only shape and type of a tensor matter.
             args = [x.double() if isinstance(x, Tensor) else x for x in args]
             return self._constants(node.target(*args, **keywords))
         name = operation.__name__.lstrip("_")
@@ -310,7 +311,7 @@ class _Unroller:
     def _reduced(
         self, name: str, first: Any, x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any
     ) -> Tensor:
-        """A reduction of elements; `first` is the result of none."""
+        """Reduce elements along axes; `first` is the result for no elements."""
         axes = list(range(x.ndim)) if dim in (None, []) else dim
         axes = [axis % x.ndim for axis in ([axes] if isinstance(axes, int) else axes)]
         others = [axis for axis in range(x.ndim) if axis not in axes]
@@ -322,13 +323,13 @@ class _Unroller:
         return torch.tensor(kept, dtype=torch.int64).reshape(shape)
 
     def _joined(self, name: str, row: list[int]) -> int:
-        """Reduction by halves: processors do independent operations at the same time."""
+        """Reduce pairwise: processors do independent operations at the same time."""
         while len(row) > 1:
             pairs = zip(row[::2], row[1::2], strict=False)
             row = [self.result.emit(name, a, b) for a, b in pairs] + row[len(row) & ~1 :]
         return row[0]
 
-    # Operations of PyTorch, by name; arguments as there.
+    # Operations of PyTorch by name, with PyTorch's arguments.
 
     aten_sum = partialmethod(_reduced, "add", 0.0)
     aten_amax = partialmethod(_reduced, "max", -math.inf)
@@ -362,7 +363,7 @@ class _Unroller:
         return result if keepdim else result.squeeze(dim)
 
     def _best(self, better: str, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
-        """Position of the first best element along an axis; NaN is better than any number."""
+        """Index of the first best element along an axis; NaN is better than any number."""
         first, *others = x.unbind(dim)
         best, position = first, self._tensor(0.0).expand(first.shape)
         for k, element in enumerate(others, start=1):
@@ -424,4 +425,4 @@ class _Unroller:
         return torch.nn.functional.pad(x, list(pad), mode, value=filled)
 
     def aten_assert_tensor_metadata(self, *_: Any, **__: Any) -> None:
-        """A check of the trace, which was passed."""
+        """Ignore a check that the trace has already passed."""

@@ -1,4 +1,4 @@
-"""Rotations, poses and shapes; every delicate numeric of the package is in `numerics`."""
+"""Rotations, poses and shapes; `numerics` holds the numerically delicate functions."""
 
 from hrc_learn.geometry import quaternion as quaternion
 from hrc_learn.geometry.numerics import minimum_jerk as minimum_jerk

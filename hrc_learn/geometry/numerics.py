@@ -1,10 +1,10 @@
-"""The delicate numerics of the package: singular functions, small matrices, fixed tensors.
+"""Numerically delicate functions: removable singularities, small matrices, fixed tensors.
 
-Arrays as users have them become tensors here as well, and the ranges of settings are checked.
+The module also converts arrays of users to tensors and checks the ranges of settings.
 
 Functions with a removable singularity take the *squared* length: a Euclidean norm has no second
-derivative at zero, its square has all of them. On either side of a threshold a Taylor series or
-the closed form is chosen by `where`, and the form that is not chosen is evaluated at a harmless
+derivative at zero, its square has all derivatives. `where` selects a Taylor series below a
+threshold and the closed form above it. The form that is not selected is evaluated at a harmless
 argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
@@ -24,8 +24,8 @@ from torch.utils._pytree import tree_leaves
 type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Sequence | float
 """A tensor, a NumPy array, or a nested list of numbers."""
 
-# Below it the series are exact to rounding in float64 (next term < 1e-16) while the closed
-# forms lose second derivatives to cancellation, which grows as 1 / threshold^2.
+# Below these thresholds the series are exact to rounding in float64 (next term < 1e-16), while
+# the closed forms lose their second derivatives to cancellation, which grows as 1/threshold^2.
 _SINC_THRESHOLD = 1e-2
 _ARCTAN_THRESHOLD = 1e-3
 
@@ -55,7 +55,7 @@ def check_settings(
     below_one: Iterable[str] = (),
     fraction: Iterable[str] = (),
 ) -> None:
-    """Check that settings are in their ranges; NaN is in none.
+    """Check that settings are in their ranges; NaN is in no range.
 
     Args:
         settings: Object with the settings as attributes.
@@ -104,7 +104,7 @@ def arctan_ratio(
 ) -> Tensor:
     """atan2(s, c) / s from s squared and c; smooth at s = 0 for c > 0.
 
-    Only the direction of (s, c) enters the angle, so a common scale of both divides the result.
+    A common factor on s and c does not change the angle, so it divides the result.
 
     Args:
         sine_square: s squared, not negative.
@@ -116,7 +116,7 @@ def arctan_ratio(
     small = sine_square < _ARCTAN_THRESHOLD * cosine * cosine
     s = torch.sqrt(torch.where(small, 1.0, sine_square))
     c = torch.where(small, cosine, 1.0)
-    tangent_square = sine_square / (c * c)  # where not small it only has to be finite
+    tangent_square = sine_square / (c * c)  # only has to be finite if not small
     series = polynomial(tangent_square, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9)) / c
     return torch.where(small, series, torch.atan2(s, cosine) / s)
 
@@ -128,7 +128,7 @@ def safe_norm(vector: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
     return torch.where(zero, 0.0, torch.sqrt(torch.where(zero, 1.0, square)))
 
 
-# No measurement in SI units is as large. Squares of it fit into float32.
+# No measurement in SI units is as large. The square of this number fits into float32.
 _LARGEST_VALID = 1e12
 
 
@@ -138,9 +138,9 @@ def is_number(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
 
 
 def may_branch(x: Tensor) -> bool:
-    """True where a step may skip work by a branch on its data.
+    """True where a step may skip work by branching on its data.
 
-    A tracer or `vmap` cannot follow the branch, and an accelerator would have to wait for it.
+    Tracers and `vmap` cannot follow such a branch, and on an accelerator it waits for the data.
     """
     if torch.compiler.is_compiling() or x.device.type != "cpu":
         return False
@@ -178,7 +178,7 @@ def minimum_jerk[T: (float, Tensor)](x: T) -> tuple[T, T]:
 
 
 class Constant:
-    """A fixed tensor, kept ready for every dtype and device it has met.
+    """A fixed tensor, cached for each dtype and device that it is used with.
 
     Floating-point values are converted from float64; integers keep their dtype.
     """
@@ -188,18 +188,18 @@ class Constant:
         self._ready: dict[tuple[torch.dtype, torch.device], Tensor] = {}
 
     def __getstate__(self) -> dict[str, object]:
-        # What was met is no part of what it is.
+        # The cache is not part of the constant.
         return {"_value": self._value, "_ready": {}}
 
     def like(self, x: Tensor) -> Tensor:
-        """The tensor on the device of `x`, and of its dtype if floating-point."""
+        """The tensor on the device of `x`; a floating-point one also takes the dtype of `x`."""
         dtype = x.dtype if self._value.is_floating_point() else self._value.dtype
         if torch.compiler.is_compiling():
             return self._value.to(device=x.device, dtype=dtype)
         key = (dtype, x.device)
         tensor = self._ready.get(key)
         if tensor is None:
-            # Once kept, it must serve autograd as well.
+            # Autograd cannot use inference tensors, so none may enter the cache.
             with torch.inference_mode(False):
                 tensor = self._value.to(device=x.device, dtype=dtype)
             if _outlives_the_call(tensor):
@@ -208,15 +208,15 @@ class Constant:
 
 
 def _outlives_the_call(tensor: Tensor) -> bool:
-    """False for stand-ins that a tracer or a functional transform will take down again."""
+    """False for stand-ins that are valid only within a tracer or a functional transform."""
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
     return type(tensor) is Tensor and not functorch.is_functorch_wrapped_tensor(tensor)
 
 
-# Products and solutions with matrices of a few rows. Eagerly each call costs more than its
-# arithmetic, so one call of BLAS or LAPACK is best. A compiler fuses sums of products with all
-# that surrounds them, across a batch as well, but has to leave its loop for every such call. So
-# what is compiled is written out.
+# Products and solutions with matrices of a few rows. In eager mode each call costs more than
+# its arithmetic, so one call of BLAS or LAPACK is best. A compiler fuses sums of products with
+# the surrounding operations, also across a batch, but has to leave its loop for each call of
+# BLAS or LAPACK. So the compiled branch is written out.
 
 
 def matmul(
@@ -272,11 +272,11 @@ def solve_positive(
 def null_projection(
     J: Float[Tensor, "*batch m n"], w: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch n"]:
-    """The part of w that J maps to zero, to rounding: |J N w| <= 1e-14 |J| |w| or so.
+    """The null-space part N w of w, up to rounding: |J N w| is at most about 1e-14 |J| |w|.
 
-    By Householder's QR of J^T, which is as exact for a singular J as for a regular one; solving
-    with J J^T would square its condition. Where the rank is below m, what is left out is m
-    directions all the same: those of the range, and some of the null space.
+    It uses a Householder QR of J^T, which is as accurate for a singular J as for a regular one;
+    solving with J J^T would square the condition number. If the rank is below m, the projection
+    still removes m directions: the range of J^T and some of the null space.
 
     Args:
         J: Jacobian with at least as many columns as rows.
@@ -285,7 +285,8 @@ def null_projection(
     if not torch.compiler.is_compiling():
         Q = torch.linalg.qr(J.mT).Q
         return w - (Q @ (Q.mT @ w.unsqueeze(-1))).squeeze(-1)
-    # By the reflections that make J^T triangular, there and back.
+    # Apply the reflections that make J^T triangular, drop the first m entries, and reflect
+    # back.
     m = J.shape[-2]
     reflections = _reflections(J)
     for k, (v, factor) in enumerate(reflections):
@@ -297,9 +298,10 @@ def null_projection(
 
 
 def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
-    """An orthogonal matrix Q whose last n - m columns J maps to zero, to rounding.
+    """An orthogonal matrix Q; J maps its last n - m columns to zero, up to rounding.
 
-    The first m span the range of J^T, and where its rank is below m some of the null space.
+    The first m columns span the range of J^T and, if its rank is below m, some of the null
+    space.
 
     Args:
         J: Jacobian with at least as many columns as rows.
@@ -314,13 +316,13 @@ def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n
 
 
 def _reflections(J: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Vectors and factors of the reflections that make J^T triangular, one a row of J."""
+    """Vectors and factors of the reflections that make J^T triangular, for each row of J."""
     columns = list(J.unbind(-2))
     reflections: list[tuple[Tensor, Tensor]] = []
     for k in range(len(columns)):
         x = columns[k][..., k:]
         norm = (x * x).sum(-1, keepdim=True).sqrt()
-        # Away from zero: no digits cancel.
+        # Equal signs, so no digits cancel.
         v = torch.cat([x[..., :1] + torch.copysign(norm, x[..., :1]), x[..., 1:]], dim=-1)
         square = (v * v).sum(-1, keepdim=True)
         # A column of zeros needs no reflection.
@@ -332,14 +334,14 @@ def _reflections(J: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 def _reflected(x: Tensor, k: int, v: Tensor, factor: Tensor) -> Tensor:
-    """Mirror the entries of x from k on in the plane across v."""
+    """Reflect the entries of x from index k on in the plane perpendicular to v."""
     rest = x[..., k:]
     rest = rest - factor * (rest * v).sum(-1, keepdim=True) * v
     return torch.cat([x[..., :k], rest], dim=-1)
 
 
 def _factors(A: Tensor) -> tuple[list[list[Tensor]], list[Tensor]]:
-    """L, as rows of entries left of the diagonal, and 1/D of A = L D L^T."""
+    """L and 1/D of A = L D L^T; L as rows of the entries left of its diagonal."""
     n = A.shape[-1]
     L: list[list[Tensor]] = [[] for _ in range(n)]
     inverse_d: list[Tensor] = []

@@ -33,7 +33,7 @@ class Pose:
         # NumPy arrays and lists become tensors; placeholders of tracers pass unchanged.
         for name in ("position", "orientation"):
             value = getattr(self, name)
-            if isinstance(value, (np.ndarray, list, tuple)):  # which torch 2.15 traces
+            if isinstance(value, (np.ndarray, list, tuple)):  # torch 2.15 can trace this
                 object.__setattr__(self, name, as_tensor(value))
 
     @staticmethod
@@ -57,7 +57,7 @@ class Pose:
 
     @staticmethod
     def from_vector(r: ArrayLike) -> Pose:
-        """Pose of (position [m], rotation vector [rad]), shape (*batch, 6)."""
+        """Pose from a vector (position [m], rotation vector [rad]) of shape (*batch, 6)."""
         r = as_tensor(r)
         return Pose(r[..., :3], quaternion.exp(r[..., 3:]))
 
@@ -66,7 +66,7 @@ class Pose:
         return torch.cat([self.position, quaternion.log(self.orientation)], dim=-1)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """Pose of `other`, given in this frame, in this frame's parent."""
+        """Pose of `other` in the parent of this frame; `other` is given in this frame."""
         return Pose(
             self.apply(other.position), quaternion.multiply(self.orientation, other.orientation)
         )

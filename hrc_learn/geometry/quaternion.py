@@ -79,7 +79,7 @@ def normalize(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 
 
 def canonical(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The sign whose first non-zero component is positive (w >= 0: the shortest rotation)."""
+    """Choose the sign with a positive first non-zero component (w >= 0: shortest rotation)."""
     order = (torch.sign(q) * _LEXICOGRAPHIC.like(q)).sum(-1, keepdim=True)
     return q * torch.sign(order)
 
@@ -120,7 +120,7 @@ def to_matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternion of a rotation matrix, of either sign.
+    """Unit quaternion of a rotation matrix; its sign is arbitrary.
 
     Builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
     (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
@@ -174,7 +174,7 @@ def mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
 def continuous(q: Float[Tensor, "*batch time 4"]) -> Float[Tensor, "*batch time 4"]:
     """Flip signs along time so that neighbours are at most a right angle apart in R^4.
 
-    Do this before interpolating or filtering components; the first sign is kept.
+    The first sign is kept. Use this before components are interpolated or filtered.
     """
     flip = torch.where((q[..., 1:, :] * q[..., :-1, :]).sum(-1) < 0, -1.0, 1.0).to(q)
     sign = torch.cat([torch.ones_like(q[..., :1, 0]), flip.cumprod(-1)], dim=-1)
@@ -196,7 +196,7 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
     """
     length = safe_norm(v)
     axis = v / torch.where(length > 0, length, 1.0)[..., None]
-    # At the identity there is no axis: carry on with the last one that was seen.
+    # At the identity there is no axis: use the last one before it.
     step = torch.arange(v.shape[-2], device=v.device).expand(length.shape)
     seen = torch.where(length > _AXIS_THRESHOLD, step, 0).cummax(-1).values
     axis = torch.take_along_dim(axis, seen[..., None], dim=-2)
@@ -254,8 +254,8 @@ def drift_free_rate(
 ) -> Float[Tensor, "*batch 3"]:
     """Solve e' = v + n(e, v) for v, given e' = `rate`; v is minus the angular velocity.
 
-    It is the product with the transposed left Jacobian J_l(e)^T, which also takes a derivative
-    over small rotations to one over e.
+    The result is J_l(e)^T e', with the left Jacobian J_l. This product also converts a gradient
+    with respect to small rotations to one with respect to e.
     """
     square = (e * e).sum(-1, keepdim=True)
     cross = torch.linalg.cross(e, rate)
@@ -299,8 +299,8 @@ def _k(square: Tensor) -> Tensor:
     return torch.where(square < _SMALL, series, (1 - sinc) / far)
 
 
-# Compilers turn the functions below into one loop over the batch; the indexing above costs a
-# lookup per number. Also, inductor of torch 2.11 generates C++ for the `gather` in
+# Compilers turn the functions below into one loop over the batch, while the indexing above
+# costs a lookup per number. Also, inductor of torch 2.11 generates C++ for the `gather` in
 # `from_matrix` that does not compile for a batch.
 
 

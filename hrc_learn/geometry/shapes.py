@@ -1,7 +1,7 @@
 """Shapes to draw and to keep clear of, the rigid bodies that carry them, and mesh files.
 
 A body is a trajectory of poses with boxes, capsules or mesh files attached to it. trimesh reads
-the files; of these only triangles, their places in the scene and one plain colour for each
+the files. Only the triangles, their positions in the scene and one plain colour for each
 material are used.
 """
 
@@ -39,7 +39,7 @@ class Capsule:
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A box, axes along those of the body that carries it, or of the base frame."""
+    """A box aligned with the axes of the body that carries it, or of the base frame."""
 
     centre: tuple[float, float, float]
     """[m]"""
@@ -49,7 +49,7 @@ class Box:
     name: str = ""
 
     def edges(self) -> Float[np.ndarray, "12 2 3"]:
-        """Ends of its twelve edges [m]."""
+        """End points of the twelve edges [m]."""
         corners = np.array(list(product((-1, 1), repeat=3)))
         ends = [(a, b) for a, b in combinations(corners, 2) if (a != b).sum() == 1]
         return np.array(ends) * self.half_size + self.centre
@@ -57,7 +57,7 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Line:
-    """A line, or an arrow, drawn into a picture, in the base frame."""
+    """A line or an arrow in the base frame, drawn into a picture."""
 
     start: Float[np.ndarray, "3"]
     """[m]"""
@@ -97,7 +97,7 @@ class Body:
     capsules: tuple[Capsule, ...] = ()
     boxes: tuple[Box, ...] = ()
     meshes: tuple[MeshFile, ...] = ()
-    """Drawn in place of capsules and nameless boxes."""
+    """Meshes that are drawn in place of capsules and nameless boxes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +107,7 @@ class MeshPart:
     vertices: Float[np.ndarray, "vertices 3"]
     """[m]"""
     normals: Float[np.ndarray, "vertices 3"]
-    """Unit normals; where an edge is sharp, each side has vertices of its own."""
+    """Unit normals; at a sharp edge, each side has its own vertices."""
     faces: Int[np.ndarray, "faces 3"]
     """Corners of each triangle, counter-clockwise as seen from outside."""
     colour: Colour | None = None
@@ -134,15 +134,15 @@ class MeshPart:
 
 @cache
 def read_mesh(path: Path) -> tuple[MeshPart, ...]:
-    """Read the shape in a file; it is kept, so the file is read once.
+    """Read the shape in a file; results are cached, so each file is read once.
 
     Args:
         path: A mesh file of a format that trimesh reads, such as COLLADA, STL, OBJ or PLY.
 
     Returns:
-        Its parts, one for each material, in the frame and unit that the file is meant in:
-        metres. COLLADA says its unit; the others have none and are taken as they are.
-        COLLADA's `up_axis` is ignored, as all readers of URDF do.
+        Parts of the shape, one for each material, in the frame of the file [m]. COLLADA files
+        state their unit; the numbers of other formats are taken as metres. COLLADA's `up_axis`
+        is ignored, as in all readers of URDF.
 
     Raises:
         ValueError: The file is of another format, broken, or holds no triangle.
@@ -152,7 +152,7 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
 
     parts = []
     for mesh, colour in _meshes(path):
-        # A micrometre apart is one place: files in text are rounded there.
+        # Merge vertices within a micrometre: text files are rounded to about that.
         mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=6)
         mesh.update_faces(mesh.nondegenerate_faces())
         mesh = smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
@@ -180,9 +180,9 @@ def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
 
 
 def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
-    """Meshes in a file, in metres, at their places in its scene, with their colours."""
+    """Meshes in a file [m], at their positions in its scene, with their colours."""
     try:
-        import collada  # noqa: F401  # which trimesh reads COLLADA with
+        import collada  # noqa: F401  # needed by trimesh for COLLADA
         import trimesh
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
@@ -192,7 +192,7 @@ def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
 
     try:
         scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # its readers raise errors of all kinds at broken files
+    except Exception as error:  # for broken files, its readers raise errors of many types
         raise ValueError(f"{path} is no mesh that trimesh reads: {error}") from error
     unit = str(scene.units or "").partition(" * ")[0]
     scale = float(unit) if unit[:1].isdigit() else 1.0
