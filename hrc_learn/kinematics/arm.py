@@ -1,8 +1,7 @@
 """A robot arm: its kinematics, limits, shape, gripper and inverse kinematics in one object.
 
-Link frames are those of `SerialChain`: the z axis of each is the axis of its joint. They may be
-turned against the frames of the description by a constant, which is taken into account
-wherever something is mounted on a link.
+Link frames are those of `SerialChain`, with z along the joint axis. They may differ from the
+frames of the description by a constant rotation; everything mounted on a link accounts for it.
 """
 
 from __future__ import annotations
@@ -33,29 +32,29 @@ from hrc_learn.kinematics.inverse import (
     unwound,
 )
 
-# Density of aluminium shells with motors and gears in them, a little above water: used for
-# the volume of the capsules where a description gives no masses. A guess.
+# Density of aluminium shells with motors and gears, a little above that of water. A guess: it
+# gives masses from the volumes of capsules where a description has none.
 _DENSITY = 1200.0  # [kg/m^3]
 _STARTS = 200  # random starts from which `postures` searches
-_SCAN = 57  # solutions among which `inverse` chooses where a joint is redundant
+_SCAN = 57  # positions of joint 7 among which `inverse` chooses
 _POSTURE_SCAN = 29  # positions of joint 7 among which `postures` chooses
 _MARGIN = 0.02  # distance of the scan from the limits of joint 7 [rad]
-_FEWEST_JOINTS = 5  # for the position of a tool, its tilt and its turn
-_LARGEST_STEP = 0.5  # joint motion between poses of a path that calls for a wider search [rad]
+_FEWEST_JOINTS = 5  # needed for position, tilt and turn of a tool
+_LARGEST_STEP = 0.5  # larger joint motion between poses of a path starts a wider search [rad]
 
 TCP_OFFSET = 0.1034
-"""Fingertips of the Franka hand, along z of the flange [m]."""
+"""Tool centre point of the Franka hand, along z of the flange [m]."""
 
-# Capsules of the Franka hand in the frame of the tool centre point. The hand is a box of 60 x
-# 200 x 66 mm, which they contain, as they do the open fingers.
+# Capsules of the Franka hand in the frame of the tool centre point. They contain the hand, a
+# box of 60 x 200 x 66 mm, and the open fingers.
 _HAND = (
     ((0.0, -0.08, -0.0704), (0.0, 0.08, -0.0704), 0.05),
     ((0.0, -0.035, -0.01), (0.0, 0.035, -0.01), 0.028),
 )
 
 type NullSpace = Literal["arm angle", "free", "none"]
-"""Self-motion that a full pose of the tool leaves: one arm angle (shoulder, elbow and wrist
-with intersecting axes), another self-motion, or none, as for six joints."""
+"""Self-motion of the arm at a fixed pose of the tool: a change of the arm angle (Franka's
+arms), another motion ("free"), or none, as for six joints."""
 
 
 class UnreachableError(ValueError):
@@ -64,7 +63,7 @@ class UnreachableError(ValueError):
 
 type ClosedForm = Callable[[SerialChain, Pose, Tensor | float], Tensor]
 """Closed-form inverse of a seven-joint arm: all solutions (*batch, 4, 7) within limits for a
-position of joint 7 [rad], then rows of NaN."""
+position of joint 7 [rad], followed by rows of NaN."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +78,15 @@ class FingerJoint:
     opened: float
     """[rad] or [m]; the end of its range that is further from zero."""
     follows: tuple[str, float, float] | None = None
-    """Joint whose position, times the factor and plus the offset, it takes."""
+    """Leading joint, factor and offset: position = factor * leading position + offset."""
     carrier: str | None = None
-    """Joint of the gripper that carries it; None: the hand."""
+    """Joint of the gripper that carries this joint; None: the hand carries it."""
     mount: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    """Frame of the joint at zero in the frame of its carrier, or of the tool."""
+    """Frame of the joint at zero, in the frame of its carrier, or of the tool without one."""
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Unit vector in that frame."""
+    """Unit vector of the axis in the joint's frame."""
     meshes: tuple[MeshFile, ...] = ()
-    """Meshes that it moves."""
+    """Meshes that the joint moves."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,16 +96,16 @@ class ArmShape:
     meshes: Mapping[str, tuple[MeshFile, ...]] = field(default_factory=dict)
     """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
     gripper: tuple[FingerJoint, ...] = ()
-    """Joints of the gripper in the description, carriers first; empty if it ends at the
-    flange."""
+    """Joints of the gripper in the description, carriers first; empty if the description ends
+    at the flange."""
     hand: tuple[MeshFile, ...] = ()
     """Meshes of the hand that carries the fingers, in the frame of the tool."""
     shapes: tuple[tuple[int, Shape], ...] = ()
-    """Number of a link's frame, and a collision shape there; the capsules contain them."""
+    """Collision shapes, each with the number of its link's frame; capsules contain them."""
     masses: tuple[float | None, ...] = ()
     """Masses of base, links, flange and tool [kg], as far as the description gives them."""
     inertia: tuple[Float[np.ndarray, "4 4"] | None, ...] = ()
-    """Their pseudo-inertias (`description.pseudo_inertia`), each in its own frame."""
+    """Pseudo-inertias of these bodies (`description.pseudo_inertia`), each in its own frame."""
 
 
 class Arm(SerialChain):
@@ -200,7 +199,7 @@ class Arm(SerialChain):
 
     @cached_property
     def whole(self) -> CapsuleArm:
-        """Capsules that contain all links and the gripper, with the pairs that may touch.
+        """Capsules that contain all links and the gripper, with pairs that need no check.
 
         Fitted on first use unless they were given; a fit takes a few seconds.
         """
@@ -210,7 +209,7 @@ class Arm(SerialChain):
 
     @cached_property
     def body(self) -> CapsuleArm:
-        """Capsules of the links without the gripper, which tasks move close to objects."""
+        """Capsules of the links alone: tasks move the gripper close to objects on purpose."""
         links = [capsule for capsule in self.whole.capsules if capsule.link <= self.joints]
         return CapsuleArm(self, links, self.whole.overlapping)
 
@@ -218,7 +217,7 @@ class Arm(SerialChain):
     def masses(self) -> tuple[float, ...]:
         """Masses of base, links, flange and tool [kg].
 
-        Where the description has none: 1200 kg/m^3 times the volume of the link's capsules.
+        A missing mass is 1200 kg/m^3 times the volume of the link's capsules.
         """
         count = self.joints + 3
         given = self.shape.masses or (None,) * count
@@ -254,16 +253,16 @@ class Arm(SerialChain):
 
         Args:
             pose: Poses of the tool centre point in the base frame.
-            q7: Position of joint 7 [rad], for arms with a closed-form inverse (Franka's). It
-                settles their redundancy; None leaves it free. Their elbow branch with
-                q4 > -0.467 rad is never returned.
+            q7: Position of joint 7 [rad], for arms with a closed-form inverse (Franka's); None
+                leaves it free. The elbow branch of these arms with q4 > -0.467 rad is never
+                returned.
             near: Configuration to stay close to [rad], one for all poses or one for each.
-            task: Constrained part of the pose; None: that of the arm. Five joints reach few
-                whole poses.
-            samples: Solutions to choose from where a joint is redundant.
+            task: Constrained part of the pose; None: the arm's `task`. Five joints reach few
+                full poses.
+            samples: Positions of joint 7 to try, for arms with a closed-form inverse.
 
         Raises:
-            UnreachableError: No solution was found; names the first such pose.
+            UnreachableError: A pose has no solution; the message names the first such pose.
             ValueError: `q7` was given to an arm without a closed-form inverse.
         """
         if q7 is not None and self._closed_form is None:
@@ -296,10 +295,10 @@ class Arm(SerialChain):
 
         Args:
             pose: Poses of the tool centre point in the base frame.
-            q7: Position of joint 7 [rad]: all branches are returned. None scans joint 7.
-            near: Configuration with another position of joint 7 to try [rad]; the ready posture
-                if None.
-            samples: Positions of joint 7.
+            q7: Position of joint 7 [rad]; None scans its range.
+            near: Configuration whose position of joint 7 is added to the scan [rad]; the ready
+                posture if None.
+            samples: Number of positions of joint 7 in the scan.
 
         Raises:
             ValueError: The arm has no closed-form inverse.
@@ -332,7 +331,7 @@ class Arm(SerialChain):
         """
         limits = self.limits
         if self._closed_form is None:
-            # The same starts each time: an answer depends on its arguments alone.
+            # The same starts in each call: the result depends on the arguments alone.
             rng = torch.Generator().manual_seed(0)
             # A joint that turns by more than one revolution repeats its poses.
             low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
@@ -358,7 +357,7 @@ class Arm(SerialChain):
         task: TaskSpace,
         samples: int,
     ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
-        """Solutions of a path, each close to the one before, and where there is none."""
+        """Solutions of a path, each close to the previous one, and a mask of missing ones."""
         pose = Pose(pose.position.expand(*batch, 3), pose.orientation.expand(*batch, 4))
         angles = None if q7 is None else as_tensor(q7, pose.position).expand(batch)
         before, path, missing = self.ready.to(pose.position), [], []
@@ -382,7 +381,7 @@ class Arm(SerialChain):
     def _nearest(
         self, pose: Pose, q7: ArrayLike | None, near: Tensor, task: TaskSpace, samples: int
     ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
-        """Solution closest to a configuration, for each pose by itself, and where none is."""
+        """Solutions closest to a configuration, for each pose, and a mask of missing ones."""
         if self._closed_form is None or task != self.task:
             solution = solve_inverse(self, pose, near, task=task)
             return solution.position, ~solution.found
@@ -395,21 +394,21 @@ class Arm(SerialChain):
     def with_hand(self, size: float = 1.0, mount: Float[Tensor, "4 4"] | None = None) -> Arm:
         """The same arm with the Franka hand in place of its gripper.
 
-        An arm of fewer than six joints brings it to the nearest pose of its tool.
+        With fewer than six joints, the task of the new arm is "nearest pose".
 
         Args:
             size: Size of the hand relative to the Franka hand.
-            mount: Frame of the hand in that of the flange, its z axis the approach; None: at
-                the flange, along the approach of the arm's own tool.
+            mount: Frame of the hand in the frame of the flange, with z in the direction of
+                approach; None: at the flange, in the direction of the arm's own tool.
 
         Raises:
-            ValueError: The arm has too few joints for a position of its tool and its tilt.
+            ValueError: The arm has fewer than five joints.
         """
         n = self.joints
         if n < _FEWEST_JOINTS:
             raise ValueError(
-                f"{self.name} has {n} joints, but grasping and placing need the position of "
-                f"the tool, its tilt and its turn, for which it takes {_FEWEST_JOINTS}."
+                f"{self.name} has {n} joints, but grasping and placing need position, tilt and "
+                f"turn of the tool: at least {_FEWEST_JOINTS} joints."
             )
         flange, tcp = self.flange, self.tcp.clone()
         links = [capsule for capsule in self.whole.capsules if capsule.link <= n]
@@ -440,7 +439,7 @@ class Arm(SerialChain):
 
 
 def _behind(capsule: LinkCapsule, hand: Float[Tensor, "4 4"]) -> LinkCapsule | None:
-    """Part of a capsule behind the base of a hand in the frame of its link; None: no part."""
+    """Part of a capsule behind the base of a hand, in the link's frame; None: no part."""
     axis, origin = hand[:3, 2], hand[:3, 3]
     ends = torch.tensor([capsule.start, capsule.end], dtype=hand.dtype)
     ahead = (ends - origin) @ axis
@@ -455,7 +454,7 @@ def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:
     """Capsules of the Franka hand and its fingers, mounted on the frame of the tool.
 
     Args:
-        link: Number of that frame.
+        link: Number of the tool's frame.
         size: Size relative to the Franka hand.
     """
     return link_capsules(
@@ -467,8 +466,8 @@ def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:
 def comfortable_posture(arm: Arm, pose: Pose) -> Float[Tensor, " joints"]:
     """Inverse-kinematics solution furthest from singularities and joint limits [rad].
 
-    An arm that servoes around a pose keeps its posture but for small motions, so the posture in
-    which it arrives decides whether it meets a limit there.
+    An arm that servoes around a pose hardly changes its posture, so its posture on arrival
+    decides whether it meets a limit there.
 
     Args:
         arm: The arm.

@@ -1,9 +1,8 @@
-"""Capsules around the links of an arm from a file, and the pairs of links that may touch.
+"""Capsules around the links of an arm from a file, and pairs of links that need no check.
 
-What is contained are the convex hulls of a link's collision shapes, which is what MuJoCo takes
-for contacts as well. A link is cut into up to three parts by planes across one of its principal
-axes where this saves volume; each part of the hulls lies in one capsule.
-tools/fit_capsules.py fits more closely, for the registered arms.
+Capsules contain the convex hulls of a link's collision shapes, which MuJoCo uses for contacts
+as well. Where it saves volume, planes across a principal axis cut a link into two or three
+parts with one capsule each. For registered arms, tools/fit_capsules.py fits more closely.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.description import Shape
 
-# Capsules hold every point with this much to spare [m]: far above rounding.
+# Margin with which capsules contain every point [m], far above rounding errors.
 _SLACK = 1e-6
-# One more capsule for a link has to save this part of the volume.
+# Fraction of the volume that one more capsule for a link must save.
 _WORTH = 0.2
 # Cuts of a link, as fractions of its extent along an axis.
 _CUTS = ((), (0.35,), (0.5,), (0.65,), (0.2, 0.8), (0.3, 0.7))
-# Corners of the prism around a round shape: 2 % wider at the corners.
+# Corners of the prism around a cylinder, which is 2 % wider there.
 _CORNERS = 16
 # Steps towards the smallest circle around points (Badoiu and Clarkson 2003).
 _CIRCLE_STEPS = 32
 _SEED, _POSTURES = 0, 2000
-# Radius of links of unknown shape [m], at most this part of the length of the arm. Chosen: that
-# of a large arm's forearm.
+# Radius of links of unknown shape [m], and its largest fraction of the arm's length. The radius
+# is chosen as that of a large arm's forearm.
 _BARE_RADIUS, _BARE_FRACTION = 0.045, 0.06
-# Pairs of links that come no nearer in any sampled posture are left out [m].
+# Pairs of links that stay farther apart than this in all sampled postures are ignored [m].
 _FAR = 0.1
-# Fractions of postures in which capsules overlap: always; and more often than tells anything,
-# for links with one link between them.
+# Pairs of links that overlap in a larger fraction of postures are ignored, too; the second
+# value is for links with one link between them.
 _ALWAYS, _MOST = 0.99, 0.5
 
 type _Capsule = tuple[np.ndarray, np.ndarray, float]
@@ -52,14 +51,14 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
     """Fit capsules around the shapes on an arm's links.
 
     Like MoveIt's setup assistant, this ignores pairs of links that are neighbours, that overlap
-    in all random postures, or that never come near each other in any. Capsules are rounder than
-    links: around a short, wide link they overlap those of the link after the next. Such a pair
-    is ignored as well if it overlaps in most postures.
+    in nearly all random postures, or that never come near each other. Capsules are rounder than
+    links: those of a short, wide link overlap those of the next link but one. Such a pair is
+    ignored as well if it overlaps in most postures.
 
     Args:
         chain: The arm.
-        shapes: Number of a link's frame, and a shape there. A link without any gets a capsule
-            from its own frame to the next.
+        shapes: Shapes, each with the number of its link's frame. A link without a shape gets a
+            capsule from its own frame to the next.
     """
     hulls: dict[int, list[Hull]] = defaultdict(list)
     capsules: list[LinkCapsule] = []
@@ -84,7 +83,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
     capsules += [
         link_capsule(link, np.zeros(3), step, radius)
         for link, (step, length) in enumerate(zip(steps, lengths, strict=True))
-        # A step shorter than that is inside its neighbours.
+        # A link shorter than this radius lies inside its neighbours.
         if link not in shown and (length > radius or not shown)
     ]
     return CapsuleArm(chain, capsules, _left_out(chain, capsules))
@@ -111,7 +110,7 @@ class Hull:
 
 
 def hull_of(shape: Shape) -> Hull:
-    """Convex hull of a shape, of a round one that of a prism around it.
+    """Convex hull of a shape, or of a prism around a round shape.
 
     Raises:
         ModuleNotFoundError: SciPy is not installed.
@@ -128,7 +127,7 @@ def hull_of(shape: Shape) -> Hull:
     points = shape_points(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
     try:
         hull = ConvexHull(points)
-    except QhullError:  # flat: every pair of points may be an edge, of the few there are
+    except QhullError:  # flat: any two of the few points may be an edge
         return Hull(points, points[list(combinations(range(min(len(points), 200)), 2))])
     faces = hull.simplices
     pairs = np.unique(np.sort(np.concatenate([faces[:, [i, i - 1]] for i in range(3)])), axis=0)
@@ -189,7 +188,7 @@ def _smallest_capsule(points: Float[np.ndarray, "points 3"]) -> _Capsule:
             centre = centre + (furthest - centre) / (k + 2)
         distance = np.linalg.norm(flat - centre, axis=1)
         radius = float(distance.max()) + _SLACK
-        # Every point must be no further out than the round end there.
+        # No point may protrude from the round ends.
         bulge = np.sqrt(radius**2 - distance**2)
         low, high = (along + bulge).min(), (along - bulge).max()
         if low > high:
@@ -218,10 +217,10 @@ def link_capsule(link: int, start: np.ndarray, end: np.ndarray, radius: float) -
 def _left_out(
     chain: SerialChain, capsules: Sequence[LinkCapsule]
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs of links that are no neighbours and yet need no watching."""
+    """Pairs of links, other than neighbours, that need no check."""
     last = len(chain.joint_names)
     links = sorted({capsule.link for capsule in capsules})
-    # The last link, the flange and the tool are one body, and the link before its neighbour.
+    # The last link, the flange and the tool are one body; the link before is its neighbour.
     pairs = {
         (i, k) for i, k in combinations(links, 2) if k > last and i >= last - 1 and k - i > 1
     }

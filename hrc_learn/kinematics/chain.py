@@ -37,14 +37,14 @@ def transform_and_jacobian(
     """Transform (R | p) of the tool centre point and its geometric Jacobian, written out.
 
     Args:
-        q: Joint positions [rad], of sliding joints [m].
-        mounts: Frame of each joint at zero in the frame of the joint before (the base).
+        q: Joint positions [rad, or m for sliding joints].
+        mounts: Frame of each joint at zero, in the frame of the previous joint (or the base).
         tip: Tool centre point in the frame of the last joint.
         sliding: Mask of joints that move along their z axis; the others, by default all, turn
             about it.
 
     Returns:
-        Both with the batch last in memory.
+        Transform and Jacobian, with the batch dimensions last in memory.
     """
     zero, one = torch.zeros_like(q[..., 0]), torch.ones_like(q[..., 0])
     frame = [[one if i == j else zero for j in range(4)] for i in range(3)]
@@ -81,7 +81,7 @@ def _product(frame: list[_Row], constant: Sequence[Sequence[float]]) -> list[_Ro
 
 
 def _combination(factors: Sequence[float], terms: _Row) -> Tensor:
-    """Sum of factor times term, without those that are zero or one."""
+    """Sum of factors times terms; products with zeros and ones are not computed."""
     products = [
         term if factor == 1 else factor * term
         for factor, term in zip(factors, terms, strict=True)
@@ -145,7 +145,7 @@ class SerialChain:
 
         Args:
             joint_names: Names, from the base to the tip.
-            mounts: Frame of each joint at zero, in the frame of the joint before (the base).
+            mounts: Frame of each joint at zero, in the frame of the previous joint or the base.
             flange: Flange in the frame of the last joint.
             tcp: Tool centre point in the frame of the flange.
             limits: Joint limits, in the same order.
@@ -153,7 +153,7 @@ class SerialChain:
             kinds: Kind of each joint; all are revolute if None.
 
         Raises:
-            ValueError: The number of names, mounts, limits, kinds and joints of `ready` differ.
+            ValueError: Numbers of names, mounts, limits, kinds and joints of `ready` differ.
         """
         kinds = kinds or ("revolute",) * len(joint_names)
         counts = [len(joint_names), len(mounts), len(limits.lower), len(ready), len(kinds)]
@@ -173,8 +173,8 @@ class SerialChain:
         slides = torch.tensor(self._slides)[:, None, None]
         x, y, z, _ = self.mounts.unbind(-1)
         zero = torch.zeros_like(x)
-        # mount Rz(q) = fixed + cosine cos(q) + sine sin(q), column by column; of a joint that
-        # slides, mount Tz(q) = fixed + slide q.
+        # mount Rz(q) = fixed + cosine cos(q) + sine sin(q), column by column; for a sliding
+        # joint, mount Tz(q) = fixed + slide q.
         turned = torch.stack([x, y, zero, zero], dim=-1).masked_fill(slides, 0.0)
         self._cosine = Constant(turned)
         self._sine = Constant(torch.stack([turned[..., 1], -turned[..., 0], zero, zero], -1))
@@ -217,11 +217,11 @@ class SerialChain:
 
     @property
     def elbow(self) -> int:
-        """Number of the joint at the elbow, from 1: the middle one, of two the nearer one."""
+        """Number of the elbow's joint, from 1: the middle joint, or the first of two."""
         return (len(self.joint_names) + 1) // 2
 
     def joint_positions(self, q: ArrayLike) -> Float[Tensor, "*batch joints"]:
-        """Joint positions as a tensor, their number checked.
+        """Convert joint positions to a tensor and check their number.
 
         Args:
             q: Joint positions [rad].
@@ -261,7 +261,7 @@ class SerialChain:
         return Pose.from_matrix(self.link_frames(q))
 
     def link_frames(self, q: ArrayLike) -> Float[Tensor, "*batch links 3 4"]:
-        """`link_poses` left as matrices (R | p): no quaternion made.
+        """`link_poses` as matrices (R | p), without conversion to quaternions.
 
         Args:
             q: Joint positions [rad].
@@ -272,7 +272,7 @@ class SerialChain:
         return torch.stack([*frames, *tips], dim=-3)
 
     def joint_origins(self, q: ArrayLike) -> Float[Tensor, "*batch joints 3"]:
-        """Origins of the joint frames in the base frame [m]: `link_poses` without the turns.
+        """Origins of the joint frames in the base frame [m], without their orientations.
 
         Args:
             q: Joint positions [rad].
@@ -310,7 +310,7 @@ class SerialChain:
     def transform_and_jacobian(
         self, q: ArrayLike
     ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
-        """`forward_and_jacobian` with the pose left as a matrix (R | p): no quaternion made."""
+        """`forward_and_jacobian` with the pose as a matrix (R | p) instead of a quaternion."""
         q = self.joint_positions(q)
         if torch.compiler.is_compiling():
             return transform_and_jacobian(
@@ -321,7 +321,7 @@ class SerialChain:
         return tip, self._screw_jacobian(frames, tip)
 
     def joint_jacobian(self, q: ArrayLike, joint: int) -> Float[Tensor, "*batch 6 joints"]:
-        """Geometric Jacobian of the frame of one joint, to pull the arm there.
+        """Geometric Jacobian of the frame of one joint, for example to pull the elbow.
 
         Args:
             q: Joint positions [rad].

@@ -24,14 +24,14 @@ from hrc_learn.geometry import Capsule
 from hrc_learn.geometry.numerics import Constant, safe_norm
 from hrc_learn.kinematics.chain import SerialChain
 
-# Rounds of the search for the point of a segment nearest to a box, in each of which 31 points
-# tell the part of what the one before told: 1e-6 of its length.
+# Search for the point of a segment nearest to a box: in each round, 31 points select one of 32
+# parts of the interval, so the last interval is 1e-6 of the segment's length.
 _PARTS, _ROUNDS = 32, 4
 _TRIED = [
     Constant(torch.arange(1, _PARTS, dtype=torch.float64) / _PARTS ** (k + 1))
     for k in range(_ROUNDS)
 ]
-# Rounding error of a bound on a distance [m]: that of float32 within reach.
+# Rounding error of a bound on a distance [m], for float32 and distances within reach.
 _ROUNDING = 1e-6
 
 
@@ -55,7 +55,7 @@ def link_capsules(rows: Iterable[Sequence[Any]]) -> tuple[LinkCapsule, ...]:
 class CapsuleArm:
     """Distances of an arm's capsules from each other and from obstacles.
 
-    Signed: negative is the depth to which two capsules overlap. Links are numbered as
+    A negative distance is the depth to which two capsules overlap. Links are numbered as
     `SerialChain.link_poses` lists their frames, from 1; 0 is the base.
 
     Attributes:
@@ -103,7 +103,7 @@ class CapsuleArm:
         self._moving, self._moving_radius = Constant(moving), Constant(self.radius[moving])
 
     def with_capsules(self, more: Sequence[LinkCapsule]) -> CapsuleArm:
-        """The same arm with further capsules, such as of what is mounted on its hand."""
+        """The same arm with additional capsules, such as those of an object on its hand."""
         return CapsuleArm(self.chain, (*self.capsules, *more), self.overlapping)
 
     def segments(
@@ -115,7 +115,7 @@ class CapsuleArm:
 
         Args:
             q: Joint positions [rad].
-            frames: `SerialChain.link_frames` there, where they are known.
+            frames: `SerialChain.link_frames` at q, if already computed.
         """
         if frames is None:
             frames = self.chain.link_frames(q)
@@ -133,7 +133,7 @@ class CapsuleArm:
 
         Args:
             q: Joint positions [rad].
-            frames: `SerialChain.link_frames` there, where they are known.
+            frames: `SerialChain.link_frames` at q, if already computed.
         """
         ends = self.segments(q, frames)
         first, second = (ends.index_select(-3, i.like(q)) for i in (self._first, self._second))
@@ -141,7 +141,7 @@ class CapsuleArm:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Numbers of the two capsules of each pair."""
+        """Numbers of the two capsules of each pair that should not touch."""
         return [(int(i), int(k)) for i, k in self._pairs.mT]
 
     def self_distance(
@@ -149,11 +149,11 @@ class CapsuleArm:
         q: Float[Tensor, "*batch joints"],
         frames: Float[Tensor, "*batch links 3 4"] | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """Distance of the two nearest capsules that should not touch [m]; infinite without any.
+        """Smallest of `pair_distances` [m]; infinite if there are no pairs.
 
         Args:
             q: Joint positions [rad].
-            frames: `SerialChain.link_frames` there, where they are known.
+            frames: `SerialChain.link_frames` at q, if already computed.
         """
         if self._pairs.numel() == 0:
             return torch.full_like(q[..., 0], torch.inf)
@@ -168,15 +168,15 @@ class CapsuleArm:
     ) -> Float[Tensor, "*batch"]:
         """Distance of the nearest moving link from boxes along the base axes [m].
 
-        Inside a box it counts from the segment, not from the nearest wall. Pairs of a link and
-        a box that are too far apart to be the nearest are left out by a branch on the data,
-        which neither compiles nor maps over batches.
+        A capsule whose axis enters a box counts with minus its radius, not with its depth.
+        Pairs of a link and a box that are too far apart to be the nearest are skipped by a
+        branch on the data, so this neither compiles nor works under `vmap`.
 
         Args:
             q: Joint position [rad].
             centre: Centre of the box, or of each of several boxes [m].
             half_size: Half of its edges [m].
-            frames: `SerialChain.link_frames` there, where they are known.
+            frames: `SerialChain.link_frames` at q, if already computed.
         """
         ends = self.segments(q, frames).index_select(-3, self._moving.like(q))
         batch, ends = ends.shape[:-3], ends.reshape(-1, *ends.shape[-3:])
@@ -185,11 +185,11 @@ class CapsuleArm:
         start, end = ends.unbind(-2)
         offset = ((start + end) / 2).unsqueeze(-2) - centre
         outside = offset - offset.clamp(-half_size, half_size)
-        # Nothing of a capsule is further from its middle than half of its axis and its radius.
+        # No point of a capsule is further from its middle than half its axis plus its radius.
         middle = torch.linalg.vector_norm(outside, dim=-1) - radius.unsqueeze(-1)
         half_axis = torch.linalg.vector_norm(end - start, dim=-1, keepdim=True) / 2
         least = middle.amin((-2, -1), keepdim=True) + _ROUNDING
-        # Written so that what is not a number stays.
+        # Written so that NaN stays.
         near = ~(middle - half_axis > least)
         posture, link, box = near.nonzero(as_tuple=True)
         distance = segment_box_distance(ends[posture, link], centre[box], half_size[box])
@@ -291,14 +291,14 @@ class GraspedBox:
 class Separation:
     """Distances of an arm's C capsules from a person's H capsules.
 
-    What the arm holds is one more row, the last, so C counts it.
+    An object held by the arm adds one row, the last, which C includes.
     """
 
     distance: Float[Tensor, "*batch C H"]
     """Between the surfaces; negative is the depth to which two capsules overlap [m]."""
     direction: Float[Tensor, "*batch C H 3"]
-    """Unit vector from the arm to the person; zero where the axes of two capsules meet, or the
-    axis of one a box: there no direction leads out."""
+    """Unit vector from the arm to the person; zero, as undefined, where the axes of two
+    capsules meet or the axis of the person's capsule enters the held box."""
     fraction: Float[Tensor, "*batch C H"]
     """Nearest point on the axis of the person's capsule, 0 to 1 from its first end."""
     arm_point: Float[Tensor, "*batch C H 3"]
@@ -331,8 +331,8 @@ class Separation:
         """Some rows of the gradient [m/rad].
 
         Args:
-            pairs: Numbers c H + h of the pairs of a capsule c of the arm and h of the person,
-                the same for all of a batch or of each element its own.
+            pairs: Numbers c H + h of pairs of capsules (c of the arm, h of the person), either
+                the same for the whole batch or separate ones for each element.
         """
         index = pairs.unsqueeze(-1).expand(*self.direction.shape[:-3], -1, 3)
         direction, point = (
@@ -380,11 +380,12 @@ def separation(
     radius: Float[Tensor, "*#batch H"],
     grasped: GraspedBox | None = None,
 ) -> Separation:
-    """Distances of all of an arm from all of a person.
+    """Distances of all capsules of an arm from all capsules of a person.
 
-    Nearest points of two segments after Ericson (2005), section 5.1.9; those of a segment and a
-    box by bisection. A box is exact as long as no axis of the person's capsules enters it.
-    Where several points are equally near, the gradient is that of one of them.
+    Nearest points of two segments follow Ericson (2005), section 5.1.9; those of a segment and
+    a box are found by interval search. Distances from a held box are exact unless the axis of a
+    person's capsule enters it. Where several points are equally near, the gradient is that of
+    one of them.
 
     Args:
         arm: The arm's capsules.
@@ -434,18 +435,18 @@ def _moved(links: tuple[int, ...], joints: int) -> Bool[Tensor, "links joints"]:
 
 
 def _between(segment: Tensor, fraction: Tensor) -> Tensor:
-    """Point of a segment."""
+    """Point at a fraction of a segment."""
     first, second = segment.unbind(-2)
     return first + fraction.unsqueeze(-1) * (second - first)
 
 
 def _stacked(points: Tensor, last: Tensor) -> Tensor:
-    """(*batch, C, H, 3) and one more row (*batch, H, 3)."""
+    """Append one row (*batch, H, 3) to points (*batch, C, H, 3)."""
     return torch.cat([points, last[..., None, :, :].expand(*points.shape[:-3], 1, -1, -1)], -3)
 
 
 def _nearest_on_box(tool: Tensor, ends: Tensor, box: GraspedBox) -> tuple[Tensor, Tensor]:
-    """Points of a held box nearest to segments, and where on these the nearest points lie."""
+    """Points of a held box nearest to segments, and nearest points of these as fractions."""
     R, p = tool[..., :3], tool[..., None, :, 3]
     local = (ends - p[..., None, :]) @ R[..., None, :, :]
     centre, half_size = local.new_tensor(box.centre), local.new_tensor(box.half_size)

@@ -1,4 +1,4 @@
-"""Arms made of descriptions in URDF and MJCF files: links numbered from base to tool."""
+"""Arms from descriptions in URDF and MJCF files, with links numbered from base to tool."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _FINGER_POSTURES = 5
 
 
 def read_description(path: Path) -> Description:
-    """Read a robot description, URDF or MJCF by its first element.
+    """Read a robot description. Its first element shows if it is URDF or MJCF.
 
     Raises:
-        ValueError: The file is neither, or describes no tree of links.
+        ValueError: The file is neither URDF nor MJCF, or its links form no tree.
         FileNotFoundError: There is no such file.
     """
     if not path.is_file():
@@ -72,9 +72,9 @@ def arm_from_file(
 ) -> Arm:
     """An arm from a URDF or MJCF file.
 
-    What hangs on moving joints beyond the last joint of the arm is the gripper, and belongs to
-    the tool; a hand that only carries the fingers belongs there as well. What hangs on moving
-    joints before is left out.
+    Links that moving joints carry beyond the last joint of the arm are the gripper and belong
+    to the tool, as does a hand that only carries the fingers. Links on moving joints that
+    branch off earlier are left out.
 
     Args:
         path: The file.
@@ -83,8 +83,8 @@ def arm_from_file(
         name: Name of the arm; None: the stem of the file.
         tool: Tool centre point in the frame of the flange, z in the direction of approach;
             None: the flange itself.
-        limits: Limits that replace or complete those of the file; None: the TOML file named
-            after it, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
+        limits: Limits that replace or complete those of the file; None: the TOML file with the
+            same stem, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
         ready: A comfortable posture [rad, m]; None: the file's `home`, or a posture near the
             middle of the joints' ranges and far from singularities.
         body: Capsules and overlapping links; None fits capsules on first use.
@@ -147,7 +147,7 @@ def _ready(
     limits: JointLimits,
     given: Sequence[float] | None,
 ) -> Float[Tensor, " joints"] | None:
-    """Ready posture as given, or as the file has it [rad, m]; None if neither is there."""
+    """Ready posture [rad, m]: the given one, or the file's `home`; None without either."""
     home = description.home or {}
     if given is None:
         if any(name not in home for name in names):
@@ -155,8 +155,8 @@ def _ready(
         ready = torch.tensor([home[name] for name in names], dtype=torch.float64)
         if not limits.contain(ready):
             warnings.warn(
-                f"{description.path}: the posture `home` is outside the limits of joints, and "
-                "was moved to them",
+                f"{description.path}: the posture `home` is outside the limits of its joints "
+                "and was moved to them",
                 stacklevel=3,
             )
         return ready.clamp(limits.lower, limits.upper)
@@ -175,7 +175,7 @@ def _ready(
 def _places(
     description: Description, base: str, moving: Sequence[Joint], base_turn: float
 ) -> tuple[dict[str, tuple[int, Transform]], list[Transform]]:
-    """Number of each link's frame and its pose there, and the mounts of the joints."""
+    """Number of the frame that carries each link, its pose there, and mounts of the joints."""
     turned = motion("revolute", np.array([0.0, 0.0, 1.0]), base_turn)
     subtree = description.rigid_subtree(base)
     places = {name: (0, turned @ pose) for name, pose in subtree.items()}
@@ -198,7 +198,7 @@ def _shape(
 
     Args:
         description: The tree.
-        places: Number of each link's frame, and its pose there.
+        places: Number of the frame that carries each link, and the link's pose there.
         path: Joints from base to tip.
         to_tool: Frame of the last joint in the frame of the tool.
     """
@@ -223,7 +223,7 @@ def _shape(
     bodies = dict(places)
     gripper = []
     # A joint, its parent's pose in the frame of the tool with the gripper open, the joint that
-    # carries the parent, and the parent's pose there.
+    # carries the parent, and the parent's pose in the frame of that joint or of the tool.
     ahead: list[tuple[Joint, Transform, str | None, Transform]] = [
         (joint, at, None, at)
         for joint in roots
@@ -258,7 +258,7 @@ def _shape(
 
 
 def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transform]]:
-    """A joint of the gripper, and poses of its child in the frame of the tool as it opens.
+    """A joint of the gripper, and its child's poses in the tool's frame as the joint opens.
 
     Args:
         joint: The joint.
@@ -282,7 +282,7 @@ def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transfor
 def _meshes(
     description: Description, places: dict[str, tuple[int, Transform]], last: int
 ) -> dict[str, tuple[MeshFile, ...]]:
-    """Meshes by the name of the link that carries them: link0, link1, ...; no gripper's."""
+    """Meshes, by the names of the links that carry them (link0, ...), without the gripper's."""
     found: dict[str, tuple[MeshFile, ...]] = {}
     for link, (number, place) in places.items():
         for shape in description.links[link].visuals:
@@ -304,7 +304,7 @@ def _meshes(
 
 
 def _touching(description: Description, link: str) -> tuple[Shape, ...]:
-    """Shapes of a link for contacts; those that are drawn where it has no others."""
+    """Collision shapes of a link, or its visual shapes if it has none."""
     found = description.links[link]
     return found.collisions or found.visuals
 
@@ -324,7 +324,7 @@ def _inertias(
         if link.inertia is not None:
             more, before = pose @ link.inertia @ pose.T, inertia[number]
             inertia[number] = more if before is None else before + more
-    # Nothing is mounted on the flange's own frame; without a gripper, nor on the tool's.
+    # The frame of the flange carries no bodies; that of the tool none without a gripper.
     for number in {last + 1, last + 2} - {number for number, _ in bodies.values()}:
         masses[number], inertia[number] = 0.0, np.zeros((4, 4))
     return {"masses": tuple(masses), "inertia": tuple(inertia)}

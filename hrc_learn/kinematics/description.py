@@ -1,8 +1,8 @@
 """Robot descriptions: a tree of links and joints, checked once for all file formats.
 
-Readers of URDF and MJCF make links and joints of a file. `Description` refuses what is no tree
-of rigid bodies, tells the joints of a gripper from those of an arm, and finds the tool frame.
-All transforms are homogeneous, float64, with the numbers of the file.
+Readers of URDF and MJCF turn a file into links and joints. `Description` refuses anything but a
+tree of rigid bodies, separates the joints of a gripper from those of the arm, and finds the
+tool frame. All transforms are homogeneous and float64, with the numbers of the file.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ Transform = Float[np.ndarray, "4 4"]
 
 MOVING = ("revolute", "continuous", "prismatic")
 _KINDS = (*MOVING, "fixed", "floating", "planar", "ball", "free")
-# No parts of a robot are further apart [m]; a file in millimetres gives some hundreds.
+# Larger distances between parts are errors [m], for example lengths in millimetres.
 _FURTHEST = 100.0
 
-# Names of a gripper's joints and of the links that they move, and words which show that such a
-# joint turns the whole gripper, or that the link is fixed to the arm.
+# Words in the names of a gripper's joints and of the links that they move; then words which
+# show that the joint turns the whole gripper instead, or that the link is fixed to the arm.
 _GRIPPER_JOINT = re.compile("gripper|jaw|finger|knuckle|thumb|claw")
 _FINGER_LINK = re.compile("jaw|finger|knuckle|thumb|claw")
 _ARM_JOINT = re.compile("wrist|elbow|shoulder|forearm|roll|pitch|yaw|rotat|swivel|turn")
 _FIXED_LINK = re.compile("fixed|static")
-# Words in the names of tool frames, the likeliest first, and in those of frames that are none.
+# Words in the names of tool frames, the likeliest first, and of frames that are no tool frames.
 _TOOL_FRAMES = (r"\btcp\b", r"tool", r"grasp|pinch", r"\bee|effector", r"gripper", r"hand|tip")
 _NO_TOOL_FRAME = re.compile(
     r"camera|optical|depth|laser|lidar|sensor|accelerometer|marker|safety|motor|finger|knuckle"
@@ -45,7 +45,7 @@ class Shape:
     """A mesh, box, cylinder, sphere or capsule on a link."""
 
     pose: Transform
-    """In the frame of the link; a cylinder or capsule lies along z, centred."""
+    """Pose in the frame of the link; cylinders and capsules lie along z, centred."""
     kind: str
     """"mesh", "box", "cylinder", "sphere" or "capsule"."""
     size: tuple[float, ...] = ()
@@ -62,10 +62,11 @@ def pseudo_inertia(
     centre: Sequence[float] | Float[np.ndarray, "3"],
     inertia: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """Pseudo-inertia of a body: [[S, m c], [m c^T, m]], S its second moments about the origin.
+    """Pseudo-inertia P = [[S, m c], [m c^T, m]] of a body, S its second moments about zero.
 
-    Those of bodies that move together add up; in a frame T it is T P T^T (Wensing et al. 2018,
-    "Linear matrix inequalities for physically consistent inertial parameter identification").
+    Pseudo-inertias of bodies that move together add up. In a frame in which the body's frame
+    has the pose T, P becomes T P T^T (Wensing et al. 2018, "Linear matrix inequalities for
+    physically consistent inertial parameter identification").
 
     Args:
         mass: [kg]
@@ -95,7 +96,7 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Joint:
-    """A joint; its child's frame is `origin`, then the motion about or along `axis`."""
+    """A joint. Its child's frame is `origin` followed by the motion about or along `axis`."""
 
     name: str
     kind: str
@@ -113,7 +114,7 @@ class Joint:
     effort: float | None = None
     """[N m] or [N]"""
     follows: tuple[str, float, float] | None = None
-    """Joint that it mimics, with factor and offset; no name if it is held at the offset."""
+    """Mimicked joint, factor and offset; the name is empty if the offset holds the joint."""
 
     @property
     def is_finger(self) -> bool:
@@ -142,7 +143,7 @@ class Description:
         path: File of the description.
         links: Links by name.
         joints: Joints, in the order of the file.
-        home: Positions of joints by name [rad, m] of a posture that the file names, or None.
+        home: Joint positions of the file's posture `home` by joint name [rad, m], or None.
     """
 
     def __init__(
@@ -159,7 +160,7 @@ class Description:
                 has two parents, joints form a cycle, or joints are absurdly far apart.
         """
         if not links:
-            raise ValueError(f"{path} has no links: is it complete, and made from its xacro?")
+            raise ValueError(f"{path} has no links: is it complete, and is its xacro expanded?")
         self.path, self.joints, self.home = path, tuple(joints), home
         self.links = {link.name: link for link in links}
         self._below: dict[str, list[Joint]] = defaultdict(list)
@@ -213,7 +214,7 @@ class Description:
         return [name for name in self.links if name not in self._above]
 
     def below(self, link: str) -> Sequence[Joint]:
-        """Joints whose parent a link is."""
+        """Joints that have a link as their parent."""
         return self._below.get(link, ())
 
     def above(self, link: str) -> Joint | None:
@@ -223,12 +224,12 @@ class Description:
     def subtree(self, link: str) -> list[str]:
         """A link and all that it carries, parents first."""
         found = [link]
-        for name in found:  # which grows on the way
+        for name in found:  # grows during the loop
             found += [joint.child for joint in self.below(name)]
         return found
 
     def rigid_subtree(self, link: str) -> dict[str, Transform]:
-        """A link and all that is fixed to it, with poses in its frame."""
+        """A link and all links fixed to it, with their poses in its frame."""
         found, ahead = {link: np.eye(4)}, [link]
         for name in ahead:
             for joint in self.below(name):
@@ -238,7 +239,7 @@ class Description:
         return found
 
     def path_between(self, base: str | None, tip: str | None) -> tuple[str, str, list[Joint]]:
-        """Joints from one link to another, with the names of both.
+        """Names of base and tip, and the joints between them.
 
         Args:
             base: A link; None: the root.
@@ -246,8 +247,9 @@ class Description:
                 joints of the gripper are left out with a warning.
 
         Raises:
-            ValueError: There is no such link, no way between them that moves, several roots or
-                ends to choose from, or a joint of a kind that no serial chain has.
+            ValueError: A link does not exist, no joint moves between base and tip, there are
+                several roots or ends to choose from, or a joint is of a kind that no serial
+                chain has.
         """
         for role, name in (("base", base), ("tip", tip)):
             if name is not None and name not in self.links:
@@ -278,8 +280,8 @@ class Description:
         self._check_path(base, tip, joints)
         if wrong := [joint.name for joint in joints if joint in fingers]:
             warnings.warn(
-                f"{self.path}: joint {wrong[0]} looks like a gripper's, but is taken for the "
-                f"arm's, since the tip {tip!r} lies behind it",
+                f"{self.path}: joint {wrong[0]} looks like a gripper's, but is used as the "
+                f"arm's, since the tip {tip!r} lies beyond it",
                 stacklevel=2,
             )
         return base, tip, joints
@@ -323,16 +325,16 @@ class Description:
     def _ends(self, base: str) -> tuple[list[_End], list[Joint]]:
         """Bodies at which an arm may end, and the first joints of grippers.
 
-        A joint is a gripper's by its name, or if several branch off where the arm ends, each
-        shorter than the arm.
+        A joint belongs to a gripper by its name, or if several joints branch off where the arm
+        ends, each with a shorter chain than the arm.
         """
-        height: dict[str, int] = {}  # joints in a row that a link carries
+        height: dict[str, int] = {}  # largest number of joints in a row beyond a link
         for link in reversed(self.subtree(base)):
             height[link] = max((_length(j, height) for j in self.below(link)), default=0)
         ends: list[_End] = []
         fingers: list[Joint] = []
         bodies = [(base, 0)]
-        for root, count in bodies:  # which grows on the way
+        for root, count in bodies:  # grows during the loop
             body = self.rigid_subtree(root)
             moving = [j for link in body for j in self.below(link) if j.kind != "fixed"]
             spread = len(moving) > 1 and all(_length(j, height) < count for j in moving)
@@ -356,14 +358,14 @@ def _length(joint: Joint, height: dict[str, int]) -> int:
 
 
 def _unlikely(frame: str) -> int:
-    """Rank of a link among those that may be the tool frame, from 0."""
+    """Rank of a link among those that may be the tool frame; 0 is the likeliest."""
     words = _words(frame)
     ranks = [rank for rank, word in enumerate(_TOOL_FRAMES) if re.search(word, words)]
     return min(ranks, default=len(_TOOL_FRAMES))
 
 
 def _words(name: str) -> str:
-    """A name as words of small letters."""
+    """A name as words in lower case."""
     return re.sub("[^a-z]+", " ", name.lower())
 
 
@@ -372,7 +374,7 @@ def turn_to(axis: Float[np.ndarray, "3"]) -> Transform:
     turn = np.eye(4)
     along = int(np.abs(axis).argmax())
     if abs(axis[along]) == 1.0:
-        # Columns z, x, y in turn for z, x, y: no rounding. Half a turn for the other sense.
+        # A cyclic permutation of the axes has no rounding. Half a turn reverses the axis.
         turn[:3, :3] = np.roll(np.eye(3), along + 1, axis=0)
         if axis[along] < 0:
             turn[:3, :3] = turn[:3, :3] @ np.diag([1.0, -1.0, -1.0])

@@ -1,4 +1,4 @@
-"""Arms as they are drawn: meshes by link, and moving bodies along recorded joints."""
+"""Drawing of arms: meshes of each link, and bodies along recorded joint positions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def panda_meshes(body: str) -> tuple[MeshFile, ...]:
 
     Args:
         body: link0 to link7, hand, finger_left or finger_right; tool is the hand in the frame
-            of the tool centre point. There are none of any other body.
+            of the tool centre point. Other names have no meshes.
     """
     folder = _mesh_folder()
     if folder is None or body not in _PARTS:
@@ -56,7 +56,7 @@ def _mesh_folder() -> Path | None:
 def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
     """Meshes of a link, the gripper or a finger of an arm; empty if unknown.
 
-    Franka's arms share their meshes, and all arms of the work cell carry the same gripper.
+    Franka's arms have the same meshes, and all arms of the work cell carry the same gripper.
 
     Args:
         robot: The arm.
@@ -75,7 +75,7 @@ def arm_bodies(
     joint_position: Float[np.ndarray, "time joints"],
     opening: Float[np.ndarray, " time"] | None = None,
 ) -> tuple[Body, ...]:
-    """Links, hand and fingers of an arm along a motion: meshes, else capsules of planning.
+    """Links, hand and fingers of an arm along a motion, as meshes or, without them, capsules.
 
     Args:
         robot: The arm.

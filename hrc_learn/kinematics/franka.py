@@ -12,8 +12,8 @@ For the Research 3 it also misses most solutions outside the Panda's range (q6 >
 constant velocity limits. Of configurations in the whole range with q4 < -0.467 it finds 81 %,
 of those within the Panda's range 99.8 %.
 
-Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at most 30 mm (link
-2), those of the base by 46 mm and of the gripper by 9 mm: clearances must cover this.
+Franka's meshes, which agree to 2 mm for both arms, protrude from the capsules by at most 30 mm
+(link 2), those of the base by 46 mm and of the gripper by 9 mm: clearances must cover this.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ PANDA_LIMITS = _limits(**_TABLES["panda_limits"])
 """Franka's "Robot and interface specifications", control-parameters-joint-fer.csv."""
 
 FR3_LIMITS = _limits(**_TABLES["fr3_limits"])
-"""The innermost position limits of these tables, and the smallest velocity offsets whose curves
-stay below all others: kept by every Research 3. The tables differ in the position limits and in
-the offsets; a robot uses those of the URDF that it sends to its driver, hence of its system
-image."""
+"""The strictest limits of the tables that `vintage` names, which every Research 3 accepts: the
+innermost position limits, and the smallest velocity offsets whose curves stay below those of
+all tables. A robot uses the values of the URDF that it sends to its driver; they depend on its
+system image."""
 
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
 _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
 
 
-# A returned branch whose own forward kinematics is further off than this [m, rad] is wrong.
+# A branch is dropped if its forward kinematics misses the pose by more [m; entries of R].
 _TOLERANCE = 1e-6
 
 
@@ -65,16 +65,16 @@ def franka_branches(
     q7: Float[Tensor, "*#batch"] | float,
     ranges: tuple[bool, ...] = (False,),
 ) -> Float[Tensor, "*batch 4 7"]:
-    """All branches within the limits for a position of joint 7 [rad], then rows of NaN.
+    """All solutions within the limits for a position of joint 7, followed by rows of NaN.
 
     Args:
         arm: Chain with Franka's geometry.
         pose: Poses of the tool centre point in the base frame.
         q7: Position of joint 7 [rad].
-        ranges: Joint ranges that frankik is asked with. It drops branches outside the Panda's
-            range (False) or outside the narrow range of the FR3 for which the velocity limits
-            hold at all positions (True). The FR3's full range is in neither; both together
-            leave out the least.
+        ranges: Joint ranges with which frankik is called. It drops branches outside the Panda's
+            range (False) or outside the narrow range of the FR3 in which velocity limits are
+            constant (True). Neither contains the full range of the FR3; both together lose the
+            fewest branches.
     """
     import frankik  # only here: the rest of the package works without it
 
@@ -91,7 +91,7 @@ def franka_branches(
     branches = np.full((len(flanges), 4, 7), np.nan)
     for is_fr3 in ranges:
         for row, T, angle in zip(branches, flanges, angles, strict=True):
-            # A branch has the same row in either answer, or is NaN.
+            # A branch has the same row in both results, or is NaN in one of them.
             found = frankik.ik_full(T, frankik.kQDefault, angle, is_fr3)
             np.copyto(row, found, where=np.isnan(row))
     q = torch.from_numpy(branches).reshape(*shape, 4, 7)
@@ -101,7 +101,7 @@ def franka_branches(
 def _valid_first(
     arm: SerialChain, q: Float[Tensor, "*batch 4 7"], tip: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 4 7"]:
-    """Branches with those outside the limits or at another pose blanked and moved last."""
+    """Branches, with those outside the limits or at another pose set to NaN and moved last."""
     reached = arm.forward(q).matrix()
     error = (reached - tip[..., None, :, :]).abs().flatten(-2).amax(-1)
     good = arm.limits.contain(q) & (error < _TOLERANCE)  # False for rows of NaN
@@ -166,7 +166,7 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
 
 
 panda = _franka("panda", PANDA_LIMITS, (False,))
-"""The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
+"""The Panda with its hand; Franka limits its tool to 1.7 m/s and 2.5 rad/s."""
 
 fr3 = _franka("fr3", FR3_LIMITS, (False, True))
-"""The Research 3 with its hand; the Cartesian limits are 3 m/s and 2.5 rad/s."""
+"""The Research 3 with its hand; Franka limits its tool to 3 m/s and 2.5 rad/s."""

@@ -1,7 +1,7 @@
 """Mass matrix of an arm, from the masses, centres and inertias of its description.
 
-With the pseudo-inertia P of each body (`description.pseudo_inertia`) and the derivatives D_j of
-its frame over the joints, the mass matrix is M_jk = sum tr(D_j P D_k^T).
+With the pseudo-inertia P of each body (`description.pseudo_inertia`) and the derivative D_j of
+its frame with respect to joint j, the mass matrix is M_jk = sum over bodies of tr(D_j P D_k^T).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class MassMatrix:
         """
         self._arm = arm
         count = arm.joints + 3
-        # Not of the base, which does not move.
+        # Without the base, which does not move.
         bodies = np.stack([_inertia(arm, link) for link in range(1, count)])
         self._bodies = Constant(torch.from_numpy(bodies))
         self._rotors = Constant(rotor_inertia * torch.eye(arm.joints, dtype=torch.float64))
@@ -58,7 +58,7 @@ class MassMatrix:
         """
         frames, n = self._arm.link_frames(q), self._arm.joints
         axis, origin = frames[..., :n, :, 2], frames[..., :n, :, 3]
-        # Derivatives of all frames over all joints: z x (x - o) for a joint that turns.
+        # Derivatives of all frames by all joints: z x (x - o) for a joint that turns.
         about = frames.unsqueeze(-3) - _at_last(origin)[..., None, :, :, :]
         turned = torch.linalg.cross(axis[..., None, :, :, None], about, dim=-2)
         slid = _at_last(axis)[..., None, :, :, :].expand_as(turned)
@@ -83,7 +83,7 @@ def _inertia(arm: Arm, link: int) -> Float[np.ndarray, "4 4"]:
     found = pseudo_inertia(0.0 if capsules else mass, (0.0, 0.0, 0.0), np.zeros((3, 3)))
     for capsule in capsules:
         start, end = np.array(capsule.start), np.array(capsule.end)
-        # A thin rod: as its ends with a sixth of the mass each, and its middle with the rest.
+        # Point masses equal to a thin rod: a sixth at each end, the rest in the middle.
         for part, point in ((1 / 6, start), (2 / 3, (start + end) / 2), (1 / 6, end)):
             found += pseudo_inertia(part * mass / len(capsules), point, np.zeros((3, 3)))
     return found

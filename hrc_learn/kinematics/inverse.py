@@ -1,11 +1,11 @@
 """Inverse kinematics of any serial arm, and the redundancy that a pose leaves.
 
-Poses are inverted in batches by damped least squares from many starts: Levenberg and
-Marquardt's method with the damping of Sugihara 2011, "Solvability-unconcerned inverse
-kinematics by the Levenberg-Marquardt method": the damping is the error itself, so that it
-vanishes at a solution. Every start of every pose is one row of a batch; rows that have arrived
-leave it. Joint limits are kept at every iteration. Of a pose's solutions the one nearest to a
-wanted configuration is kept, and moved further towards it in the null space.
+Poses are inverted in batches by damped least squares from many starts. The damping of the
+Levenberg-Marquardt method is the squared error, so that it vanishes at a solution (Sugihara
+2011, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method"). Each
+start of each pose is one row of a batch; rows that have arrived leave the batch. Every
+iteration keeps the joint limits. Among the solutions of a pose, the one nearest to a wanted
+configuration is kept and moved further towards it in the null space.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from hrc_learn.geometry.numerics import Constant, orthonormal_basis
 from hrc_learn.kinematics.chain import SerialChain
 
 type TaskSpace = Literal["pose", "nearest pose", "position+axis", "position"]
-"""Constrained part of the tool's pose: all, all but the rotation about its z axis, or the
-position. The "nearest pose" is a pose for six joints; with fewer, the position exactly and the
-orientation as near as they bring it there.
+"""Constrained part of the tool's pose: all of it, all but the rotation about its z axis, or the
+position. "nearest pose" equals "pose" for six joints or more; with fewer, it is the exact
+position with the nearest orientation that the joints can reach there.
 """
 
 TASK_ROWS: dict[TaskSpace, int] = {
@@ -35,20 +35,20 @@ TASK_ROWS: dict[TaskSpace, int] = {
     "position+axis": 5,
     "position": 3,
 }
-# Weight of an angle against a distance [m/rad]: turning by 1 rad moves what is this far away.
+# Weight of angles relative to distances [m/rad]: 1 rad counts as much as this distance.
 _LEVER = 0.3
-# Singular values below this part of the largest are none (`null_space_dimension`), and below
-# this one nothing that an arm is led by: the SO-101's tool is 8 mm off the axis about which its
-# last joint rolls it, which moves it by so much and no further.
+# Singular values below these fractions of the largest one count as zero, in
+# `null_space_dimension` and in `task_rank`. The second ignores weak directions: the SO-101's
+# tool lies 8 mm off the axis of its last joint, which therefore hardly moves it.
 _RANK, _LED = 1e-6, 0.02
-_BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
+_BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
 _STARTS, _ROUNDS, _ITERATIONS = 24, 6, 40
 # Largest error of a solution's position [m] and orientation [rad].
 _TOLERANCE = 1e-9
-# Rotation by which a nearest pose may miss the wanted one [rad]: an arm that turns away further
-# does another task.
+# Largest rotation between a wanted pose and its "nearest pose" [rad]: beyond it, the arm would
+# do another task.
 _MISSED_TURN = 0.6
-_CORRECTIONS = 2  # of Newton's, from one pose of a path to the next
+_CORRECTIONS = 2  # iterations of `_step` at each pose of a path
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class InverseSolution:
     """Joint positions that `solve_inverse` found."""
 
     position: Float[Tensor, "*batch joints"]
-    """[rad, m]; the best tried where none was found."""
+    """[rad, m]; where no solution was found, `near` moved to the joint limits."""
     found: Bool[Tensor, "*batch"]
     """True if the pose is reached within limits."""
 
@@ -66,8 +66,8 @@ def task_error_and_jacobian(
 ) -> tuple[Float[Tensor, "rows task"], Float[Tensor, "rows task joints"]]:
     """Error to a pose, and the Jacobian of the task with respect to the joints.
 
-    Rows are the linear ones [m] in the base frame, then for "pose" the angular ones there
-    [rad], for "position+axis" the two angular ones perpendicular to the wanted tool axis.
+    The first three rows are linear, in the base frame [m]. A pose adds three angular rows in
+    the base frame [rad], "position+axis" two, perpendicular to the wanted axis of the tool.
 
     Args:
         chain: The arm.
@@ -87,7 +87,7 @@ def task_error_and_jacobian(
     sine = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
     cosine = (now * wanted).sum(-1, keepdim=True)
     angle = torch.atan2(sine, cosine)
-    # Opposite axes: any direction across will do, x of the wanted frame.
+    # For opposite axes, any perpendicular axis of rotation works: take x of the wanted frame.
     small = sine < 1e-9
     axis = torch.where(small, R[..., 0], across / sine.clamp(min=1e-9))
     turn = axis * torch.where(small & (cosine > 0), 0.0, angle)
@@ -124,10 +124,10 @@ _SAMPLES = 64  # joint positions at which `task_rank` looks: nearly all are regu
 def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
     """Number of task dimensions that an arm controls, away from its singularities.
 
-    Six for a pose and six or more joints. For "position+axis" five, but four for an arm of five
-    joints whose last joint turns the tool about its axis: position and tilt. The remaining
-    joint motion is null space. A direction that takes 50 times as much joint motion as another
-    one does not count.
+    It is six for a pose and six or more joints. For "position+axis" it is five, but four
+    (position and tilt) for an arm of five joints whose last joint turns the tool about its
+    axis. The remaining joint motion is null space. A direction that takes 50 times as much
+    joint motion as another one does not count.
 
     Args:
         chain: The arm.
@@ -143,11 +143,12 @@ _LINEAR = Constant(torch.eye(6, dtype=torch.float64)[:3])
 
 
 def position_first(J: Float[Tensor, "*batch 6 n"]) -> Float[Tensor, "*batch n 6"]:
-    """Orthonormal twists of the tool that an arm of three to five joints leads.
+    """Orthonormal basis of the tool's twists that an arm of three to five joints controls.
 
-    The linear ones, then the rotations that the joints make with the position at rest:
-    B = [I 0; 0 U^T] with U an orthonormal basis of J_w Z and J_v Z = 0. Solving B J q_dot = B v
-    moves the position as wanted and turns the tool as near to the wanted rotation as it can.
+    Rows are the linear velocities, then the rotations that the joints cause while the position
+    rests: B = [I 0; 0 U^T], with U an orthonormal basis of the range of J_w Z and J_v Z = 0.
+    Solving B J q_dot = B v moves the position as wanted, and turns the tool as near to the
+    wanted rotation as the joints can.
 
     Args:
         J: Geometric Jacobian of the tool.
@@ -164,10 +165,10 @@ def task_basis(
     task: TaskSpace,
     rank: int,
 ) -> Float[Tensor, "*batch {rank} 6"]:
-    """Orthonormal twists of the tool that a task leads: its velocity there is B J q_dot.
+    """Orthonormal basis B of the tool's twists in a task; the task's velocity is B J q_dot.
 
-    Linear ones, then the turns across the tool's axis. Of an arm that has fewer of them than
-    the task, those that it moves: the range of J in them.
+    Rows are linear velocities, then the rotations of the task. If the arm controls fewer
+    dimensions than the task has, rows span only those that it controls: the range of J there.
 
     Args:
         J: Geometric Jacobian of the tool.
@@ -214,12 +215,12 @@ def solve_inverse(
     best = wish.clone().clamp(lower, upper)
     distance = wish.new_full((len(wish),), torch.inf)
     for round_ in range(_ROUNDS):
-        # First from the wish itself and around it, then wherever the arm can be.
+        # The first round starts from the wish, too; other starts are random postures.
         missing = distance.isinf().nonzero().flatten()
         if len(missing) == 0:
             break
-        # The same starts for all poses: an answer does not depend on the others. They are drawn
-        # on the CPU: a seed means the same on every device.
+        # All poses have the same starts, so a result does not depend on the other poses. Starts
+        # are drawn on the CPU: a seed gives other numbers on other devices.
         random = torch.rand(_STARTS, joints, generator=rng, dtype=torch.float64).to(wish.device)
         half = ((upper - lower) / 2).clamp(max=math.pi)
         start = ((lower + upper) / 2 + (2 * random - 1) * half).repeat(len(missing), 1, 1)
@@ -256,7 +257,7 @@ def solutions_from(
         task: Constrained part of the pose.
 
     Returns:
-        In the order of the starts; NaN for those that do not lead there.
+        Solutions in the order of the starts; NaN where a start does not lead to the pose.
     """
     count, joints = starts.shape[-2:]
     batch = torch.broadcast_shapes(pose.position.shape[:-1], starts.shape[:-2])
@@ -277,19 +278,19 @@ def follow_poses(
 ) -> tuple[Float[Tensor, "steps *rows joints"], Float[Tensor, "steps *rows"]]:
     """Joint positions along a path of the tool, by differential inverse kinematics.
 
-    Joints move as little as they can from one pose to the next, as an arm's do whose tool is
-    led in velocity; at their limits they stay behind.
+    Joints move as little as possible from one pose to the next, as under velocity control of
+    the tool; at their limits they stop.
 
     Args:
         chain: The arm.
         path: Poses of the tool centre point, (steps, *#rows).
         start: Joint positions at the first pose [rad, m].
-        wish: Posture that the null space takes at each pose [rad, m]; None: none.
+        wish: Posture that the null-space motion approaches at each pose [rad, m]; None: none.
         task: Constrained part of the poses.
 
     Returns:
-        Joint positions, and how far the tool is from each pose: the larger one of distance [m]
-        and angle [rad].
+        Joint positions, and the tool's error at each pose: the larger of distance [m] and
+        angle [rad].
     """
     q, positions, errors = start.reshape(-1, start.shape[-1]), [], []
     rows = start.shape[:-1]
@@ -305,7 +306,7 @@ def follow_poses(
 
 
 def _in_rows(pose: Pose, batch: Sequence[int]) -> Pose:
-    """Poses broadcast to a batch, in one axis and in float64, without gradients."""
+    """Poses broadcast to a batch and flattened to one axis, in float64, without gradients."""
     return Pose(
         pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
         pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
@@ -319,7 +320,7 @@ def _step(
     task: TaskSpace,
     wish: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """One iteration, and the error before it [m, rad]."""
+    """Joint positions after one iteration, and the error before it [m, rad]."""
     error, J = task_error_and_jacobian(chain, q, goal, task)
     missed = error[..., 3:]
     if task == "nearest pose" and J.shape[-1] < 6:
@@ -342,7 +343,7 @@ def _step(
 
 
 def _limits(chain: SerialChain, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Lower and upper ones, on the device of `like`."""
+    """Lower and upper joint limits, on the device of `like`."""
     return chain.limits.lower.to(like.device), chain.limits.upper.to(like.device)
 
 
@@ -374,9 +375,9 @@ def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
 def _drawn_nearer(
     chain: SerialChain, goal: Pose, q: Tensor, wish: Tensor, task: TaskSpace
 ) -> Tensor:
-    """Moved in the null space towards a wish, as long as the pose is reached and it helps."""
+    """Solutions moved in the null space towards a wish, where that keeps the pose and helps."""
     moved = q
-    for _ in range(15):  # each removes most of what the null space can
+    for _ in range(15):  # each removes most of the distance that the null space can remove
         moved, _ = _step(chain, goal, moved, task, wish)
     moved, reached = _descend(chain, goal, moved, task)
     nearer = torch.linalg.vector_norm(moved - wish, dim=-1) < torch.linalg.vector_norm(
@@ -388,31 +389,31 @@ def _drawn_nearer(
 # Redundancy. The arm angle is one number for the posture of a seven-joint arm with its end
 # effector at rest: the angle by which the plane of shoulder, elbow and wrist is turned out of
 # the vertical (Kreutz-Delgado et al. 1992). Unlike the position of joint 7 it changes steadily
-# as the elbow circles, and keeps its meaning when the end effector moves on.
+# as the elbow circles, and keeps its meaning when the end effector moves.
 
-# Smallest singular value of the 6 x n Jacobian (metres and radians mixed, as it stands) below
-# which inverting it exactly asks for joint speeds an arm does not have.
+# Smallest singular value of the 6 x n Jacobian (with unscaled metres and radians) below which
+# its exact inverse demands joint speeds that no arm reaches.
 SINGULAR_BELOW = 0.05
 
 
 _SHOULDER, _ELBOW, _WRIST = 1, 3, 5  # frames of joints 2, 4 and 6
-# Step of the central difference [rad]: rounding and truncation are both near 1e-10 then.
+# Step of the central difference [rad]: rounding and truncation errors are both near 1e-10.
 _STEP = 1e-5
-# Square of the rate [1] below which the motion that turns the arm angle is damped: near
-# configurations in which the null space does not move the elbow it would have no bound.
+# Damping of the joint motion that turns the arm angle, as a squared rate [1]. Without it, the
+# motion is unbounded near configurations in which the null space does not move the elbow.
 _DAMPING = 1e-2
-# Singular value [1] and distance to a limit [rad] beyond which a posture is as good as any.
+# Singular value [1] and distance to a limit [rad] beyond which larger ones count the same.
 _GOOD_SINGULAR_VALUE = 0.2
 _GOOD_DISTANCE = 0.5
-# Postures nearer to each other lead along the same path [rad].
+# Postures closer to each other than this count as the same [rad].
 _ALIKE = 0.5
 
 
 def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
     """Angle of the elbow about the line from shoulder to wrist [rad], in (-pi, pi].
 
-    Zero with the elbow straight above that line, positive turning right-handed about it. Not
-    defined where the wrist is straight above the shoulder, or the arm is stretched.
+    The angle is zero with the elbow straight above this line and grows right-handed about it.
+    It is undefined where the wrist is straight above the shoulder, or the arm is stretched.
 
     Args:
         chain: A seven-joint arm with shoulder, elbow and wrist at joints 2, 4 and 6.
@@ -457,7 +458,7 @@ def arm_angle_and_motion(
 def best_postures(
     chain: SerialChain, solutions: Float[Tensor, "solutions n"]
 ) -> Float[Tensor, "postures n"]:
-    """Those of several joint positions that differ, the most comfortable one first.
+    """Distinct postures among several joint positions, the most comfortable one first.
 
     Args:
         chain: The arm.

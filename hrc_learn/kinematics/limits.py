@@ -116,7 +116,7 @@ class JointLimits(MotionLimits):
     ) -> tuple[Float[Tensor, "*batch"], Int[Tensor, "*batch"]]:
         """Factor by which a path is too fast, and the limit that it breaks most.
 
-        A path that takes that many times as long keeps all limits; below 1 it keeps them.
+        Slowed down by this factor, the path keeps all limits; below 1, it keeps them already.
 
         Args:
             path: Joint positions [rad].

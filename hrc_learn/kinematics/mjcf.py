@@ -23,15 +23,15 @@ from hrc_learn.kinematics.description import (
 )
 
 _NO_MASS = 1e-9
-"""Mass of bodies without any [kg]."""
+"""Mass that marks bodies without a known mass [kg]."""
 
 
 def read_mjcf(path: Path) -> Description:
-    """Read a file.
+    """Read an MJCF file.
 
-    A body is a link, a site a link fixed to its body. Several joints of one body become links
-    in a row, named after the body and the joint. A warning names the first mesh that is
-    missing; links do without.
+    A body becomes a link, a site a link fixed to its body. Several joints of one body become
+    links in a row, named after the body and the joint. Missing meshes are left out, and a
+    warning names the first one.
 
     Raises:
         ValueError: The file is not MJCF.
@@ -53,8 +53,8 @@ def read_mjcf(path: Path) -> Description:
 
 
 def _model_without_missing_meshes(path: Path, mujoco: Any) -> Any | None:
-    """The model without meshes whose files are missing, named in a warning; None if it has
-    another fault.
+    """The model without the meshes whose files are missing, with a warning; None if the file
+    has another error.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -67,15 +67,15 @@ def _model_without_missing_meshes(path: Path, mujoco: Any) -> Any | None:
             spec.delete(geom)
         for mesh in missing:
             spec.delete(mesh)
-        # Bodies whose mass was that of their meshes; `_NO_MASS` tells them apart.
+        # Bodies whose mass came from these meshes get `_NO_MASS`, by which they are recognised.
         spec.compiler.boundmass = spec.compiler.boundinertia = _NO_MASS
         model = spec.compile()
     except ValueError:
         return None
     if files:
         warnings.warn(
-            f"{path}: {len(files)} meshes are missing, such as {files[0]}: their links are "
-            "taken for capsules",
+            f"{path}: {len(files)} meshes are missing, such as {files[0]}: links without "
+            "shapes get capsules",
             stacklevel=4,
         )
     return model if files else None
@@ -121,7 +121,7 @@ class _Reader:
                     collisions.append(shape)
                 if not touches or int(model.geom_group[g]) < 3:
                     visuals.append((bool(touches), shape))
-        # A geom of either kind is drawn only where a body has none that is visual alone.
+        # Geoms that also collide are drawn only on bodies without purely visual geoms.
         alone = [shape for touches, shape in visuals if not touches]
         drawn = alone or [shape for _, shape in visuals]
         mass, known = float(model.body_mass[i]), float(model.body_mass[i]) > _NO_MASS
@@ -143,7 +143,7 @@ class _Reader:
         x, y, z = model.geom_size[g].tolist()
         if kind == kinds.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            # MuJoCo moves meshes into their principal axes, and the geom against it.
+            # MuJoCo moves a mesh to its principal axes and the geom the opposite way.
             moved = self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh])
             place["pose"] = pose @ np.linalg.inv(moved)
             sx, sy, sz = model.mesh_scale[mesh].tolist()
@@ -182,7 +182,7 @@ class _Reader:
             kind = ("free", "ball", "prismatic", "revolute")[int(model.jnt_type[j])]
             anchor = np.eye(4)
             anchor[:3, 3] = model.jnt_pos[j]
-            # A joint's position counts from the reference that the file gives it.
+            # Joint positions count from the reference position in the file.
             moving = f"{name} ({self._joint_name(j)})"
             at = float(model.qpos0[model.jnt_qposadr[j]]) if kind in MOVING else 0.0
             zero = motion(kind, model.jnt_axis[j], -at) if at else np.eye(4)
@@ -210,7 +210,7 @@ class _Reader:
         return joints
 
     def _effort(self, j: int) -> float | None:
-        """Largest force or torque of the joint's actuators, or that of the joint."""
+        """Force or torque limit of a joint or of its first limited actuator; None: no limit."""
         model = self.model
         if model.jnt_actfrclimited[j]:
             return float(np.abs(model.jnt_actfrcrange[j]).max())
@@ -228,7 +228,7 @@ class _Reader:
         return None
 
     def _followers(self) -> dict[int, tuple[str, float, float]]:
-        """Joints that an active equality ties to another or holds, with factor and offset."""
+        """Leader, factor and offset of joints that an active equality couples or holds."""
         model, tied = self.model, {}
         for e in range(model.neq):
             if model.eq_type[e] == self.mujoco.mjtEq.mjEQ_JOINT and model.eq_active0[e]:

@@ -31,8 +31,8 @@ class MissingModelError(ModuleNotFoundError):
     """The package that ships an arm's description is not installed."""
 
 
-# Simulators whose descriptions alone are wanted, without what they require: gym-aloha's MuJoCo
-# is older than ours, and robosuite's OpenCV takes the place of the headless one.
+# Simulators are installed for their descriptions alone, without their requirements: gym-aloha
+# requires an older MuJoCo, and robosuite an OpenCV that replaces the headless one.
 _INSTALL = {
     "example-robot-data": "hrc-learn[meshes]",
     "robosuite": "--no-deps robosuite==1.5.2",
@@ -53,7 +53,7 @@ def _sources() -> Mapping[str, Mapping[str, Any]]:
 
 
 def registered_arms() -> tuple[str, ...]:
-    """Names that `arm` takes."""
+    """Names of registered arms, which `arm` accepts."""
     return (*_OWN, *sorted(_sources().keys() - _OWN.keys()))
 
 
@@ -65,8 +65,8 @@ def maker_of(name: str) -> str:
 def arm_of_robot(robot_type: str | None) -> Arm | None:
     """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
 
-    Our simulated robots, such as mujoco_ur5e, carry the hand of the work cell. None as well if
-    the package with its description is not installed.
+    Our simulated robots, such as mujoco_ur5e, carry the hand of the work cell. For other robots
+    it is also None if the package with the description is not installed.
     """
     simulated = (robot_type or "").removeprefix("mujoco_")
     if simulated != robot_type and simulated in registered_arms():
@@ -81,7 +81,7 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
 def _registered_name(robot: str) -> str | None:
     """Registered arm of a robot's name or type; None if unknown.
 
-    Capitals, punctuation, the maker in front and roles such as "follower" do not count.
+    Capitals, punctuation, the maker in front and roles such as "follower" are ignored.
     """
     sources = _sources()
     names = {name: name for name in sources}
@@ -112,22 +112,25 @@ def arm(
 ) -> Arm:
     """A robot arm by its name, or from a URDF or MJCF file.
 
+    The other arguments apply to arms that are read from files: `panda` and `fr3` refuse them.
+
     Args:
         name_or_file: One of `registered_arms()` or another usual name of one ("xarm",
             "Franka"), the name of a description in an installed package ("ur10e", "iiwa14"; see
             `installed_descriptions`), or a path that ends in .urdf, .xml or .mjcf.
-        base: Link or body to be the base, of files; None: the root.
-        tip: Link, body or site to be the flange, of files; None: the only end besides a
-            gripper's.
-        tool: Tool centre point in the frame of the flange, of files.
-        limits: Limits that replace or complete those of a file, by joint name, or a TOML file;
-            None: the file named after it, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
+        base: Link or body that is the base; None: the registered one, or the root.
+        tip: Link, body or site that is the flange; None: the registered one, or the only end
+            besides a gripper's.
+        tool: Tool centre point in the frame of the flange.
+        limits: Limits that replace or complete those of the file, by joint name, or a TOML
+            file; None: `ur5e.limits.toml` for a file `ur5e.urdf`, if there is one.
         ready: A comfortable posture [rad, m].
 
     Raises:
-        ValueError: There is no such name, or the file makes no serial chain.
-        FileNotFoundError: The file, or a mesh that it names, is not there.
-        MissingModelError: The package that ships the arm is not installed: says how to.
+        ValueError: The name is unknown, or the links of the file form no serial chain.
+        FileNotFoundError: The file does not exist.
+        MissingModelError: The package with the arm's description is not installed; the message
+            says how to install it.
     """
     name, path = str(name_or_file), Path(name_or_file)
     choice = {"base": base, "tip": tip, "tool": tool, "limits": limits, "ready": ready}
@@ -153,9 +156,9 @@ def arm(
 def installed_descriptions(name: str) -> list[Path]:
     """Descriptions of a robot in installed packages, by the name of their file or folder.
 
-    Looked through are example-robot-data, robosuite, and what mujoco-menagerie and
-    robot_descriptions have already fetched; nothing is downloaded. Of several kinds of packages
-    the first that has the robot counts, of files in one folder the one named most simply.
+    The search covers example-robot-data, robosuite, and files that mujoco-menagerie and
+    robot_descriptions have already fetched; nothing is downloaded. The first of these sources
+    that has the robot counts, and in each folder the file with the shortest name.
     """
     wanted = _plain(name)
     for root in _description_folders():
@@ -172,7 +175,7 @@ def _names_of(file: Path) -> set[str]:
     """Names under which a description is looked up."""
     stem = _plain(file.stem)
     names = {stem, stem.removesuffix("robot"), stem.removesuffix("description")}
-    # robosuite names folders, and each file robot.xml.
+    # In robosuite, the folder has the robot's name, and each file is named robot.xml.
     return {_plain(file.parent.name)} if stem == "robot" else names
 
 
@@ -227,7 +230,7 @@ def _locate(name: str, package: str, file: str) -> Path:
         ) from None
     if not path.is_file():
         raise MissingModelError(
-            f"{package} is installed without {file}: install it anew, or another version of it",
+            f"{package} is installed without {file}: reinstall it, or install another version",
             name=package,
         )
     return path
@@ -254,13 +257,13 @@ class ArmChoice:
     """Flange link of a file; empty: its only end."""
 
     def arm(self) -> Arm:
-        """The arm as its description has it."""
+        """The arm as described in its file."""
         name, _, links = self.name.partition(":")
         base, _, tip = links.rpartition(":")
         return arm(name, base=base or self.base or None, tip=tip or self.tip or None)
 
     def work_arm(self) -> Arm:
-        """The arm with the hand of our work cell: two parallel fingers, as the Franka hand.
+        """The arm with the hand of our work cell: two parallel fingers, like the Franka hand.
 
         Raises:
             ValueError: There is no such arm, or it has fewer than five joints.

@@ -3,8 +3,7 @@
 `coarse_orientation` (eq. coarse_orientation): a three-axis haptic device moves the end effector
 but cannot turn it, so the tilt follows from the sideways position: straight down in front of
 the robot, level at the end of its reach. `Approach` (section Collaboration Task): the
-orientation for grasping is along the tangent of each demonstration near the object, where the
-end effector was going.
+orientation for grasping points along the tangent of the demonstrated motion near the object.
 """
 
 import math
@@ -21,10 +20,10 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.store import Radians, read_json, write_json
 
 NEAR = 0.05
-"""Length of the last stretch of a path, whose direction is its tangent there [m]."""
+"""Length of the last part of a path, whose direction is taken as the tangent [m]."""
 
-# Tangents that differ by more [rad], from one another or from where the end effector points,
-# tell nothing: it came to the object from the side, as over a table, and not as it grasps.
+# Tangents are not used if they differ by more than this from their mean, or their mean from the
+# direction in which the end effector points [rad]: it then came to the object from the side.
 MAX_SPREAD = math.radians(30)
 # Shorter vectors are rounding noise and have no direction.
 _SHORTEST = 1e-12
@@ -38,7 +37,7 @@ def gripper_down() -> Float[Tensor, "4"]:
 def coarse_orientation(
     position: Float[Tensor, "*batch 3"], reach: float = 0.6, tilt: float = math.pi / 2
 ) -> Float[Tensor, "*batch 4"]:
-    """Orientation of the end effector that goes with its position.
+    """Orientation of the end effector as a function of its position.
 
     The paper gives r_5 = beta_0 r_2 / Y_0, limited to +-beta_0, without saying about which
     axis. We tilt the gripper-down frame by that angle about the base's x axis: a hand that
@@ -61,17 +60,17 @@ def coarse_orientation(
 def turn_about_vertical(
     orientation: Float[Tensor, "4"], reference: Float[Tensor, "4"]
 ) -> float:
-    """Turn about the base's z axis that brings one orientation nearest to another [rad].
+    """Turn about the base's z axis that brings a reference nearest to an orientation [rad].
 
     Args:
-        orientation: The turned one (wxyz).
-        reference: The one that is not turned.
+        orientation: Orientation to come near to (wxyz).
+        reference: Orientation that is turned (wxyz).
 
     Returns:
         From -pi to pi.
     """
     w, _, _, z = quaternion.multiply(orientation, quaternion.conjugate(reference)).tolist()
-    # Part about z of the rotation between both (swing-twist decomposition).
+    # Twist about z of the rotation between both (swing-twist decomposition).
     return math.remainder(2 * math.atan2(z, w), 2 * math.pi)
 
 
@@ -79,13 +78,13 @@ def turn_about_vertical(
 class Approach:
     """Orientation of the end effector in front of an object, from demonstrated approaches.
 
-    As it would be were the gripper not turned about the vertical: objects lie at any yaw. The
-    fields are those of its file.
+    It is given for a gripper that closes along x: turns about the vertical are removed, since
+    objects lie at any yaw. The fields are those of the saved file.
     """
 
     version: Literal[1] = 1
     orientation_wxyz: tuple[float, float, float, float]
-    """Its z axis is the direction in which the end effector goes on to the object."""
+    """Unit quaternion; its z axis is the direction of approach to the object."""
     spread_rad: Radians
     """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
     turned_rad: Radians
@@ -102,12 +101,12 @@ class Approach:
 
     @property
     def direction(self) -> Float[Tensor, "3"]:
-        """In which the end effector goes on to the object, base frame; of unit length."""
+        """Unit vector of the approach to the object, in the base frame."""
         return quaternion.to_matrix(self.orientation)[:, 2]
 
     @classmethod
     def fit(cls, paths: Sequence[Pose]) -> "Approach":
-        """Turn the mean demonstrated orientation, as little as needed, along the path.
+        """Turn the mean demonstrated orientation, as little as needed, to point along the path.
 
         Args:
             paths: Poses of the end effector in each demonstration, which ends in front of the
@@ -135,7 +134,7 @@ class Approach:
         return cls(orientation_wxyz=(w, x, y, z), spread_rad=spread, turned_rad=turned)
 
     def save(self, path: Path) -> None:
-        """Write to a JSON file, whole or not at all."""
+        """Write the approach to a JSON file, completely or not at all."""
         write_json(path, self)
 
     @classmethod
@@ -144,16 +143,16 @@ class Approach:
 
         Raises:
             FileNotFoundError: If there is no such file.
-            ValueError: If it is not one of ours.
+            ValueError: If the file holds no approach.
         """
         return read_json(path, cls, "fit it again")
 
 
 def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:
-    """Direction of the last stretch of a path, of unit length; 0 where it does not move.
+    """Unit direction of the last part of a path; zero if the path does not move.
 
     Args:
-        position: Along the path [m].
+        position: Positions along the path [m].
     """
     way = position[-1] - position
     before = (way.norm(dim=-1) > NEAR).nonzero()[:, 0]
@@ -162,7 +161,7 @@ def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:
 
 
 def _unturned(path: Pose) -> Pose:
-    """The path turned about the vertical for the gripper to end closing along x."""
+    """The path, turned about the vertical so that the gripper finally closes along x."""
     turn = turn_about_vertical(path.orientation[-1], gripper_down())
     back = quaternion.exp(torch.tensor([0.0, 0.0, -turn], dtype=torch.float64))
     return Pose(
@@ -171,6 +170,6 @@ def _unturned(path: Pose) -> Pose:
 
 
 def _angle(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "3"]) -> Float[Tensor, "*batch"]:
-    """Between unit vectors [rad]; exact also where they are nearly parallel."""
+    """Angle between unit vectors [rad], exact also where they are nearly parallel."""
     a, b = torch.broadcast_tensors(a, b)
     return torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1))

@@ -24,22 +24,22 @@ from hrc_learn.kinematics.description import (
 )
 
 _BOUNDS = ("lower", "upper", "velocity", "effort")
-# Attributes that are no numbers; in others these words are numbers that no robot has.
+# Attributes that hold text. In other attributes, these words are numbers that are not finite.
 _WORDS = ("name", "link", "joint", "type", "filename")
 _NOT_FINITE = re.compile(r"\b(nan|inf|infinity)\b", re.IGNORECASE)
 
 
 def read_urdf(path: Path) -> Description:
-    """Read a file, with what urdfdom allows: blank first lines, undeclared namespaces, unused
-    properties of xacro.
+    """Read a URDF file. As in urdfdom, it may have blank first lines, undeclared namespaces and
+    unused xacro properties.
 
     Meshes `package://NAME/...` are looked for in the folders above the file and in
-    ROS_PACKAGE_PATH. A warning names the first mesh that is missing; links do without.
+    ROS_PACKAGE_PATH. Missing meshes are left out, and a warning names the first one.
 
     Raises:
-        ValueError: The file is not URDF, holds unexpanded xacro, misses an attribute, or
+        ValueError: The file is not URDF, holds unexpanded xacro, lacks an attribute, or
             describes no tree.
-        FileNotFoundError: The file is not there.
+        FileNotFoundError: The file does not exist.
     """
     robot = _parsed(path)
     if robot.tag != "robot":
@@ -54,14 +54,14 @@ def read_urdf(path: Path) -> Description:
     if reader.missing:
         warnings.warn(
             f"{path}: {len(reader.missing)} meshes are missing, such as {reader.missing[0]}: "
-            "their links are taken for capsules (ROS_PACKAGE_PATH names folders of packages)",
+            "links without shapes get capsules (set ROS_PACKAGE_PATH to find packages)",
             stacklevel=2,
         )
     return Description(path, links, joints)
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    """Elements of an XML file, names with their prefixes as they are."""
+    """Elements of an XML file, with the prefixes of their names unchanged."""
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
@@ -73,7 +73,7 @@ def _parsed(path: Path) -> ElementTree.Element:
 
 
 def _check_texts(path: Path, robot: ElementTree.Element) -> None:
-    """Raise a ValueError if xacro is left, but for properties, or a number is not finite."""
+    """Raise a ValueError if a number is not finite, or xacro other than properties is left."""
     names = [key for key, value in robot.attrib.items() if "xacro" in value]
     prefixes = ("xacro:", *(f"{name.removeprefix('xmlns:')}:" for name in names))
     harmless = tuple(prefix + kind for prefix in prefixes for kind in ("property", "arg"))
@@ -90,7 +90,7 @@ def _check_texts(path: Path, robot: ElementTree.Element) -> None:
                         "numbers"
                     )
     if left:
-        raise ValueError(f"{path} holds {left[0]}: make URDF of it with xacro first")
+        raise ValueError(f"{path} holds {left[0]}: expand it with xacro first")
 
 
 class _Reader:
@@ -123,7 +123,7 @@ class _Reader:
     def _inertia(
         self, element: ElementTree.Element, mass: float, name: str
     ) -> Transform | None:
-        """Pseudo-inertia of a link; None where the file has its mass alone."""
+        """Pseudo-inertia of a link; None where the file gives only the mass."""
         moments, inertial = element.find("inertial/inertia"), element.find("inertial")
         if moments is None or inertial is None:
             return None
@@ -155,7 +155,7 @@ class _Reader:
         limit, mimic = element.find("limit"), element.find("mimic")
         bounds, follows = {}, None
         if limit is not None:
-            # A continuous joint has no limits of position, whatever they say.
+            # A continuous joint has no position limits, even if the file gives some.
             keys = ("velocity", "effort") if kind == "continuous" else _BOUNDS
             for key in keys:
                 if limit.get(key) is not None:

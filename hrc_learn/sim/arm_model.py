@@ -23,7 +23,7 @@ from hrc_learn.vision import Marker, marker_texture
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 
-_SHORTEST = 1e-6  # length of a capsule from which on it is no ball [m]
+_SHORTEST = 1e-6  # capsules with a shorter axis are modelled as spheres [m]
 
 _HIDDEN = 4  # sites of this group are not drawn
 _WHITE = (0.92, 0.93, 0.95, 1.0)
@@ -39,7 +39,7 @@ FINGER_STROKE = 0.04
 
 
 _THICKNESS = 0.002  # of a plate [m]
-_TEXELS = 400  # along its edge: whole texels for each of its 8 modules
+_TEXELS = 400  # texels along its edge: a whole number for each of the 8 modules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ class Plate:
     solid: bool = True
     """True if the plate collides with objects; a sticker on a box does not."""
     printed: bool = True
-    """False: there is no plate; its frame stays, as a true place to measure against."""
+    """False: the plate is left out, but its frame stays as ground truth for measurements."""
 
 
 def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
@@ -106,7 +106,7 @@ def add_box(body, name: str, half_size, colour, **more):
 
 
 def add_capsule(body, name: str, capsule: Capsule, colour):
-    """Add a capsule to a body, a ball if it has no length, as MuJoCo takes no such capsule."""
+    """Add a capsule to a body, or a sphere if the axis has no length: MuJoCo refuses that."""
     is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
     along = {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
     kind = mujoco.mjtGeom.mjGEOM_SPHERE if is_ball else mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -156,7 +156,7 @@ class ArmModelConfig:
     def armature(self, joint: int) -> float:
         """Inertia of the motor and its gear, at the joint [kg m^2]."""
         torque = self.torque(joint)
-        # Small motors have lighter rotors; those of 50 N m and more are taken for the Panda's.
+        # Small motors have lighter rotors; from 50 N m on, the Panda's inertia is assumed.
         return 0.1 * min(1.0, torque / 50.0) if self.robot.name not in _SERVOS else 0.1
 
 
@@ -175,8 +175,8 @@ _HAND = "hand"
 def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     """Add the arm, its hand and its servos to a model, with the base at the world's origin.
 
-    Links are named link0, link1, ..., joints as in its chain, fingers `finger_left` and
-    `finger_right`.
+    Bodies of links are named link0, link1, ...; joints keep their names of the chain; fingers
+    are named `finger_left` and `finger_right`.
     """
     robot, n = config.robot, config.robot.joints
     base = spec.worldbody.add_body(name="link0")
@@ -190,7 +190,7 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
         _add_capsules(body, robot, i + 1, mass=robot.masses[i + 1])
-    # The end effector's frame: at the flange, turned as the tool.
+    # The hand's frame has its origin at the flange and the orientation of the tool.
     flange, tool = frames[n], frames[n + 1]
     hand_frame = np.linalg.inv(parent_frame) @ tool
     hand_frame[:3, 3] = (np.linalg.inv(parent_frame) @ flange)[:3, 3]
@@ -200,26 +200,26 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     )
     _add_hand(spec, hand, config)
     names = {link: f"link{link}" for link in range(n + 1)} | {n + 2: _HAND}
-    # MuJoCo filters neighbours by itself, but for a static parent.
+    # MuJoCo ignores contacts of neighbours, except with a static parent such as link0.
     for a, b in ((0, 1), *robot.whole.overlapping):
         if a in names and b in names:
             spec.add_exclude(bodyname1=names[a], bodyname2=names[b])
         if a == 0 and b in names:
-            # The pedestal goes on where the base ends: a wide shoulder brushes both.
+            # The pedestal continues the base downwards: what overlaps one may overlap both.
             spec.add_exclude(bodyname1="world", bodyname2=names[b])
     spec.add_exclude(bodyname1="finger_left", bodyname2="finger_right")
 
 
-# Capsules side by side that cover a plate: each sticks out by a sixth of the plate's edge.
+# Number of parallel capsules that cover a plate; they protrude by a sixth of its edge.
 _STRIPS = 3
 
 
 def whole_arm(config: ArmModelConfig) -> CapsuleArm:
-    """Capsules that contain all of the modelled arm: links, hand, fingers and plate.
+    """Capsules that contain the whole simulated arm: links, hand, fingers and plate.
 
-    The fingers are within the hand's capsules at any opening. Geoms of the simulator stick out
-    by 0.1 mm at most. The other way, capsules reach beyond the hand by up to 30 mm, beyond
-    closed fingers by up to 43 mm and beyond the plate by 11 mm.
+    The fingers are within the hand's capsules at any opening. Geoms of the simulator protrude
+    from the capsules by 0.1 mm at most. Conversely, capsules extend beyond the hand by up to
+    30 mm, beyond closed fingers by up to 43 mm and beyond the plate by 11 mm.
     """
     plate, robot = config.marker, config.robot
     if plate is None or not plate.printed:
@@ -248,7 +248,7 @@ def _add_body(parent, name: str, transform: np.ndarray):
 def _add_capsules(body, robot: Arm, link: int, mass: float | None) -> None:
     capsules = [capsule for capsule in robot.body.capsules if capsule.link == link]
     if not capsules and mass is not None:
-        # A link without a shape still has its mass: a ball of 4 cm that touches nothing.
+        # A link without a shape keeps its mass, in a sphere of 4 cm radius without contacts.
         body.add_geom(
             name=f"link{link}_0",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -346,7 +346,7 @@ def _add_hand(spec: mujoco.MjSpec, hand, config: ArmModelConfig) -> None:
 
 
 class MujocoArm:
-    """A simulated arm as an `Arm` and a `Gripper`."""
+    """A simulated arm that implements the protocols `Arm` and `Gripper`."""
 
     def __init__(
         self,
@@ -355,7 +355,7 @@ class MujocoArm:
         robot: Arm,
         imperfections: DrawnImperfections,
     ):
-        """Find its joints and servos.
+        """Look up the arm's joints and servos in the model.
 
         Args:
             model: Model with the arm of `add_arm`.
@@ -377,18 +377,18 @@ class MujocoArm:
         self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
         self._finger_servos = np.array([model.actuator(n).id for n in fingers])
         self._reference = np.zeros(len(names))
-        # Mass of each body of the arm that it does not compensate [kg]: an unknown load, and
-        # errors of its own model's link masses.
+        # Mass of each of the arm's bodies that gravity compensation misses [kg]: an unknown
+        # load, and errors of the compensated link masses.
         own = model.body_rootid == model.body("link0").id
         self._unknown = np.where(own, model.body_mass * (1.0 - model.body_gravcomp), 0.0)
-        # Estimate of the external torques, as the filter has it [N m]; None: it starts anew.
+        # Filtered estimate of the external torques [N m]; None: the filter starts anew.
         self._felt: np.ndarray | None = None
-        # Position errors [rad] from which on the servos pull no harder.
+        # Position errors at which the servos' torques saturate [rad].
         strongest = model.actuator_forcerange[self._position_servos, 1]
         self._reach = strongest / model.actuator_gainprm[self._position_servos, 0]
 
     def read(self) -> ArmState:
-        """Return the present state, as the arm's own sensors have it."""
+        """Return the present state, as measured by the arm's own sensors."""
         return ArmState(
             time=self._data.time,
             joint_position=self._errors.encoders(self._data.qpos[self.joints]),
@@ -402,8 +402,8 @@ class MujocoArm:
     def _external_torque(self) -> Float[np.ndarray, " joints"]:
         """External torque as estimated from joint torque sensors [N m].
 
-        Contains contacts and external forces, joint friction, which such arms do not model
-        well, and weights that the arm does not know.
+        It contains contacts, external forces, joint friction (which such arms do not model
+        well) and weights that are unknown to the arm.
         """
         data = self._data
         torque = data.qfrc_constraint + data.qfrc_applied
@@ -441,8 +441,8 @@ class MujocoArm:
     def drive(self) -> None:
         """Advance the servos' reference by one physics step.
 
-        It waits for joints that are held up by a contact: what they missed is not made up for
-        once they come free.
+        The reference leads each joint at most by the error at which its servo saturates, so a
+        joint that a contact blocked does not make up for the missed motion afterwards.
         """
         q = self._data.qpos[self.joints]
         dt = self._model.opt.timestep
@@ -472,12 +472,12 @@ class MujocoArm:
         return self._model.site("tcp").pos.copy()
 
     def tcp_pose(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "4 4"]:
-        """True pose of the tool centre point in the base frame."""
+        """True pose of the tool centre point in the world frame (the nominal base frame)."""
         return frame_of((data or self._data).site("tcp"))
 
 
 def frame_of(thing) -> Float[np.ndarray, "4 4"]:
-    """Pose of a site or body of MuJoCo's in the base frame."""
+    """Pose of a MuJoCo site or body in the world frame (the nominal base frame)."""
     pose = np.eye(4)
     pose[:3, :3] = thing.xmat.reshape(3, 3)
     pose[:3, 3] = thing.xpos
