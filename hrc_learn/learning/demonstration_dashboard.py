@@ -1,7 +1,7 @@
 """Rerun recording of a dataset: the arm, its cameras and curves, episode by episode.
 
-Each episode has a timeline of its own, named after it, so that one layout shows them all. The
-timeline "time" holds the first episode.
+Each episode has its own timeline, named after the episode, so one layout serves all episodes.
+The timeline "time" shows the first episode.
 """
 
 import os
@@ -51,7 +51,7 @@ _CODECS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ShownDataset:
-    """Demonstrations of a dataset with what it takes to show them."""
+    """Demonstrations of a dataset, with the arm, units and images needed to show them."""
 
     title: str
     demos: Sequence[Demonstration]
@@ -59,13 +59,13 @@ class ShownDataset:
     arm: DatasetArm | None = None
     """Arm to draw; None draws the path of the end effector alone."""
     units: Mapping[str, UnitDecision] = field(default_factory=dict)
-    """Units on disk by role, in which joints are plotted; rad if not given."""
+    """Units on disk by role; joints are plotted in these units, or in rad if not given."""
     images: Callable[[Demonstration], Mapping[str, CameraImages]] = lambda demo: {}
     """Images of a demonstration by camera."""
     cameras: Sequence[str] = ()
-    """All cameras."""
+    """Names of all cameras."""
     notes: Sequence[str] = ()
-    """Remarks of the reader."""
+    """Remarks of the dataset reader."""
 
 
 def record_demonstrations(path: str | os.PathLike[str], shown: ShownDataset) -> float:
@@ -88,9 +88,9 @@ def demonstration_layout(shown: ShownDataset) -> rrb.Blueprint:
     left: list[rrb.View | rrb.Container] = []
     path = tool_path(shown, first)
     if path is not None:
-        name, points = "Paths of the end effector, dots: now", path
+        name, points = "Paths of the end effector (dots: current position)", path
         if (arm := shown.arm) is not None and first.joint_position is not None:
-            name = f"{arm.arm.name}, and the paths of its tool (dots: now)"
+            name = f"{arm.arm.name} and the paths of its tool (dots: current position)"
             q = torch.from_numpy(arm.positions(first.joint_position))
             points = np.concatenate([path, arm.arm.joint_origins(q).flatten(0, 1).numpy()])
         eye = frame_view(points, direction=(0.85, 0.5, 0.4), nearest=0.3)
@@ -105,7 +105,7 @@ def demonstration_layout(shown: ShownDataset) -> rrb.Blueprint:
     episodes = rrb.TextDocumentView(origin="/summary", name="Episodes")
     tabs = [tab_view(_episode_tab(shown, first)), episodes]
     right = rrb.Vertical(rrb.Tabs(contents=tabs, active_tab=0), task, row_shares=(9, 1))
-    # Without arm, path and cameras the curves have the whole screen.
+    # Without arm, path and cameras, the curves fill the whole screen.
     return dashboard(left, [right], row_shares=(3, 2), column_shares=(1, 1))
 
 
@@ -115,7 +115,7 @@ def send_demonstrations(
     """Send the demonstrations one by one, and yield each one that was sent.
 
     Args:
-        stream: Into a file or to a viewer that has the layout of `demonstration_layout`.
+        stream: Stream to a file or viewer that has the layout of `demonstration_layout`.
         shown: The demonstrations.
     """
     begin(stream, shown.title)
@@ -136,7 +136,7 @@ def send_demonstrations(
 
 
 def tool_path(shown: ShownDataset, demo: Demonstration) -> Float[np.ndarray, "time 3"] | None:
-    """Recorded path of the end effector, or that of the arm [m]; None if neither is known."""
+    """Path of the end effector, recorded or computed from the joints [m]; None if unknown."""
     if demo.position is not None or shown.arm is None or demo.joint_position is None:
         return demo.position
     q = torch.from_numpy(shown.arm.positions(demo.joint_position))
@@ -176,7 +176,7 @@ def _send_images(
 
 
 def _episode_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
-    """All that was recorded in an episode, commands next to what was measured."""
+    """Plots of all quantities recorded in an episode, commanded and measured in one plot."""
     limits, plots = _limits(shown), []
     for chart in demonstration_charts(demo, shown.units):
         path, is_joint = f"episode/{chart.key}", chart.key.startswith("joint_")
@@ -193,14 +193,14 @@ def _episode_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
 
 
 def _limits(shown: ShownDataset) -> JointRanges | None:
-    """Joint limits of the arm in the units of the dataset, by the dataset's joints."""
+    """Joint limits of the arm for each joint of the dataset, in the dataset's units."""
     if shown.arm is None:
         return None
     count = len(shown.demos[0].joint_names)
     lower, upper = np.full(count, np.nan), np.full(count, np.nan)
     for joint, column in enumerate(shown.arm.columns):
         unit, factor = own_unit(shown.units, "joint_position", column)
-        if unit in ("rad", "deg"):  # shares of a range have theirs in their name
+        if unit in ("rad", "deg"):  # the limits of fractions of a range are known from the unit
             lower[column] = float(shown.arm.arm.limits.lower[joint]) / factor
             upper[column] = float(shown.arm.arm.limits.upper[joint]) / factor
     return JointRanges(lower=lower, upper=upper)
@@ -209,7 +209,7 @@ def _limits(shown: ShownDataset) -> JointRanges | None:
 def _send_path(
     stream: rr.RecordingStream, shown: ShownDataset, demo: Demonstration, k: int
 ) -> str:
-    """Draw the path of an episode's tool; returns its length [m] in words."""
+    """Draw the path of an episode's tool; returns the path length [m] as text."""
     path = tool_path(shown, demo)
     if path is None:
         return ""

@@ -1,7 +1,7 @@
-"""Rerun recordings and reports of fits: primitives with their demonstrations, image Jacobians.
+"""Rerun recordings and reports of fitted primitives and image Jacobians.
 
-Primitives are shown over their demonstrations, image Jacobians by a map of their errors and the
-convergence of their learning rounds.
+Primitives are shown with their demonstrations, image Jacobians with a map of their errors and
+the convergence of their learning rounds.
 """
 
 import os
@@ -48,7 +48,7 @@ _THOUSANDTHS = {"rad": "mrad", "m": "mm", "of the range": "1/1000 of the range"}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShownFit:
-    """Demonstrations and reproductions of the joints, or else of the position."""
+    """Demonstrations and reproductions of the joints or, without joints, of the position."""
 
     title: str
     names: tuple[str, ...]
@@ -69,7 +69,7 @@ class ShownFit:
     n_basis: int
     """Number of basis functions."""
     residual: Mapping[int, float]
-    """Held-out error of each number of basis functions tried; empty if it was given."""
+    """Held-out error of each number of basis functions tried; empty if the number was given."""
 
 
 def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
@@ -124,12 +124,12 @@ def record_fit(path: str | os.PathLike[str], fit: ShownFit) -> None:
 
     Args:
         path: File to write; it appears only when complete.
-        fit: Demonstrations and reproductions; the first `_MOST_TABS` get a tab of their own.
+        fit: Demonstrations and reproductions; each of the first `_MOST_TABS` gets a tab.
     """
     tabs = [_tab(fit, i) for i in range(min(_MOST_TABS, len(fit.demos)))]
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
     if every := [*fit.paths, *fit.reproduced_paths]:
-        name = "Paths: demonstrations (grey), reproductions (blue, dots: now)"
+        name = "Paths: demonstrations (grey), reproductions (blue, dots: current position)"
         eye = frame_view(np.concatenate(every), base=False)
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
     right = rrb.Tabs(contents=[tab_view(tab) for tab in tabs], active_tab=0)
@@ -146,14 +146,14 @@ def record_fit(path: str | os.PathLike[str], fit: ShownFit) -> None:
 
 
 def _tab(fit: ShownFit, i: int) -> Tab:
-    """Joint plots of demonstration i, and its error."""
+    """Plots of each coordinate of demonstration i, and of its reproduction error."""
     root, demo, made = f"demonstration_{i + 1}", fit.demos[i], fit.reproductions[i]
     plots = [
         joint_plot(root, name, j, made, demo, fit.limits, fit.unit)
         for j, name in enumerate(fit.names)
     ]
     error = several(f"{root}/error", fit.names, 1e3 * (made - demo))
-    title = f"Error, all together [{_THOUSANDTHS[fit.unit]}]"
+    title = f"Error of all coordinates [{_THOUSANDTHS[fit.unit]}]"
     plots.append(Plot(title=title, curves=(error,)))
     return Tab(title=f"Demonstration {i + 1}", plots=tuple(plots), columns=2)
 
@@ -211,10 +211,10 @@ def fit_report(
 
 
 _MOST_PATHS = 30
-"""Largest number of paths drawn, as more hide each other."""
+"""Largest number of paths drawn; more would hide each other."""
 _BELOW = 0.03
 """Distance of the error map below the lowest path, so that both are visible [m]."""
-_THICKNESS = 0.002  # of the error map's cells [m]
+_THICKNESS = 0.002  # half thickness of the error map's cells [m]
 _ROUND = "round"
 """Timeline of learning, with one step per round."""
 
@@ -226,8 +226,8 @@ def record_learning(
 
     Args:
         path: File to write; it appears only when complete.
-        skill: Skill that was just fitted: a loaded one has no held-out errors.
-        demos: Its demonstrations, of which the first are drawn.
+        skill: Skill that was just fitted; a loaded one has no held-out errors.
+        demos: Demonstrations of the skill; the first `_MOST_PATHS` are drawn.
         title: Title of the recording.
     """
     assert skill.cells is not None
@@ -235,7 +235,7 @@ def record_learning(
     paths = [demo.pose.position.numpy() for demo in watched]
     tab = Tab(title="", plots=()) if skill.learned is None else _convergence(skill.learned)
     name = "End effector (grey), held-out error (blue)"
-    # Near and steep, so that every cell can be read.
+    # A near and steep view, in which every cell can be read.
     eye = frame_view(np.concatenate(paths), base=False, direction=(0.75, 0.2, 1.0), nearest=0.2)
     left = [
         rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye),
@@ -259,7 +259,7 @@ def record_learning(
 
 
 def _convergence(learned: EvidenceResult) -> Tab:
-    """A plot for each quantity over the rounds, with a dot at the round that was kept."""
+    """Plots of each quantity over the rounds, with a dot at the round that was kept."""
     rounds, configs = learned.rounds, [state.config for state in learned.rounds]
     plots = []
     for name, values in (
@@ -282,13 +282,13 @@ def _rounds(numbers: np.ndarray) -> list[rr.TimeColumn]:
 
 
 def _error_map(cells: CellErrors, height: float) -> rr.Boxes3D:
-    """Flat boxes, the darker the larger the error, with the error in percent on them."""
+    """Flat boxes labelled with the error in percent; a larger error is darker."""
     edges, errors = cells.edges.mT.numpy(), cells.relative.numpy()
     known = np.isfinite(errors)
     relative, flat = errors[known], np.full(int(known.sum()), _THICKNESS)
     middle = np.meshgrid(*((axis[1:] + axis[:-1]) / 2 for axis in edges), indexing="ij")
     size = np.meshgrid(*(np.diff(axis) for axis in edges), indexing="ij")
-    # From a pale blue to one on which black figures can still be read.
+    # From pale blue to a shade on which black numbers can still be read.
     shades = matplotlib.colormaps["Blues"](0.15 + 0.5 * relative / relative.max(initial=1e-12))
     centers = [*(grid[known] for grid in middle), np.full_like(flat, height)]
     return rr.Boxes3D(
@@ -306,6 +306,6 @@ def _learning_summary(skill: VisualServoSkill, title: str) -> str:
     lines = [f"# {title}", ""]
     if (learned := skill.learned) is not None:
         last = len(learned.rounds) - 1
-        lines += [f"Round {learned.best} of {last} was kept: the dots.", ""]
+        lines += [f"Round {learned.best} of {last} was kept (red dots).", ""]
     rows = [(n.replace("_", " "), f"{value:.4g}") for n, value in skill.metrics().items()]
     return "\n".join([*lines, *markdown_table(("measured", "value"), rows)])

@@ -1,4 +1,4 @@
-"""A fitted model as a whole: its primitives by channel, its units, and the arm it moves."""
+"""Fitted model in a folder: its primitives by channel, its units, and the arm it moves."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from hrc_learn.learning.primitive_fitting import Primitive, load_primitive
 CHANNELS = ("joint", "pose", "position")
 """Channels that can be played; an orientation alone moves no arm."""
 _RAD = {"rad": 1.0, "deg": math.pi / 180}
-"""Units of joints with a fixed size, in radians."""
+"""Radians per unit, for joint units of a fixed size."""
 _SAME_TOOL = 0.02
-"""Largest distance between the model's poses and those of its joints [m]."""
+"""Largest distance between the model's first position and the tool at its first joints [m]."""
 KINDS = "joints", "position", "pose"
 """Kinds of goals."""
 
@@ -32,16 +32,16 @@ class Target:
     """Start or goal of a motion."""
 
     joints: Float[Tensor, " joints"] | None = None
-    """In the model's unit."""
+    """Joint positions in the model's unit."""
     position: Float[Tensor, "3"] | None = None
-    """[m]"""
+    """Position of the tool [m]."""
     orientation: Float[Tensor, "4"] | None = None
-    """Unit quaternion (w, x, y, z); None leaves the model's."""
+    """Unit quaternion (w, x, y, z); None keeps the model's orientation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FittedModel:
-    """Primitives of a folder of `hrc fit`."""
+    """Primitives in a folder written by `hrc fit`."""
 
     folder: Path
     primitives: Mapping[str, Primitive]
@@ -57,8 +57,8 @@ class FittedModel:
         found = [channel for channel in CHANNELS if (folder / channel).is_dir()]
         if not found:
             raise FileNotFoundError(
-                f"{folder} holds no primitive of joints, poses or positions: give a folder of "
-                "hrc fit"
+                f"{folder} holds no primitive of joints, poses or positions: give a folder "
+                "written by hrc fit"
             )
         loaded = {c: cast(Any, load_primitive(folder / c, c)).double() for c in found}
         return cls(folder=folder, primitives=loaded)
@@ -75,7 +75,7 @@ class FittedModel:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, empty without their primitive."""
+        """Names of the joints; empty without a primitive of the joints."""
         joint = self.joint
         if joint is None:
             return ()
@@ -83,10 +83,10 @@ class FittedModel:
         return tuple(name.removesuffix(".pos") for name in names)
 
     def target(self, words: Sequence[str], option: str) -> Target:
-        """Start or goal from the words of an option.
+        """Parse a start or goal from the words of an option.
 
         Args:
-            words: Numbers, or "joints", "position" or "pose" before them.
+            words: Numbers, which may follow "joints", "position" or "pose".
             option: Name of the option, for errors.
 
         Raises:
@@ -105,12 +105,12 @@ class FittedModel:
         if not fits or not bool(values.isfinite().all()):
             raise ValueError(
                 f"{option} {' '.join(words)}: {self.folder} takes {forms}, all finite, or "
-                "episode and its number."
+                "the word episode and its number."
             )
         if len(fits) > 1:
             raise ValueError(
                 f"{option}: {len(values)} numbers may be {' or '.join(fits)}: write "
-                f"{option} {fits[0]} before them, or {fits[1]}."
+                f"{option} {fits[0]} or {option} {fits[1]} before them."
             )
         if fits[0] == "joints":
             return Target(joints=values)
@@ -119,12 +119,12 @@ class FittedModel:
         norm = float(values[3:].norm())
         if abs(norm - 1) > 0.02:
             raise ValueError(
-                f"{option} pose: w x y z have the norm {norm:.3f}, but a quaternion has 1."
+                f"{option} pose: the norm of w x y z is {norm:.3f}, but must be 1."
             )
         return Target(position=values[:3], orientation=values[3:] / norm)
 
     def in_rad(self, robot: Arm, values: Float[Tensor, "*batch joints"]) -> Tensor:
-        """Joint positions of an arm [rad] from the model's, (*batch, joints).
+        """Convert the model's joint positions to those of an arm [rad], (*batch, joints).
 
         Raises:
             ValueError: The model's unit has no fixed size.
@@ -138,35 +138,35 @@ class FittedModel:
         return joints[..., np.argsort(columns).tolist()] / factor
 
     def _columns(self, robot: Arm) -> tuple[float, list[int]]:
-        """Radians in the model's unit, and the model's column of each joint of the arm."""
+        """Radians per unit of the model, and the model's column of each joint of the arm."""
         assert self.joint is not None
         unit = self.joint.units
         if unit not in _RAD:
-            shown = "shares of their ranges" if unit in ("1", "%") else repr(unit)
+            shown = "fractions of their ranges" if unit in ("1", "%") else repr(unit)
             raise ValueError(
-                f"{self.folder} holds joints in {shown}, of which no angle is known: fit "
+                f"{self.folder} holds joints in {shown}, which have no known size in rad: fit "
                 "with the unit of the dataset (--units joint_position deg) or convert it with "
-                "the robot's calibration; without --robot the model is played as it is."
+                "the robot's calibration. Without --robot, the model is played in its own unit."
             )
         return _RAD[unit], [self.joint_names.index(name) for name in robot.chain.joint_names]
 
 
 def arm_for(model: FittedModel, name: str) -> Arm:
-    """Arm whose tool the model's poses are of: that of its description, or with our hand.
+    """Arm with the tool to which the model's poses belong: its described tool, or our hand.
 
     Args:
         model: The model.
-        name: Registered arm, or its file.
+        name: Name of a registered arm, or file of an arm's description.
 
     Raises:
-        ValueError: The model moves other joints, or poses of another tool or base.
+        ValueError: The model has other joints, or its poses belong to another tool or base.
     """
     robot = ArmChoice(name).arm()
     names = robot.chain.joint_names
     if model.joint is not None and {*model.joint_names} != {*names}:
         raise ValueError(
             f"{model.folder} moves the joints {', '.join(model.joint_names)}, but {name} has "
-            f"{', '.join(names)}: choose the arm it was taught with, or fit --joint-names."
+            f"{', '.join(names)}: choose the arm of its demonstrations, or fit --joint-names."
         )
     if model.joint is None or model.pose is None:
         return robot
@@ -180,8 +180,8 @@ def arm_for(model: FittedModel, name: str) -> Arm:
     best = int(np.argmin(apart))
     if apart[best] > _SAME_TOOL:
         raise ValueError(
-            f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from where its "
-            f"joints put the tool of {name}: they are of another tool or base frame. Fit with "
+            f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from the tool of "
+            f"{name} at its first joints: they belong to another tool or base frame. Fit with "
             "--channels joint, or choose the arm's description with that tool."
         )
     return arms[best]

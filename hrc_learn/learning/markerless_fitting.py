@@ -1,11 +1,11 @@
-"""Tool and object of demonstrations, found in their video: no marker, no calibration.
+"""Detection of tool and object in demonstration videos, without markers or calibration.
 
-The arm moves, so its pixels differ from the usual ones. Features of these pixels are followed
-through frames of all demonstrations. Every point fixed to a link of the arm moves as the
-kinematics say, seen by one unknown camera: a camera fitted to one such track (`fit_camera`)
-predicts all others of that link, and the camera that explains most tracks is right. These
-tracks become the points of the tool. The object is what changed its place between the
-demonstrations and lies where their motion ends.
+The pixels of the moving arm differ from the background image. Features of these pixels are
+tracked through frames of all demonstrations. Every point fixed to a link of the arm moves
+according to the kinematics and is seen by one unknown camera. Therefore, a camera fitted to one
+such track (`fit_camera`) predicts all other tracks of that link, and the camera that explains
+most tracks is chosen. These tracks become the points of the tool. The object is what changes
+its position between demonstrations and lies where their motion ends.
 """
 
 from __future__ import annotations
@@ -55,34 +55,34 @@ from hrc_learn.vision.landmarks import (
 )
 from hrc_learn.vision.markers import as_grey
 
-# Frames of all demonstrations that are searched for tracks; those among them from whose
-# features tracks start; and those of which the usual image is the median.
+# Number of frames, over all demonstrations, that are searched for tracks; of frames from whose
+# features tracks start; and of frames whose median is the background image.
 _FRAMES, _STARTS, _USUAL = 72, 10, 31
-# Fewest frames of a track; least spread of its pixels [px of 1440]; tracks to which cameras are
-# fitted; tracks after which no further camera is tried; and largest error of a point that moves
-# with its link [px of 1440].
+# Fewest frames of a track; least spread of its pixels; number of tracks to which cameras are
+# fitted; number of explained tracks at which the search for a camera stops; and largest error
+# of a point that moves with its link. Pixels are those of an image 1440 px wide.
 _SHORTEST, _STILL, _TRIED, _ENOUGH, _AGREES = 10, 20.0, 12, 150, 4.0
-# Errors beyond which pixels count less, adjustment by adjustment [px of 1440].
+# Error beyond which pixels count less in each of three bundle adjustments [px of 1440].
 _CLOSER = (8.0, 4.0, 2.0)
 # Largest distance of a point from the origin of its link [m].
 _NEAR = 0.35
-# Frames of all demonstrations in which the tool is looked for at last.
+# Number of frames, over all demonstrations, in which the tool is finally detected.
 _FOLLOWED = 320
-# Largest width of a part of the picture of what was found [px].
+# Largest width of each image in the picture of the findings [px].
 _TILE = 720
-# Length of the line below the tool on which the object lies at the end [m]; images without the
-# arm before the object.
+# Length of the line ahead of the tool on which the object lies at the end [m]; number of images
+# per demonstration from which the object is learned, while the tool is far from it.
 _DEEPEST, _CLEAR = 0.25, 7
 
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerlessFit:
-    """Demonstrations with what was found in their video."""
+    """Demonstrations with the tool and object found in their video."""
 
     demos: DemonstrationSet
-    """Demonstrations with image features, in place of those recorded."""
+    """Demonstrations with the image features found, in place of recorded ones."""
     landmarks: Landmarks
-    """Tool and object, to be found at run time."""
+    """Tool and object, for detection at run time."""
     camera: Float[Tensor, "13"]
     """Camera that explains the motion of the tool (see `jacobian.perspective`)."""
     seen: float
@@ -90,7 +90,7 @@ class MarkerlessFit:
     deviation: float
     """Median standard deviation of the tool's pixel [px]."""
     picture: UInt8[np.ndarray, "height width 3"]
-    """Last searched images with what was found drawn over them."""
+    """First and last image with the tool of up to three demonstrations, findings drawn in."""
 
     def figures(self) -> dict[str, float]:
         """Measured values by name."""
@@ -108,7 +108,7 @@ class MarkerlessFit:
 
 
 class _Link(NamedTuple):
-    """Poses of a link in the searched frames, and the line on which the place lies."""
+    """Poses of a link in the searched frames, and the axis on which its `Tool.place` lies."""
 
     pose: Pose
     axis: tuple[np.ndarray, np.ndarray] | None = None
@@ -145,14 +145,15 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
     if best is None or best[0] < FEWEST_POINTS:
         raise ValueError(
             f"{source.source}, {key}: nothing in the video moves as the arm's kinematics say "
-            f"({0 if best is None else best[0]} points, {FEWEST_POINTS} wanted). See that this "
-            "camera stands still, the gripper is in its view, and joints and images belong "
-            "to the same time."
+            f"({0 if best is None else best[0]} points found, {FEWEST_POINTS} needed). Check "
+            "that this camera stands still and sees the gripper, and that joints and images "
+            "are synchronised."
         )
     _, link, fit = best
     tool, adjusted = _tool(tracks, link, fit.camera, (width, height))
     landmarks = Landmarks(tool=tool, image_size=(width, height))
-    # The place as the tool sees it: where it belongs to the wrist, it is on the common axis.
+    # The place in the tool frame. A place on the wrist link lies on the axis of the last joint,
+    # so it is fixed in the tool frame, too.
     place = poses[0].inverse().apply(link.pose[0].apply(torch.from_numpy(tool.place)))
     seen_by = torch.cat([adjusted[: MARKER.start], place])
     found = search.follow(landmarks, seen_by)
@@ -172,7 +173,7 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
 
 
 class _Search:
-    """Frames of all demonstrations in which tool and object are looked for."""
+    """Search for tool and object in frames of all demonstrations."""
 
     def __init__(
         self, reader: ImageReader, key: str, demos: DemonstrationSet, size: tuple[int, int]
@@ -185,7 +186,7 @@ class _Search:
         ]
 
     def features(self) -> list[Features]:
-        """Features of the picked frames where they differ from the usual image."""
+        """Features of the picked frames where they differ from the background image."""
         images = [image for rows in self._pictures(self.picked) for image in rows]
         stride = max(1, len(images) // _USUAL)
         usual = np.median(np.stack(images[::stride]), axis=0).astype(np.uint8)
@@ -200,13 +201,13 @@ class _Search:
     def follow(
         self, landmarks: Landmarks, camera: Float[Tensor, "13"]
     ) -> list[list[Finding | None]]:
-        """The tool in frames of every demonstration; None where it was not looked for, too."""
+        """Tool in each frame of every demonstration; None if not found or not searched."""
         found: list[list[Finding | None]] = []
         stride = max(1, sum(map(len, self._demos)) // _FOLLOWED)
         for demo in self._demos:
             detector = LandmarkDetector(landmarks)
             row: list[Finding | None] = [None] * len(demo)
-            # From the last frame back, at which the target is learned.
+            # Count back from the last frame, at which the target is learned.
             wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
             expected = marker_pixels(camera, _pose_of(demo))[0].numpy()
             most = 4 * _AGREES * self._size[0] / 1440
@@ -222,7 +223,7 @@ class _Search:
     def picture(
         self, found: Sequence[Sequence[Finding | None]], objects: Sequence[Finding | None]
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """First and last image with the tool of some demonstrations, the findings drawn in."""
+        """First and last image with the tool of three demonstrations, findings drawn in."""
         rows, smaller = [], -(-self._size[0] // _TILE)
         for demo, tools, item in list(zip(self._demos, found, objects, strict=True))[:3]:
             seen = [k for k, finding in enumerate(tools) if finding is not None] or [0]
@@ -236,11 +237,11 @@ class _Search:
         return np.vstack(rows)
 
     def object(self, camera: Float[Tensor, "13"]) -> tuple[Object, list[Finding | None]] | None:
-        """Views of the object, and its place in each demonstration; None: there is none."""
+        """Views of the object, and its place in each demonstration; None if not found."""
         below = [_below(demo, camera) for demo in self._demos]
         rows = []
         for demo, line in zip(self._demos, below, strict=True):
-            # While the tool is far from it, or not in the image yet, nothing hides the object.
+            # While the tool is far from the object or outside the image, nothing hides it.
             tool = marker_pixels(camera, _pose_of(demo))[0].numpy()
             away = np.linalg.norm(tool[:, None] - line, axis=-1).min(axis=1)
             rows.append(sorted(np.argsort(away)[-_CLEAR:].tolist()))
@@ -251,15 +252,15 @@ class _Search:
 
 
 class _Tracks(NamedTuple):
-    """Features followed through the searched frames."""
+    """Features tracked through the searched frames."""
 
     pixels: Float[np.ndarray, "tracks frames 2"]
-    """(u, v) [px]; NaN: not seen."""
+    """Pixels (u, v) [px]; NaN where a feature is not seen."""
     descriptors: UInt8[np.ndarray, "tracks 128"]
 
 
 def _tracks(features: Sequence[Features], width: int) -> _Tracks:
-    """Features of some frames with their matches in all frames, those that moved."""
+    """Features of some frames, matched in all frames; only features that moved are kept."""
     tracks, descriptors = [], []
     starts = np.unique(np.linspace(0, len(features) - 1, _STARTS).astype(int))
     for start in starts:
@@ -283,12 +284,12 @@ def _tracks(features: Sequence[Features], width: int) -> _Tracks:
 def _cameras(
     tracks: _Tracks, links: Sequence[_Link], image_size: tuple[int, int]
 ) -> Iterator[CameraFit]:
-    """Cameras fitted to single tracks, the longest first, as points of each link."""
+    """Cameras fitted to single tracks, the longest first, each as a point of every link."""
     pixels = tracks.pixels
     chosen: list[np.ndarray] = []
     for k in np.argsort(-np.isfinite(pixels[..., 0]).sum(1)):
         apart = [np.nanmedian(np.linalg.norm(pixels[k] - other, axis=-1)) for other in chosen]
-        # Starts in several frames give the same point again.
+        # Tracks that start in different frames may show the same point.
         if len(chosen) < _TRIED and all(not a < _STILL * image_size[0] / 1440 for a in apart):
             chosen.append(pixels[k])
             for link in links:
@@ -301,9 +302,9 @@ def _cameras(
 def _points(
     tracks: _Tracks, pose: Pose, camera: Float[Tensor, "13"], width: int
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " tracks"]]:
-    """Place of each track in the frame of a link [m], and True if it moves with the link.
+    """Point of each track in the frame of a link [m], and True if it moves with the link.
 
-    Robust least squares: a point m is seen from the eye e along d, so d x (p + T m - e) = 0.
+    Robust least squares: a camera at e sees a point m in direction d, so d x (p + T m - e) = 0.
     """
     position, turn = pose.position.numpy(), quaternion.to_matrix(pose.orientation).numpy()
     pixels = torch.from_numpy(tracks.pixels)
@@ -311,7 +312,7 @@ def _points(
     seen = np.isfinite(sight[..., 0])
     sight = np.nan_to_num(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
     lever = eye_of(camera).numpy() - position
-    # Rows of the matrix that takes the cross product with a line of sight.
+    # Matrices of the cross product with each line of sight.
     across = np.cross(sight[..., None, :], np.eye(3)).swapaxes(-1, -2)
     design, right = across @ turn, (across @ lever[..., None])[..., 0]
     scale = float(camera[FOCAL].exp()) / np.maximum(np.linalg.norm(lever, axis=-1), 0.05)
@@ -335,7 +336,7 @@ def _points(
 def _tool(
     tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], image_size: tuple[int, int]
 ) -> tuple[Tool, Float[Tensor, "13"]]:
-    """The tool of the points that move with a link, and the camera adjusted to all of them."""
+    """Tool made of the points that move with a link, and the camera adjusted to all of them."""
     width = image_size[0]
     for reach in _CLOSER:
         points, agrees = _points(tracks, link.pose, camera, width)
@@ -350,7 +351,7 @@ def _tool(
     points = points[agrees]
     place = np.median(points, axis=0)
     if link.axis is not None:
-        # On the axis of the last joint, which turns about it, near the points.
+        # The nearest point on the axis of the last joint: this joint does not move it.
         origin, direction = link.axis
         place = origin + ((place - origin) @ direction) * direction
     f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
@@ -390,7 +391,7 @@ def _poses(demos: DemonstrationSet, picked: Sequence[Sequence[int]]) -> Pose:
 def _wrist(
     source: DemonstrationSource, demos: DemonstrationSet, picked: Sequence[Sequence[int]]
 ) -> Iterator[_Link]:
-    """The link before the last joint, where arm and joints are known."""
+    """The link before the last joint, if arm and joint positions are known."""
     joints = [d.joint_position for d in demos]
     rows = [q[k] for q, k in zip(joints, picked, strict=True) if q is not None]
     try:
@@ -418,7 +419,7 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
     end = _pose_of(demo)[-1]
     depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)[:, None]
     points = end.position + depth * quaternion.to_matrix(end.orientation)[:, 2]
-    # A camera whose marker is at the origin of a frame that stands at each point.
+    # With the marker at the origin of the tool frame, poses at the points give their pixels.
     bare = torch.cat([camera[:10], camera.new_zeros(3)])
     pixels, _ = marker_pixels(bare, Pose(points, end.orientation.expand(len(depth), 4)))
     return pixels.numpy()
@@ -427,12 +428,12 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
 def _common_object(
     seen: Sequence[Features], lines: Sequence[Float[np.ndarray, "points 2"]], width: int
 ) -> tuple[Object, list[Finding | None]] | None:
-    """The object in the view that most others match where their motion ends."""
+    """Object of the view that most others match near where their motion ends."""
     rows: list[list[Finding | None]] = []
     for features, line in zip(seen, lines, strict=True):
         first = replace(features, pixels=features.pixels - line[len(line) // 2])
         found = [match_view(first, other, width) for other in seen]
-        # It lies near the line below the tool.
+        # The object lies near the line ahead of the tool.
         near = [
             f if f and np.linalg.norm(end - f.pixel, axis=1).min() < ASIDE * width else None
             for f, end in zip(found, lines, strict=True)
@@ -455,7 +456,7 @@ def _described(
     tools: Sequence[Sequence[Finding | None]],
     objects: Sequence[Finding | None],
 ) -> DemonstrationSet:
-    """Demonstrations with columns of what was found, as markers would have given them."""
+    """Demonstrations with the findings in the columns that markers would give."""
     result = []
     for demo, found, item in zip(demos, tools, objects, strict=True):
         visible = np.array([f is not None for f in found])

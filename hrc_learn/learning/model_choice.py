@@ -80,15 +80,15 @@ def keep_best(
         demos: Demonstrations.
         columns: Columns whose first row is the context. Default: start and goal.
         folder: Folder of the model.
-        regression_only: True to save a function of the context, whatever predicts best.
+        regression_only: True to choose only among regressions on the context.
 
     Returns:
         Median held-out errors, `held_out_CHANNEL_MODEL_nrmse_median`, of the best model of each
         kind.
 
     Raises:
-        ValueError: A function of the context has no channel or too few demonstrations, or a
-            demonstration lacks a column.
+        ValueError: A demonstration lacks a column or, with `regression_only`, there is no
+            channel for a regression, or too few demonstrations.
     """
     metrics: dict[str, float] = {}
     chosen: dict[str, str] = {}
@@ -112,7 +112,7 @@ def keep_best(
 
 
 def best_models(folder: Path) -> dict[str, str]:
-    """Best model of each channel in a model's folder, without those that are the mean.
+    """Kind of the best model of each channel; channels for which the mean is best are left out.
 
     Raises:
         ValueError: The file is damaged.
@@ -128,7 +128,7 @@ def _choice(folder: Path) -> _Choice:
 
 
 def predict(folder: Path, channel: str, motions: Motions, demos: DemonstrationSet) -> Any:
-    """Motions that the best model predicts from start, goal and duration.
+    """Motions that the best model predicts from context, start, goal and duration.
 
     Args:
         folder: Folder of `hrc fit`.
@@ -151,8 +151,10 @@ def predict(folder: Path, channel: str, motions: Motions, demos: DemonstrationSe
 def predicted_primitive(
     folder: Path, channel: str, start: Float[Tensor, " D"], goal: Float[Tensor, " D"]
 ) -> JointDMP:
-    """Primitive of the best model for one start and goal; the mean where there is none, and
-    where it needs other columns than start and goal.
+    """Primitive that the best model predicts for one start and goal.
+
+    It is the mean primitive if no model was chosen, or if the model's context is not start and
+    goal.
 
     Raises:
         FileNotFoundError: The folder holds no model.

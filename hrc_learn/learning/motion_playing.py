@@ -1,4 +1,4 @@
-"""A fitted model carried out to a goal: its path, the joints of an arm, and their limits."""
+"""Motion of a fitted model to a goal, in its own coordinates or on an arm within its limits."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from hrc_learn.learning.model_choice import predicted_primitive
 DT = 0.02
 """Time between samples [s]."""
 _DEVIATION = 2e-3
-"""Largest distance of the motion from the planned path [rad]: 1 mm at 0.5 m."""
+"""Largest distance of the motion from the planned path [rad]: 1 mm at a lever of 0.5 m."""
 _KINDS = "velocity", "acceleration"
-"""Limits of a planned path; the motion filter keeps the jerk."""
+"""Limits checked on the planned path; the motion filter enforces the jerk limit."""
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
-"""Longest time after the path in which the motion reaches its end [s]."""
+"""Longest time after the end of the path for the motion to settle there [s]."""
 _TURNS = 30
-"""Steps towards an orientation that an arm may have no joints for."""
+"""Steps towards an orientation that an arm of fewer than six joints may not reach."""
 _MISSED = 1e-3
 """Error that counts as out of reach [m, rad]."""
 
 
 class BeyondLimitsError(RuntimeError):
-    """The motion leaves a limit that no longer duration can keep."""
+    """The motion violates a limit, whatever its duration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,20 +45,20 @@ class PlayedMotion:
     """Motion of a model to a goal."""
 
     time: Float[np.ndarray, " samples"]
-    """[s]"""
+    """Time of each sample [s]."""
     joints: Float[np.ndarray, "samples joints"] | None = None
-    """Joint positions, in rad with an arm, else in the model's unit."""
+    """Joint positions, in rad on an arm, else in the model's unit."""
     position: Float[np.ndarray, "samples 3"] | None = None
     """Position of the end effector [m]."""
     orientation: Float[np.ndarray, "samples 4"] | None = None
     """Unit quaternions (w, x, y, z)."""
     planned_duration: float
-    """Duration that was asked for [s]; the motion is longer where the limits demand it."""
+    """Requested duration [s]; the motion takes longer if the limits require it."""
     slowed_by: str = ""
-    """Limit that made the motion slower."""
+    """First limit that made the motion slower; empty if none did."""
     goal_errors: Mapping[str, float]
-    """Errors of the end: `goal_position_error_mm`, `goal_turn_error_deg`, and the largest one
-    of a joint in the unit of `joints`, `goal_joint_error`."""
+    """Errors at the goal: `goal_position_error_mm` and `goal_turn_error_deg`, or
+    `goal_joint_error`, the largest error of a joint in the unit of `joints`."""
     deviation: float = 0.0
     """Largest distance of a joint from the planned path [rad]."""
 
@@ -72,10 +72,10 @@ def play_path(
         model: The model.
         start: Start; None: the model's.
         goal: Goal.
-        duration: [s]; None: the model's.
+        duration: Duration [s]; None: the model's.
 
     Raises:
-        ValueError: The model has no primitive of such a goal.
+        ValueError: The model has no primitive for such a goal, or the start is of another kind.
     """
     kind = "joint" if goal.joints is not None else "pose"
     if kind == "pose" and model.pose is None:
@@ -84,7 +84,7 @@ def play_path(
         raise ValueError(
             f"{model.folder} holds no primitive for a goal of "
             f"{'joints' if kind == 'joint' else 'the end effector'}: it has "
-            f"{' and '.join(model.primitives)}. With --robot one becomes the other."
+            f"{' and '.join(model.primitives)}. With --robot, kinematics converts the goal."
         )
     if start is not None and (start.joints is None) != (goal.joints is None):
         raise ValueError("--start and --goal must be of one kind, or give --robot.")
@@ -116,7 +116,7 @@ def play_on_arm(
 ) -> PlayedMotion:
     """Motion of an arm within its limits, from rest to rest.
 
-    The path keeps its shape; where the limits of velocity, acceleration or jerk demand it, the
+    The path keeps its shape; if the limits of velocity, acceleration or jerk require it, the
     motion takes longer.
 
     Args:
@@ -124,10 +124,10 @@ def play_on_arm(
         robot: The arm, from `arm_for`.
         start: Start; None: the model's.
         goal: Goal.
-        duration: [s]; None: the model's.
+        duration: Duration [s]; None: the model's.
 
     Raises:
-        ValueError: The joints have a unit without a fixed size.
+        ValueError: The model's joint unit has no fixed size.
         UnreachableError: The arm does not reach the path or the goal.
         BeyondLimitsError: The path leaves the range of a joint.
     """
@@ -171,9 +171,9 @@ def play_on_arm(
 def _planner(
     model: FittedModel, robot: Arm, start: Target | None, goal: Target
 ) -> tuple[str, Callable[[float], Float[Tensor, "samples joints"]]]:
-    """Channel that plans the motion, and the joint path [rad] for a duration [s].
+    """Channel that plans the motion, and its function from duration [s] to joint path [rad].
 
-    Joints move by their primitive, or by inverse kinematics of the primitive of the tool.
+    The joints follow the tool's primitive by inverse kinematics, or their own primitive.
     """
     tool = "pose" if model.pose is not None else "position"
     if goal.joints is None and tool in model.primitives:
@@ -183,7 +183,7 @@ def _planner(
         raise ValueError(
             f"{model.folder} holds no primitive of joints: give --goal position or pose."
         )
-    usual = model.in_rad(robot, model.joint.goal)  # refuses shares before any search
+    usual = model.in_rad(robot, model.joint.goal)  # rejects units without a fixed size first
     if goal.joints is None:
         end = _joints_at(model, robot, goal, usual, robot.forward(usual))
     else:
@@ -211,7 +211,7 @@ def _times(duration: float) -> Float[Tensor, " samples"]:
 def _joint_path(
     model: FittedModel, start: Tensor | None, goal: Tensor, duration: float
 ) -> Float[Tensor, "samples joints"]:
-    """Positions in the model's unit, by the model that predicts best, from rest."""
+    """Joint positions from rest in the model's unit, by the model that predicts best."""
     joint = model.joint
     assert joint is not None
     start = joint.start if start is None else start
@@ -222,7 +222,7 @@ def _joint_path(
 
 @torch.no_grad()
 def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration: float) -> Pose:
-    """Poses of the end effector; positions alone keep the orientation of the goal."""
+    """Poses of the end effector; a model of positions keeps the goal's orientation."""
     time, pose = _times(duration), model.pose
     assert goal.position is not None
     if pose is None:
@@ -251,8 +251,8 @@ def _joints_along(
 ) -> Float[Tensor, "samples joints"]:
     """Joint positions [rad] along the model's poses, from the joints at the start.
 
-    The null space moves to the joints that the model has at its goal, that of fewer than six
-    joints to joints that turn the tool towards the goal.
+    In the null space, the arm moves towards the model's joints at its goal; an arm of fewer
+    than six joints moves towards joints that turn the tool to the goal's orientation.
     """
     begin = robot.forward(first)
     start = Target(position=begin.position, orientation=begin.orientation)
@@ -299,9 +299,9 @@ def _first_joints(model: FittedModel, robot: Arm, start: Target | None) -> Tenso
 def _joints_at(
     model: FittedModel, robot: Arm, target: Target | None, near: Tensor, usual: Pose
 ) -> Float[Tensor, " joints"]:
-    """Joint positions [rad] at a pose, near others.
+    """Joint positions [rad] that reach a pose, near given ones.
 
-    Fewer than six joints keep the position, and the orientation as far as they can.
+    An arm of fewer than six joints reaches the position, and the orientation as far as it can.
     """
     pose = _completed(target, usual)
     free = target is not None and target.orientation is None and model.pose is None
@@ -317,7 +317,7 @@ def _joints_at(
 
 
 def _require_range(robot: Arm, path: Float[Tensor, "samples joints"]) -> None:
-    """Refuse a path that leaves the range of a joint."""
+    """Raise `BeyondLimitsError` if a path leaves the range of a joint."""
     beyond = torch.maximum(robot.limits.lower - path, path - robot.limits.upper)
     if float(beyond.max()) > 1e-9:
         k, i = divmod(int(beyond.argmax()), path.shape[1])
@@ -350,14 +350,14 @@ def _within_limits(
 def _distance(
     joints: Float[np.ndarray, "moments joints"], path: Float[Tensor, "samples joints"]
 ) -> float:
-    """Largest distance of a motion from a path, whenever it passes there [rad]."""
+    """Largest distance of a motion from a path, regardless of time [rad]."""
     between = torch.linspace(0, 1, 5, dtype=path.dtype)[:-1, None, None]
     fine = torch.cat([torch.lerp(path[:-1], path[1:], between).flatten(0, 1), path[-1:]])
     return float(torch.cdist(torch.from_numpy(joints), fine, p=torch.inf).amin(1).max())
 
 
 def _pose_errors(pose: Pose, goal: Target) -> dict[str, float]:
-    """Distance and angle of the last pose from the goal."""
+    """Distance and angle between the last pose and the goal."""
     errors = {}
     if goal.position is not None:
         apart = (pose.position[-1] - goal.position).norm()

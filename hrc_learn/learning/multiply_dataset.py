@@ -1,8 +1,8 @@
-"""Episodes of new motions in the columns of the demonstrations they were made of.
+"""Episodes of new motions, with the columns of the demonstrations they were made from.
 
 Columns whose meaning is known (joints, commands, tool, gripper, objects) get the values of the
-new motion; all others are carried along from the demonstration. Every episode keeps its
-provenance in the list of episodes, so that an interrupted job goes on where it stopped.
+new motion; all others are copied from the demonstration at corresponding frames. Every episode
+stores its provenance, so that an interrupted job continues where it stopped.
 """
 
 import re
@@ -29,18 +29,18 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm
 from hrc_learn.store import Claim, json_text, parse_json
 
-# Components that are the pose of an object: NAME.x, NAME.y, NAME.z, and its orientation.
+# Names of the components of an object's pose: NAME.x, NAME.y, NAME.z, and its orientation.
 _AXES = re.compile(r"(?P<name>.+?)[._](?P<axis>[xyz]|w[xyz]|q[wxyz])(?:[._]pos)?$")
 _POSE = ("x", "y", "z", "wx", "wy", "wz", "qw", "qx", "qy", "qz")
 _JOINTS = ("joint_position", "joint_velocity", "command_position", "command_velocity")
 _TOOL = ("position", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw")
 # Quantities that a new motion does not have: images, forces, and the recorder's own clock.
 _LEFT_OUT = ("feature", "feature_visible", "human_effort", "joint_effort", "time")
-# Values up to which a column is one of switches, which are not interpolated.
+# Largest number of distinct values of a switch column; switches are not interpolated.
 _LEVELS = 5
 
 type Place = tuple[str, int]
-"""Feature and number of a component."""
+"""Feature of a component, and its index there."""
 
 
 class MultipliedColumns:
@@ -62,12 +62,12 @@ class MultipliedColumns:
 
         Args:
             source: Demonstrations.
-            taught: Their arm.
+            taught: Arm of the demonstrations.
             robot: Arm of the new motions.
-            objects: Columns of objects that names do not tell, as FEATURE[FIRST:LAST].
+            objects: Columns of objects that names do not reveal, as FEATURE[FIRST:LAST].
 
         Raises:
-            ValueError: Such columns do not exist, or are no pose.
+            ValueError: Columns in `objects` do not exist, or do not form a pose.
         """
         self._source, self._taught, self._robot = source, taught, robot
         self._same = robot.name == taught.arm.name
@@ -88,7 +88,7 @@ class MultipliedColumns:
             self._places[f"object {name}"] = places
             first = np.stack([self._first(places, main) for main in range(len(source))])
             self.objects[name] = pose_of(torch.from_numpy(first))
-        # A command of the tool is its next pose, as LeRobot's robots take it.
+        # A command of the tool is its next pose, as LeRobot's robots expect.
         shown = {
             self._old[k].component(i): (r, n)
             for r in _TOOL
@@ -128,14 +128,14 @@ class MultipliedColumns:
             option, root = f"objects.{name}.columns", self._source.folder.root
             places[name] = column_places(option, text, self._old, root)
             if len(places[name]) not in (3, 6, 7):
-                raise ValueError(f"{option}={text!r} must be of 3, 6 or 7 columns")
+                raise ValueError(f"{option}={text!r} must have 3, 6 or 7 columns")
         return places
 
     def _first(self, places: Sequence[Place], main: int) -> Float[np.ndarray, " numbers"]:
         return np.array([float(self._frames[main][key][0, i]) for key, i in places])
 
     def _rename(self, names: dict[str, np.ndarray]) -> None:
-        """Name the joints of another arm."""
+        """Replace the joint names by those of another arm."""
         old, new = self._taught.arm.joint_names[0], self._robot.joint_names
         patterns = {}
         for role in filter(self._places.__contains__, _JOINTS):
@@ -147,8 +147,8 @@ class MultipliedColumns:
     def _put_joints(
         self, made: dict[str, np.ndarray], values: Mapping[str, np.ndarray]
     ) -> None:
-        """Put the joints of the new motions in the place of the demonstrated ones."""
-        # The last first: there may be more joints, or fewer.
+        """Replace the demonstrated joints by those of the new motions."""
+        # The last columns first, since the number of joints may change.
         for role in sorted(values, key=lambda role: self._places[role][0], reverse=True):
             key, columns = self._places[role][0][0], [i for _, i in self._places[role]]
             if self._same:
@@ -172,7 +172,7 @@ class MultipliedColumns:
     def _along(
         self, main: int, key: str, phase: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T _components"]:
-        """Columns of a demonstration at frames with fractions; switches stay switches."""
+        """Columns of a demonstration at fractional frames; switches are not interpolated."""
         values, made = self._frames[main][key].astype(float), []
         for column in values.T:
             smooth = len(np.unique(column)) > _LEVELS
@@ -192,8 +192,8 @@ class MultipliedColumns:
         """Columns of a new episode in the units on disk.
 
         Args:
-            main: Number of the demonstration whose other columns are carried along.
-            phase: Its frame, with fractions, for each new frame.
+            main: Index of the demonstration from which the other columns are copied.
+            phase: Fractional frame of that demonstration for each new frame.
             joints: Joint positions [rad].
             sent: Commanded joint positions [rad].
             gripper: Measured opening; None: that of the demonstration.
@@ -227,20 +227,20 @@ class MultipliedColumns:
     def _pose_columns(
         self, role: str, pose: Pose, main: int, of: str = ""
     ) -> Float[np.ndarray, "T _numbers"]:
-        """Poses as the numbers of a role, of the tool or of an object."""
+        """Poses of the tool or of an object in the representation of a role."""
         if role == "position":
             return pose.position.numpy()
         q = quaternion.continuous(pose.orientation)
         if role != "rotation_vector":
             return q.numpy() if role == "quaternion_wxyz" else q.roll(-1, -1).numpy()
-        # It continues that of the demonstration: at half a turn there are two.
+        # Continue from the demonstration's rotation vector: at half a turn there are two.
         places = self._places.get(of, ())[3:6] if of else self._places.get(role, ())
         near = torch.from_numpy(self._first(places, main) if len(places) == 3 else np.zeros(3))
         vectors = torch.cat([near[None], quaternion.log(q)])
         return quaternion.unwrap_log(vectors)[1:].numpy()
 
     def _on_disk(self, role: str, values: np.ndarray) -> np.ndarray:
-        """Joint values as the dataset has them; the inverse of `DatasetArm.positions`."""
+        """Joint values in the dataset's convention; the inverse of `DatasetArm.positions`."""
         count = max(self._made.columns) + 1
         zero, one = self._made.positions(np.stack([np.zeros(count), np.ones(count)]))
         if role.endswith("position"):
@@ -262,7 +262,7 @@ def pose_of(values: Float[torch.Tensor, "*batch numbers"]) -> Pose:
 
 
 class MultipliedWriter:
-    """Writer of episodes that goes on where a killed one stopped.
+    """Writer of episodes that continues where an interrupted one stopped.
 
     Attributes:
         provenance: Provenance of each episode written so far.
@@ -276,14 +276,15 @@ class MultipliedWriter:
         source: DemonstrationSource,
         made_by: Mapping[str, Any],
     ):
-        """Describe the dataset; `claimed` begins to write it.
+        """Prepare the description of the dataset; `claimed` begins to write.
 
         Args:
             root: Folder of the dataset.
             robot_type: Robot of the new episodes.
-            columns: Their columns.
+            columns: Columns of the new episodes.
             source: Demonstrations.
-            made_by: Settings; an interrupted recording is continued if it has the same.
+            made_by: Settings of the job; an interrupted recording with the same settings is
+                continued.
         """
         before = read_sidecar(source.folder.root)
         units = {role: d.unit for role, d in source.units.items() if not d.units}
@@ -307,11 +308,11 @@ class MultipliedWriter:
 
     @contextmanager
     def claimed(self) -> Iterator[None]:
-        """Claim the folder, continue an interrupted recording, and make the dataset at the end.
+        """Claim the folder, continue an interrupted recording, complete the dataset at the end.
 
         Raises:
-            BusyError: Another process writes there.
-            FileExistsError: There is something else.
+            BusyError: Another process writes to the folder.
+            FileExistsError: The folder holds something else.
         """
         self.root.parent.mkdir(parents=True, exist_ok=True)
         with Claim(self.root) as claim:

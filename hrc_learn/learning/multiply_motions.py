@@ -1,10 +1,11 @@
 """New motions from a few demonstrations: object-centred segments, joined in new scenes.
 
 A demonstration is cut where the gripper begins to move. Each segment becomes a pose primitive
-in the frame in which the ends of all demonstrations agree best: that of an object, of its
-position alone, or of the base. In a new scene the primitives of a mixture of the demonstrations
-are moved with their frames. Each begins at the pose and velocity at which the one before it
-ended, and joins its own path along a minimum-jerk curve until the demonstrations agree.
+in the frame in which its ends agree best over the demonstrations: an object's frame, a frame at
+the object that does not turn with it, or the base frame. In a new scene, the primitives of the
+demonstrations are mixed and move with their frames. Each segment begins with the final pose and
+velocity of the previous one, and joins its own path along a minimum-jerk curve, over the part
+in which the demonstrations still differ.
 """
 
 from __future__ import annotations
@@ -27,39 +28,39 @@ from hrc_learn.kinematics import Arm
 from hrc_learn.kinematics.inverse import follow_poses
 
 BASE, POSITION_ONLY = "base", " position"
-"""Frame of the base, and end of the name of an object's frame that does not turn."""
+"""Name of the base frame, and suffix for a frame at an object that does not turn with it."""
 # Smallest number of frames of a segment: fewer do not determine a primitive.
 _SHORTEST = 6
-# Range of a signal below which it does not switch, relative to its largest value, and step
-# between frames, relative to its range, from which on it is moving.
+# A gripper signal switches only if its range exceeds this fraction of its largest value, and
+# moves while its steps between frames exceed this fraction of its range.
 _CONSTANT, _MOVING = 0.05, 0.02
-# Length that converts an angle [m/rad], and spread by which a frame may be worse than the best
-# and still be preferred for being nearer [m]: the tremor of a hand.
+# Lever that converts angles to lengths [m/rad], and tremor of a hand [m]: a frame with at most
+# 1.5 times the least spread plus the tremor is preferred if it is nearer.
 _LEVER, _TREMOR = 0.1, 1e-3
-# Frames of a demonstration for each basis function, and the limits of their number.
+# Frames per basis function, and smallest and largest number of basis functions.
 _PER_FUNCTION, _FEWEST, _MOST = 3, 8, 50
-# Times at which demonstrations are compared, and the fraction of a segment that is free if they
-# do not differ.
+# Number of times at which demonstrations are compared, and their `_free_fraction` if they do
+# not differ.
 _COMPARED, _USUALLY_FREE = 50, 0.6
-# Iterations from a given posture to the first pose of a path.
+# Iterations of inverse kinematics from the initial posture to the first pose of a path.
 _FIRST = 12
 # Largest error of inverse kinematics: 1 mm or 1 mrad.
 _REACHED = 1e-3
 # Speed of a motion relative to the fastest one within the limits, and attempts to slow it down.
 _USABLE, _SLOWER = 0.975, 3
-# Largest factor by which a motion is slowed down at once.
+# Largest factor by which one attempt slows a motion down.
 _JUMP = 3.0
-# Every so many frames are checked for collisions.
+# Stride of the frames that are checked for collisions.
 _CHECKED = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Segmentation:
-    """Segments of demonstrations; it may be corrected in a file."""
+    """Segments of demonstrations; users may correct them in a file."""
 
     frames: tuple[str, ...]
-    """Frame of each segment: "base", an object, or "OBJECT position" for one that does not
-    turn with the object."""
+    """Frame of each segment: "base", an object, or "OBJECT position" for a frame at the object
+    that does not turn with it."""
     cuts: dict[int, tuple[int, ...]]
     """First frame of each segment and last frame of the last one, by episode."""
 
@@ -73,7 +74,7 @@ class Segmentation:
         return rows
 
     def check(self, demos: Sequence[Demonstration], objects: Mapping[str, Pose]) -> None:
-        """Refuse segments that are not those of the demonstrations.
+        """Check that the segments fit the demonstrations.
 
         Raises:
             ValueError: A frame or an episode is unknown, or cuts do not increase.
@@ -102,7 +103,7 @@ def find_segments(
         tool: Poses of the tool along each demonstration.
 
     Raises:
-        ValueError: The demonstrations differ in the number of their switches.
+        ValueError: The demonstrations differ in the number of gripper switches.
     """
     openings = [demo.gripper for demo in demos if demo.gripper is not None] or [np.zeros(1)]
     low, high = min(x.min() for x in openings), max(x.max() for x in openings)
@@ -130,7 +131,7 @@ def find_segments(
 
 
 def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> list[int]:
-    """Frames at which a signal of two levels begins to go from one to the other."""
+    """Frames at which a two-level signal begins to change its level."""
     if high - low <= _CONSTANT * max(abs(low), abs(high)):
         return []
     level = (values - low) / (high - low)
@@ -144,7 +145,7 @@ def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> 
 
 
 def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
-    """Frame in which the ends of all demonstrations agree; of several the nearest object's."""
+    """Frame in which the ends of all demonstrations agree; of several, the nearest one."""
     names = [*objects, *(f"{name}{POSITION_ONLY}" for name in objects), BASE]
     spread: dict[str, float] = {}
     distance: dict[str, float] = {}
@@ -155,7 +156,7 @@ def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
         spread[name] = float((apart[:3].sum() + _LEVER**2 * apart[3:].sum()).sqrt())
         distance[name] = math.inf if name == BASE else float(local.position.norm(dim=-1).mean())
     good = [name for name in names if spread[name] <= 1.5 * min(spread.values()) + _TREMOR]
-    # Of equal ones the first: an object's own frame before that of its position.
+    # Of equally near frames the first: an object's own frame before its position-only frame.
     return min(good, key=lambda name: round(distance[name], 6))
 
 
@@ -180,10 +181,10 @@ class Draws:
     speed: Float[Tensor, "B"]
     """Speed relative to the demonstrations."""
     start: Float[Tensor, "B 3"]
-    """Displacement of the first position [m]."""
+    """Displacement of the tool's initial position [m]."""
 
     def __getitem__(self, index: Tensor) -> Draws:
-        """Part of the motions."""
+        """Choices of the motions at some indices."""
         scene = {name: pose[index] for name, pose in self.scene.items()}
         rest = {name: getattr(self, name)[index] for name in ("weights", "speed", "start")}
         return Draws(scene=scene, **rest)
@@ -196,11 +197,11 @@ class NewMotion:
     joints: Float[Tensor, "T joints"]
     """Joint positions [rad]."""
     phase: Float[Tensor, "T"]
-    """Frame of the main demonstration, with fractions, that corresponds to each frame."""
+    """Fractional frame of the main demonstration that corresponds to each frame."""
     source: int
-    """Number of the main demonstration."""
+    """Index of the main demonstration, the one with the largest weight."""
     reason: str
-    """Reason for which it is impossible, or empty."""
+    """Reason why the motion is impossible; empty if it is possible."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,9 +209,9 @@ class _Poses:
     """B motions of the tool, padded with their last sample."""
 
     pose: Pose
-    """In the base frame, (B, T)."""
+    """Poses in the base frame, (B, T)."""
     body: Float[Tensor, "B T joints"] | None
-    """Joint positions carried along [rad]."""
+    """Joint positions of the demonstrated posture [rad]; None for another arm."""
     phase: Float[Tensor, "B T"]
     length: Int[Tensor, "B"]
 
@@ -221,16 +222,16 @@ class _Segment:
 
     frame: str
     dmp: PoseDMP
-    """Primitives (n), with the joint positions as body if the arm is the demonstrated one."""
+    """Primitives (n), with the joint positions as body if the same arm was demonstrated."""
     first: Float[Tensor, "n"]
     last: Float[Tensor, "n"]
 
     def span(self, main: Int[Tensor, "B"]) -> Float[Tensor, "2 B 1"]:
-        """First frame and number of further frames in the main demonstrations."""
+        """First frame and number of further frames of the segment in main demonstrations."""
         return torch.stack([self.first, self.last - self.first])[:, main, None]
 
     def mixed(self, weights: Float[Tensor, "B n"], speed: Float[Tensor, "B"]) -> PoseDMP:
-        """Primitives with mixed coordinates and durations."""
+        """Primitives with weighted means of the coordinates and durations."""
         motion = self.dmp.motion
         x = torch.einsum("bn,ndm->bdm", weights, motion.coordinates().detach())
         mixed = motion.with_coordinates(
@@ -243,7 +244,7 @@ class _Segment:
 
 
 def _turned(frame: Pose, twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
-    """A twist in the axes of the parent of a frame."""
+    """Rotate a twist from the axes of a frame to the axes of the frame's parent."""
     parts = twist.unflatten(-1, (2, 3))
     return quaternion.rotate(frame.orientation[:, None], parts).flatten(-2)
 
@@ -252,7 +253,7 @@ def _turned(frame: Pose, twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
 def _free_fraction(dmp: PoseDMP) -> float:
     """Fraction of a segment after which the demonstrations agree in its frame.
 
-    Until then they come from different places, so that a new motion may as well.
+    Until then the demonstrations come from different places, so a new motion may do so, too.
     """
     s = torch.linspace(0, 1, _COMPARED, dtype=torch.float64)
     position = dmp.rollout(s * dmp.duration[:, None]).position
@@ -292,16 +293,17 @@ class MotionSource:
 
         Args:
             demos: Demonstrations of one task.
-            tool: Poses of the tool along each.
+            tool: Poses of the tool along each demonstration.
             objects: Poses of each object at the start of each demonstration, (n).
             segmentation: Segments and their frames.
-            robot: Arm that will carry out the motions.
-            near: Joint positions along each demonstration [rad] if the arm demonstrated them:
-                its posture is carried along. Else joint positions near the first pose.
+            robot: Arm of the new motions.
+            near: Joint positions along each demonstration [rad] if the same arm was
+                demonstrated, whose posture is then kept; else joint positions near the first
+                pose.
             obstacles: Boxes that the arm keeps clear of.
 
         Raises:
-            ValueError: The segmentation is not that of the demonstrations.
+            ValueError: The segmentation does not fit the demonstrations.
         """
         segmentation.check(demos, objects)
         segments = []
@@ -346,15 +348,15 @@ class MotionSource:
             poses = self.poses(part)
             q, missed = self._joint_paths(part, poses)
             factor, limit = self.robot.limits.excess(q, 1 / self.fps)
-            # Joints of a motion that does not reach its poses may jump, at any speed.
+            # Joints of a motion that does not reach its poses may jump at any speed.
             factor = (factor / _USABLE).clamp(max=_JUMP)
-            # What cannot be reached is tried once at a lower speed, at which joints jump less.
+            # A motion that misses its poses is retried once, slower: its joints then jump less.
             again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
             where = self._collisions(q[~again])
             for k in (~again).nonzero()[:, 0].tolist():
                 hit, reason = where.pop(0), ""
                 if missed[k] > 0:
-                    reason = "not reached, or only beyond the range of a joint"
+                    reason = "not reached within the ranges of the joints"
                 elif factor[k] > 1:
                     kind, joint = divmod(int(limit[k]), self.robot.joints)
                     kind = ("velocity", "acceleration", "jerk")[kind]
@@ -411,7 +413,7 @@ class MotionSource:
     def _joint_paths(
         self, draws: Draws, poses: _Poses
     ) -> tuple[Float[Tensor, "B T joints"], Float[Tensor, "B"]]:
-        """Inverse kinematics near the posture carried along; and errors that are too large."""
+        """Joint positions near the demonstrated posture, and errors (0 if small enough)."""
         order = torch.arange(-_FIRST, poses.phase.shape[1]).clamp(min=0)
         path, wish, start = poses.pose[:, order], None, self.near[draws.weights.argmax(-1)]
         if poses.body is not None:
@@ -427,7 +429,7 @@ class MotionSource:
         return q, torch.where(worst > _REACHED, worst, 0.0)
 
     def _collisions(self, q: Float[Tensor, "B T joints"]) -> list[str]:
-        """Collision of each motion with the arm itself or a box, in words; empty if clear."""
+        """Collision of each motion with the arm itself or a box, as text; empty if clear."""
         q, (centre, half) = q[:, ::_CHECKED], self.obstacles.split(3, dim=-1)
         frames = self.robot.link_frames(q)
         hit = (self.robot.whole.self_distance(q, frames) < 0).any(-1)

@@ -1,4 +1,4 @@
-"""Movement primitives of demonstrations by channel: each one, their mean, or a streamed fit."""
+"""Movement primitives of demonstrations by channel: one for each, their mean, streamed fits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,19 +49,19 @@ CLASSES = {
 EACH = "each"
 """Folder of the primitives of single demonstrations."""
 _APPROACH = 0.6
-"""Fraction of a motion that takes up a new goal: the rest, such as an insertion, keeps its
+"""Fraction of a motion that adapts to a new goal; the rest, such as an insertion, keeps its
 shape."""
 _LEAST_MOTION = 1e-4
 """Smallest motion above the noise of encoders and trackers [rad, m, quaternion components]."""
 HELD_AT_ONCE = 700_000
-"""Values of a channel (padded frames times joints, or 7 of a pose) that are held at once. Their
-fit and the comparison of models take up to 300 MB."""
+"""Largest number of values of a channel in memory: padded frames times joints, or times 7 for a
+pose. Their fit and the comparison of models take up to 300 MB."""
 LONGEST = 5_000
-"""Largest number of frames of one demonstration, up to 100 basis functions."""
+"""Largest number of frames of one demonstration; enough for 100 basis functions."""
 
 
 def require_motion(demo: Demonstration, source: str) -> None:
-    """Refuse a demonstration without motion, as its relative errors are not defined.
+    """Refuse a demonstration without motion, since its relative errors are not defined.
 
     Raises:
         ValueError: Neither joints nor pose move, or values are not finite.
@@ -72,7 +72,7 @@ def require_motion(demo: Demonstration, source: str) -> None:
     if any(not np.isfinite(column).all() for column in shown):
         raise ValueError(f"{place}: values are not finite; `hrc check` names them")
     if shown and max(float(np.ptp(column, axis=0).max()) for column in shown) < _LEAST_MOTION:
-        raise ValueError(f"{place}: nothing moves; leave it out (--episodes names the others)")
+        raise ValueError(f"{place}: nothing moves; leave it out (--episodes lists the others)")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,7 +176,7 @@ class Motions:
         return reproduction_error(self.demos, CHANNELS[channel][0], made)
 
     def _body_shape(self) -> Tensor | None:
-        """Arm angle of a Franka arm [rad], continuous, in the same turn at the start."""
+        """Arm angle of a Franka arm [rad], unwrapped over time and over the starts."""
         franka = {arm.joint_names: arm for arm in (panda, fr3)}
         if self.demos.joint_position is None or self.joint_names not in franka:
             return None
@@ -306,7 +306,7 @@ def fit_primitives(
 def _select(
     motions: Motions, channel: str, candidates: Sequence[int], options: Mapping[str, Any]
 ) -> BasisSelection:
-    """Number of basis functions by the linear coordinates of a channel."""
+    """Select the number of basis functions from the linear coordinates of a channel."""
     if channel == "orientation":
         raise ValueError(
             "the number of basis functions is chosen by joints or positions: give n_basis for "
@@ -329,9 +329,10 @@ def _select(
 
 
 def sampled(source: DemonstrationSource) -> DemonstrationSet:
-    """All demonstrations, or an evenly spread sample of a dataset that is too large.
+    """All demonstrations, or an evenly spread sample of them if the dataset is too large.
 
-    Demonstrations of more than twice the median length are thinned. A note describes this.
+    In a sample, demonstrations longer than twice the median or `LONGEST` frames are thinned. A
+    note describes this.
 
     Args:
         source: Demonstrations on disk.
@@ -342,10 +343,10 @@ def sampled(source: DemonstrationSource) -> DemonstrationSet:
     longest = min(LONGEST, 2 * int(np.median(lengths)), max(lengths))
     count = min(len(lengths), max(1, HELD_AT_ONCE // (longest * _width(source))))
     demos = [_thinned(demo, longest) for demo in source.spread(count)]
-    note = f"{count} of {len(lengths)} demonstrations, evenly spread, stand for all of them"
+    note = f"{count} of {len(lengths)} demonstrations, evenly spread, are used"
     if max(lengths) > longest:
-        note += f"; {longest} frames of longer ones are used"
-    note += "; --several streamed uses everything"
+        note += f"; longer ones are thinned to {longest} frames"
+    note += "; --several streamed uses all"
     notes, unit = (*source.notes, note), source.joint_unit
     return DemonstrationSet(demos, notes=notes, source=source.source, joint_unit=unit)
 
@@ -356,7 +357,7 @@ def _width(source: DemonstrationSource) -> int:
 
 
 def _thinned(demo: Demonstration, longest: int) -> Demonstration:
-    """Demonstration with at most that many frames, including the first and the last."""
+    """Demonstration with at most `longest` frames, including the first and the last."""
     if len(demo) <= longest:
         return demo
     kept = np.linspace(0, len(demo) - 1, longest).round().astype(int)
@@ -371,7 +372,7 @@ def _thinned(demo: Demonstration, longest: int) -> Demonstration:
 def fit_streamed(
     demos: DemonstrationSource, n_basis: int, *, channels: Sequence[str] = ()
 ) -> tuple[dict[str, JointDMP], dict[str, float]]:
-    """Fit one primitive to all demonstrations in a single pass, one in memory at a time.
+    """Fit one primitive to all demonstrations in a single pass, reading them one by one.
 
     Args:
         demos: Demonstrations on disk.
@@ -382,7 +383,7 @@ def fit_streamed(
         Primitives by channel, and measured values by name.
 
     Raises:
-        ValueError: Another channel, whose coordinates depend on the goal of a demonstration.
+        ValueError: A channel is another one: its coordinates depend on a demonstration's goal.
     """
     fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
     for channel in channels or ("joint",):

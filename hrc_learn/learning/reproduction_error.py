@@ -22,9 +22,9 @@ class ReproductionError:
     largest: Float[Tensor, " demos"] | None = None
     """Largest error of any coordinate [rad] or [m]."""
     goal_error: Float[Tensor, " demos"] | None = None
-    """Distance of the last samples [rad] or [m]."""
+    """Distance between the last samples [rad] or [m]."""
     jerk: Float[Tensor, " demos"] | None = None
-    """Ratio of the dimensionless jerk to that of the demonstration. Below 1: smoother."""
+    """Ratio of the dimensionless jerk to that of the demonstration; smoother if below 1."""
     turn_rmse: Float[Tensor, " demos"] | None = None
     """Root mean square angle between orientations [deg]."""
     turn_at_goal: Float[Tensor, " demos"] | None = None
@@ -52,7 +52,8 @@ def reproduction_error(
     Args:
         demos: Demonstrations.
         column: Column of the reproduced joint positions or positions.
-        made: Trajectories at their time stamps, with a `position`, an `orientation` or both.
+        made: Reproductions at the time stamps of the demonstrations, with a `position`, an
+            `orientation` or both.
     """
     measures: dict[str, Tensor] = {}
     mask, last = demos.mask, (demos.length - 1)[:, None]

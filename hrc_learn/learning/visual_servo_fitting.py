@@ -1,4 +1,4 @@
-"""Visual servoing skills of demonstrations: image Jacobian, target in the image, approach."""
+"""Fit of a visual servoing skill: image Jacobian, target in the image, approach."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -57,11 +57,11 @@ def fit_visual_servo(
     Args:
         demos: Demonstrations with image features and end-effector poses, or a Panda's joints.
         neurons: Neurons of the network. Default: around the demonstrated poses.
-        config: Noise, prior and choice of key frames of what the camera leaves.
-        learning: Learning of neurons, noise and prior. None, or too few demonstrations to hold
-            one out: they stay as they are.
+        config: Noise, prior and key-frame selection of the camera's residual.
+        learning: Settings for learning neurons, noise and prior. With None, or too few
+            demonstrations to hold one out, they are not learned.
         on_round: Called after every round of learning.
-        landmarks: Landmarks whose pixels the demonstrations hold; None: those of markers.
+        landmarks: Landmarks of which the demonstrations contain pixels; None: of markers.
 
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
@@ -152,7 +152,7 @@ def _ends(demos: Demonstrations) -> list[_End]:
             without.append(demo.episode)
     if ends and without:
         raise ValueError(
-            f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, as in other episodes."
+            f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, unlike other episodes."
         )
     return ends
 

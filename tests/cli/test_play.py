@@ -101,7 +101,7 @@ def test_without_an_arm_the_path_is_the_models_own(models, tmp_path):
     [
         (["--goal", 0.5, 0.1], "--goal 0.5 0.1: ", 2),
         (["--goal", *range(7)], "7 numbers may be joints or pose", 2),
-        (["--goal", "pose", 0.4, 0, 0.4, 1, 1, 0, 0], "a quaternion has 1", 2),
+        (["--goal", "pose", 0.4, 0, 0.4, 1, 1, 0, 0], "the norm of w x y z is 1.414", 2),
         (["--goal", "there"], "takes 7 numbers (joints), 3 numbers (position)", 2),
         (["--goal", "nan", 0.1, 0.2], "all finite", 2),
         (["--goal", "episode", "last"], "needs one number", 2),
@@ -135,4 +135,4 @@ def test_shares_of_a_range_are_no_angles(models, tmp_path):
     assert names[1] == "panda_joint1 [1]"
     asked = hrc("play", tmp_path / "model", *words, "--overwrite", "--robot", "panda")
     assert asked.status == 2
-    assert "holds joints in shares of their ranges, of which no angle is known" in asked.error
+    assert "holds joints in fractions of their ranges, which have no known size" in asked.error

@@ -185,8 +185,7 @@ def test_a_sample_stands_for_more_than_fit_into_memory(tmp_path, monkeypatch):
     sample = sampled(big_set(tmp_path / "set", monkeypatch))
     assert [demo.episode for demo in sample] == [0, 5, 10]
     assert sample.notes[-1] == (
-        "3 of 11 demonstrations, evenly spread, stand for all of them; "
-        "--several streamed uses everything"
+        "3 of 11 demonstrations, evenly spread, are used; --several streamed uses all"
     )
 
 

@@ -163,13 +163,13 @@ def test_a_sample_takes_as_many_demonstrations_as_are_held_at_once(monkeypatch):
     assert [demo.episode for demo in found] == [0, 1, 3, 4]
     assert found.notes[0] == "a note"
     assert found.notes[1].startswith("4 of 5 demonstrations, evenly spread")
-    assert "frames of longer ones" not in found.notes[1]
+    assert "longer ones" not in found.notes[1]
     assert (found.source, found.joint_unit) == ("here", "1")
     # Longer than twice the median: thinned to 60 frames.
     long: Any = stored([30, 30, 30, 200])
     found = sampled(long)
     assert [len(demo) for demo in found] == [30, 60]
-    assert "; 60 frames of longer ones are used; --several" in found.notes[1]
+    assert "; longer ones are thinned to 60 frames; --several" in found.notes[1]
     # The widest channel has at least seven columns.
     wide: Any = stored([30] * 4, joints=8)
     assert len(sampled(wide)) == 3

@@ -226,7 +226,7 @@ def test_poses_of_another_tool_are_refused_and_those_of_our_hand_found(models, t
     moved_base = replace(model.pose.start, position=model.pose.start.position + 0.1)
     other = SimpleNamespace(start=moved_base)
     shifted = replace(model, primitives=model.primitives | {"pose": other})
-    with pytest.raises(ValueError, match=r"begin 173 mm from where its"):
+    with pytest.raises(ValueError, match=r"begin 173 mm from the tool of"):
         arm_for(shifted, "panda")
     robot = arm("ur5e")
     hand = robot.with_hand()

@@ -211,5 +211,5 @@ def test_a_pose_is_a_position_with_a_rotation_vector_or_a_quaternion(count):
 @pytest.mark.parametrize("columns", ["observation.cup[0:2]", "observation.block[0:4]"])
 def test_objects_of_other_numbers_of_columns_are_refused(case, columns):
     taught = arm_of_dataset(case.source)
-    with pytest.raises(ValueError, match=r"objects\.cup\.columns=.* must be of 3, 6 or 7"):
+    with pytest.raises(ValueError, match=r"objects\.cup\.columns=.* must have 3, 6 or 7"):
         MultipliedColumns(case.source, taught, panda, {"cup": columns})

@@ -172,14 +172,14 @@ def test_targets_differ_by_their_numbers(words, expected):
 @pytest.mark.parametrize(
     ("count", "words", "message"),
     [
-        (3, "1 2 3", "3 numbers may be joints or position: write --goal joints before"),
+        (3, "1 2 3", "3 numbers may be joints or position: write --goal joints or"),
         (7, "1 2 3 1 0 0 0", "7 numbers may be joints or pose"),
         (2, "1 2 3 4", r"takes 2 numbers \(joints\), 3 numbers \(position\), 7 numbers"),
         (2, "joints 1 2 3", "takes 2 numbers"),
         (2, "1 x", "takes 2 numbers"),
         (2, "1 nan", "all finite"),
-        (2, "1 2 3 1.021 0 0 0", r"w x y z have the norm 1\.021"),
-        (2, "1 2 3 0.979 0 0 0", r"w x y z have the norm 0\.979"),
+        (2, "1 2 3 1.021 0 0 0", r"norm of w x y z is 1\.021"),
+        (2, "1 2 3 0.979 0 0 0", r"norm of w x y z is 0\.979"),
         (0, "joints", "takes 3 numbers"),
     ],
 )
@@ -199,7 +199,7 @@ def test_joints_of_an_arm_are_found_by_their_names_and_units():
     np.testing.assert_allclose(model.from_rad(robot, found), values)
     rad = model_of(joint=joints(3, ["hip", "knee", "toe"]))
     assert torch.equal(rad.in_rad(robot, values), values)
-    for unit, shown in (("1", "shares of their ranges"), ("tick", "'tick'")):
+    for unit, shown in (("1", "fractions of their ranges"), ("tick", "'tick'")):
         wrong = model_of(joint=joints(3, ["hip", "knee", "toe"], unit))
         with pytest.raises(ValueError, match=shown):
             wrong.in_rad(robot, values)
