@@ -1,12 +1,13 @@
-"""Learning without choices: the model of several demonstrations that predicts each best.
+"""Automatic choice of the model that predicts each demonstration best from the others.
 
 A motion is linear in the coordinates x_j of the primitives of n demonstrations, and each model
-is a sum x(c) = sum_j w_j(c) x_j with sum_j w_j = 1: the mean, the nearest demonstration, means
-weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge regression on
-contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a trajectory
-database"). Without demonstration i the weights are closed form, for the regression by its hat
-matrix (PRESS; Allen 1974), so no model is fitted again. All are shrunk towards the straight
-minimum-jerk motion by the factor that predicts best, from 1 to 0.
+but that of frames is a sum x(c) = sum_j w_j(c) x_j with sum_j w_j = 1: the mean, the nearest
+demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
+regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
+trajectory database"). The weights without demonstration i have a closed form (for the
+regression from its hat matrix: PRESS, Allen 1974), so no such model is fitted again. Each model
+may be shrunk towards the straight minimum-jerk motion, by the factor from 1 to 0 that predicts
+best.
 """
 
 import math
@@ -43,15 +44,15 @@ APPROACHES = (1.0, 0.6)
 WIDTHS = (2.0, 1.0, 0.5, 0.25)
 """Widths of kernels, relative to the spread of the contexts."""
 PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
-"""Ridges relative to the data; the largest is nearly the mean."""
+"""Ridges relative to the data; a ridge of 1 halves the effect of a single context."""
 FEWEST = 4
-"""Smallest number of demonstrations that distinguish a regression from the mean."""
+"""Smallest number of demonstrations for a regression; fewer do not tell it from the mean."""
 CLEARLY, DEVIATIONS = 0.02, 0.8
-"""Decrease of the mean error, relative to it and in standard errors, above which a less simple
-model is preferred: on seven sets the predictions of unseen demonstrations were best with 0.5 to
-1 standard errors (`benchmarks/bench_learn.py`)."""
+"""Decrease of the mean error, relative to this error and in standard errors, above which a more
+complex model is preferred: on seven datasets, predictions of unseen demonstrations were best
+with 0.5 to 1 standard errors (`benchmarks/bench_learn.py`)."""
 GRID = 101
-"""Times at which motions are compared."""
+"""Number of times at which motions are compared."""
 CONSTANT = 1e-9
 """Spread, relative to the size, below which a context counts as constant."""
 
@@ -68,17 +69,17 @@ class Candidate:
     family: str
     """`"kernel"`, `"ridge"` or `"frames"`."""
     strength: float
-    """Width of the kernel, infinite for the mean and 0 for the nearest; or the ridge."""
+    """Width of the kernel, infinite for the mean and 0 for the nearest one; or the ridge."""
     approach: float
     shrinkage: float
-    """Factor on the deviation from the straight motion: 0 leaves nothing else."""
+    """Factor on the deviation from the straight motion: 0 leaves only the straight motion."""
     error: Float[Tensor, "n"]
-    """Root mean square error of each demonstration predicted from all others, relative to its
-    largest range."""
+    """Root mean square error of each demonstration predicted from all others; each column is
+    relative to the largest range among columns of its kind."""
 
     @property
     def kind(self) -> Kind:
-        """Kind of the model; all but the line may be shrunk towards it."""
+        """Kind of the model; all but the line may be shrunk towards the line."""
         if self.shrinkage == 0:
             return "line"
         if self.family != "kernel":
@@ -112,21 +113,21 @@ def learn(
     approach: float | None = None,
     **options: Any,
 ) -> "LearnedMotion":
-    """Learn a motion from demonstrations, with basis, approach and model by held-out error.
+    """Learn a motion from demonstrations; held-out errors select basis, approach and model.
 
     Args:
         demonstrations: Demonstrations with `time` and `joint_position`, `position` or
-            `orientation`, as from `load_demos`; or pairs of times (T,) [s] and joints (T, D),
-            unit quaternions in a `Pose` with positions, or other coordinates.
-        context: (n, C) known before the motion. None: start and goal.
-        frames: (n, F) frames of each demonstration, for positions in space.
-        n_basis: N. None: the smallest of `BASIS_COUNTS` with the least error on held-out
-            samples.
+            `orientation`, as from `load_demos`; or pairs of times (T,) [s] and values: joints
+            or other coordinates, (T, D), or a `Pose` of (T).
+        context: (n, C), known before the motion. None: start and goal.
+        frames: Frames of each demonstration, (n, F), for positions in space.
+        n_basis: N. None: the smallest of `BASIS_COUNTS` whose error on held-out samples is
+            nearly the least.
         approach: As in `FitOptions`. None: one of `APPROACHES`.
-        options: Further options of `fit` of the kind of primitive.
+        options: Further options for `fit` of the primitive.
 
     Raises:
-        ValueError: No demonstrations, bad samples, or contexts or frames of another number.
+        ValueError: No demonstrations, bad samples, or a wrong number of contexts or frames.
     """
     if not len(demonstrations):
         raise ValueError("there are no demonstrations to learn from")
@@ -147,12 +148,12 @@ def choose(
     *,
     regression_only: bool = False,
 ) -> "LearnedMotion":
-    """Model of least held-out error, among primitives fitted with different options.
+    """Model with the least held-out error, for primitives fitted with different options.
 
     Args:
         fits: Primitives (n) of the same demonstrations, fitted with `scaling="none"`.
-        context: (n, C) known before the motion. None: start and goal, in columns.
-        frames: (n, F) frames of each demonstration; joint primitives only.
+        context: (n, C), known before the motion. None: start and goal, in columns.
+        frames: Frames of each demonstration, (n, F); joint primitives only.
         regression_only: True to choose among the regressions on contexts only.
 
     Raises:
@@ -197,15 +198,15 @@ def choose(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LearnedMotion:
-    """Motion as a function of start, goal, and a context or frames, by the best model."""
+    """Motion as a function of start, goal, and a context or frames, predicted by one model."""
 
     each: MotionPrimitive
-    """Primitives (n) of the demonstrations, with one reference of orientations."""
+    """Primitives (n) of the demonstrations, with a common reference for orientations."""
     context: Float[Tensor, "n C"]
     by_ends: bool
-    """True if the context is start and goal in columns."""
+    """True if the context consists of start and goal, in columns."""
     frames: Frames | None
-    """Frames (n, F) if the model is one of frames."""
+    """Frames (n, F) if the model uses frames."""
     chosen: Candidate
     candidates: tuple[Candidate, ...] = ()
     """All models compared; none after loading."""
@@ -219,17 +220,17 @@ class LearnedMotion:
         context: Any = None,
         frames: Frames | None = None,
     ) -> Any:
-        """Primitive for a start, goal and duration, by default those that the model predicts.
+        """Primitive for a start, goal and duration; by default, the model predicts them.
 
         Args:
             start: Start of one motion, as `rollout` of the primitives takes it.
             goal: Goal.
             duration: [s].
-            context: (C,) if contexts were given to learn from.
-            frames: (F,) if the model is one of frames.
+            context: (C,) if the demonstrations had contexts.
+            frames: (F,) if the model uses frames.
 
         Raises:
-            ValueError: A context or frames are missing, or have another size.
+            ValueError: A context or frames are missing, or have the wrong size.
         """
         if self.chosen.family == "frames":
             assert self.frames is not None
@@ -250,12 +251,12 @@ class LearnedMotion:
         return found[0].with_boundary(start, goal, duration)
 
     def at_contexts(self, context: Float[Tensor, "q C"]) -> MotionPrimitive:
-        """Primitives for contexts as learned from, with starts and goals of the model.
+        """Primitives for contexts; the model also predicts start, goal and duration.
 
         Gradients flow to the contexts.
 
         Raises:
-            ValueError: The model is one of frames, or contexts have another size.
+            ValueError: The model uses frames, or contexts have the wrong size.
         """
         if self.chosen.family == "frames":
             raise ValueError("a model of frames has no contexts: use `at`")
@@ -270,7 +271,7 @@ class LearnedMotion:
     def _primitives(
         self, x: Float[Tensor, "q D M"], w: Float[Tensor, "q n"]
     ) -> MotionPrimitive:
-        """Shrunk primitives with coordinates, and durations of weighted demonstrations."""
+        """Primitives with shrunk coordinates `x`, and durations averaged with the weights."""
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x, self.chosen.shrinkage)
         middle, reference = mean_primitive(self.each).motion, common_reference(self.each)
@@ -282,7 +283,7 @@ class LearnedMotion:
 
     @property
     def reasons(self) -> str:
-        """The chosen model, its held-out error, and those of the usual ones, in a few lines."""
+        """Chosen model with its held-out error, and the errors of simple models, as text."""
         each, known = self.each.motion, {"chosen": self.chosen}
         for candidate in self.candidates:
             if candidate.kind in ("mean", "nearest", "line"):
@@ -353,7 +354,7 @@ def _samples(demonstration: Any) -> tuple[Tensor, Any]:
 def _fit_of(
     times: Sequence[Tensor], values: Sequence[Any]
 ) -> tuple[Callable[..., MotionPrimitive], list[Tensor]]:
-    """Fit of the kind of primitive, and the coordinates by which the basis is chosen."""
+    """Fit function for these values, and the coordinates by which the basis is chosen."""
     if isinstance(values[0], Pose):
         position = [pose.position for pose in values]
         turned = [pose.orientation for pose in values]
@@ -362,7 +363,7 @@ def _fit_of(
 
 
 def _basis_count(times: Sequence[Tensor], values: Sequence[Tensor]) -> int:
-    """Smallest number of functions with the least error on held-out samples."""
+    """Smallest number of functions whose error on held-out samples is nearly the least."""
     shortest = min(map(len, times))
     possible = [n for n in BASIS_COUNTS if 2 * n <= shortest]
     if len(possible) < 2:
@@ -376,7 +377,7 @@ def _coordinates(each: MotionPrimitive) -> Float[Tensor, "n D M"]:
 
 
 def _shrunk(x: Float[Tensor, "*batch D M"], factor: float) -> Float[Tensor, "*batch D M"]:
-    """Coordinates between the straight motion from start to goal, and these."""
+    """Coordinates whose deviation from the straight motion is multiplied by `factor`."""
     return torch.cat([factor * x[..., :-2], x[..., -2:]], dim=-1)
 
 
@@ -417,7 +418,7 @@ def _candidates(
 def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor, "n D 1"]:
     """Unit of the error of each column: the largest range among columns of its kind.
 
-    Positions, orientation errors and bodies are of different kinds; one that does not move has
+    Positions, orientation errors and bodies are different kinds; a kind that does not move has
     the unit one.
     """
     span = shown.amax(-1) - shown.amin(-1)
@@ -448,7 +449,10 @@ def _weights(
     known: Float[Tensor, "n C"],
     asked: Float[Tensor, "q C"] | None = None,
 ) -> Float[Tensor, "q n"]:
-    """Weights w(c) of the demonstrations, for contexts or, held out, for each of their own."""
+    """Weights w(c) of the demonstrations for contexts `asked`.
+
+    None: held-out weights for the context of each demonstration.
+    """
     held_out, n = asked is None, len(known)
     query = known if asked is None else asked.to(known)
     spread = known.std(0) if n > 1 else torch.zeros_like(known[0])
@@ -464,7 +468,7 @@ def _weights(
         if strength == 0:
             return torch.nn.functional.one_hot(distance.argmin(1), n).to(known)
         return torch.softmax(-((distance / strength) ** 2) / 2, dim=1)
-    # A prediction of unit vectors, one for each demonstration, consists of its weights.
+    # If the targets are unit vectors, one for each demonstration, predictions are the weights.
     unit = torch.eye(n).to(b)
     fit = fit_ridge(b, unit, strength, standardize=False)
     if held_out:

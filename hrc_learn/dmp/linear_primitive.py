@@ -1,7 +1,8 @@
 """The linear implementation behind all kinds of primitive.
 
-Joints, orientation errors and positions are columns that add up; each kind makes columns of its
-values (see `motion_primitive.py`). Everything here is about columns.
+Joints, orientation errors and positions are columns, which can be added and scaled. Each kind
+of primitive converts its values to columns (see `motion_primitive.py`); this module knows
+columns only.
 """
 
 import math
@@ -47,7 +48,7 @@ REPORT = "fit_report."
 class Boundary(NamedTuple):
     """Boundary conditions of a motion, as columns (*batch, D) or as a caller gives them.
 
-    None stands for those of the demonstration.
+    None stands for the value of the demonstration.
     """
 
     start: Any = None
@@ -57,7 +58,7 @@ class Boundary(NamedTuple):
 
 
 class LinearPrimitive(nn.Module):
-    """D columns under one phase, whose motion is a linear map of weights and boundary.
+    """D columns with one phase, whose motion is a linear map of weights and boundary.
 
     y'' = alpha (beta (g - y) - y') + scale * sum_i phi_i(s) w_i,   s = t / duration
 
@@ -67,7 +68,7 @@ class LinearPrimitive(nn.Module):
     """
 
     weights: Tensor
-    """Weights of the forcing term: a parameter, or a buffer if gradients flow through."""
+    """Weights of the forcing term: a parameter, or a buffer if gradients flow through them."""
     start: Tensor
     goal: Tensor
     start_velocity: Tensor
@@ -117,7 +118,8 @@ class LinearPrimitive(nn.Module):
             basis: Basis of the forcing term.
             spring: Gains of the unforced dynamics.
             scaling: Scaling of the forcing term; see `forcing_scale.py`.
-            approach: Fraction of the motion over which it moves to a new goal; 0: at once.
+            approach: Fraction of the motion over which it adapts to a new start and goal; 0:
+                at once.
             joint_names: D names.
             units: Units of the columns.
             fit_report: Residuals of the fit.
@@ -187,12 +189,13 @@ class LinearPrimitive(nn.Module):
 
         Args:
             coordinates: As from `coordinates`; their batch is that of the result.
-            duration: [s]; None keeps that of this primitive, as for all that follow.
+            duration: [s]; None keeps the value of this primitive, here and below.
             amplitude: Range of each column.
             timestamps: Normalised times of the default rollout.
 
         Returns:
-            A primitive with memory of its own, the same parts and names, and no fit report.
+            A primitive with the same basis, spring, scaling and names, with memory of its own
+            and without a fit report.
         """
         x = coordinates.to(self.weights)
         duration = self.duration if duration is None else duration
@@ -275,7 +278,7 @@ class LinearPrimitive(nn.Module):
         time: Times | None = None,
         forcing_gain: Scalars | None = None,
     ) -> Trajectory:
-        """Motion of the columns; with empty boundary and times, the demonstrated one.
+        """Motion of the columns; the demonstrated one without boundary and times.
 
         Args:
             boundary: Start, goal and start velocity, in columns.
@@ -311,10 +314,11 @@ class LinearPrimitive(nn.Module):
     def _numpy_coordinates(
         self, boundary: Boundary, duration: Tensor
     ) -> Float[np.ndarray, "D M"] | None:
-        """`_motion_coordinates` of one motion in NumPy: a third of the time.
+        """`_motion_coordinates` for one motion in NumPy, in a third of the time.
 
         Returns:
-            None where NumPy does not apply, or for a wrong value, which the other path reports.
+            Coordinates. None where NumPy does not apply, or for a wrong value, which
+            `_motion_coordinates` reports.
         """
         weights = self.weights
         if weights.ndim != 2 or duration.ndim or self.scaling != "none":
@@ -359,7 +363,7 @@ class LinearPrimitive(nn.Module):
         duration = duration.expand(batch)
         s = torch.zeros_like(duration, dtype=torch.float64)
         forced = self.response.forced.to(s.device)(s).to(start)
-        # Copies, because an export takes one tensor in two fields for one input.
+        # Copies, because an export treats one tensor in two fields as one input.
         return DMPState(
             position=start.clone(),
             rate=rate,
@@ -516,7 +520,7 @@ class LinearPrimitive(nn.Module):
 
     @classmethod
     def restore[S: "LinearPrimitive"](cls: type[S], saved: SavedModel) -> S:
-        """Linear primitive inside a saved one.
+        """Linear primitive from a saved model.
 
         Raises:
             ValueError: A wrong field; the message names the file and the field.
@@ -568,7 +572,7 @@ def check_names(joint_names: Sequence[str] | None, D: int) -> None:
 
 
 def _tensor_arguments(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Arguments of a linear primitive among its tensors."""
+    """Tensor arguments of a linear primitive, from tensors named as in files."""
     report = {n.removeprefix(REPORT): x for n, x in tensors.items() if n.startswith(REPORT)}
     known = {field.name for field in fields(FitReport)} & report.keys()
     found: dict[str, Any] = {name: tensors[name] for name in TENSORS}

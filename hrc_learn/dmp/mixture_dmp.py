@@ -1,8 +1,8 @@
 """Several routes of a motion, each a Gaussian over primitives.
 
-The mean of demonstrations that pass an obstacle on either side collides with it. A mixture
-separates them by expectation-maximisation on their paths. What is known before the motion
-(start and goal, or another context) or observed during it determines the likely mode.
+If demonstrations pass an obstacle on both sides, their mean collides with the obstacle. A
+mixture separates the routes by expectation-maximisation on the paths. What is known before the
+motion (start and goal, or another context) or observed during it determines the likely mode.
 """
 
 import math
@@ -23,16 +23,16 @@ from hrc_learn.dmp.probabilistic_dmp import (
 from hrc_learn.geometry import Pose
 
 EXPLAINED, MAXIMUM_DIRECTIONS = 0.9, 3
-"""Fraction of the variance of paths in the directions of comparison, and the largest number of
-these: with few demonstrations, further directions are chance."""
+"""Fraction of the variance of paths that the compared directions explain, and the largest
+number of directions: with few demonstrations, further ones are chance."""
 MINIMUM_SPREAD = 0.1
-"""Spread within a mode, relative to the total: two demonstrations that agree by chance must not
-form a mode."""
+"""Smallest spread within a mode, relative to the total: two demonstrations that agree by chance
+must not form a mode."""
 STRONG_EVIDENCE = 10.0
 """Difference of the criterion that is very strong evidence for more modes (Kass and Raftery
-1995, "Bayes factors"); with few demonstrations, chance alone makes half of it."""
+1995, "Bayes factors"); with few demonstrations, chance alone causes half of it."""
 MAXIMUM_ITERATIONS, SETTLED = 100, 1e-6
-"""Limit of expectation-maximisation, and change of responsibilities at which it ends."""
+"""Largest number of iterations, and change of responsibilities at which they end."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,14 +65,14 @@ class MixtureDMP[P: MotionPrimitive]:
 
         Args:
             primitives: Primitives of several demonstrations, fitted with `scaling="none"`.
-            context: (n, C) known before the motion; by default starts and goals, in columns.
+            context: (n, C), known before the motion; by default starts and goals, in columns.
             n_modes: K. None: the smallest number without strong evidence against it by the
                 Bayesian information criterion (Schwarz 1978), at most half the demonstrations.
             slack: Freedom beyond the variation of the demonstrations; see
                 `ProbabilisticDMP.fit`.
 
         Raises:
-            ValueError: Fewer than two primitives, more modes than primitives, or another number
+            ValueError: Fewer than two primitives, more modes than primitives, or a wrong number
                 of contexts.
         """
         motion = with_common_reference(primitives).motion
@@ -99,11 +99,11 @@ class MixtureDMP[P: MotionPrimitive]:
 
     @property
     def most_likely(self) -> ProbabilisticDMP[P]:
-        """Mode of the largest probability."""
+        """Mode with the largest probability."""
         return self.modes[int(self.probability.argmax())]
 
     def mean_primitive(self) -> P:
-        """Mean of the most likely mode; the mean of all modes would take none of the routes."""
+        """Mean of the most likely mode; the mean of all modes would follow no route."""
         return self.most_likely.mean_primitive()
 
     def at(self, context: Vectors) -> "MixtureDMP[P]":
@@ -167,7 +167,7 @@ def _expectation_maximisation(
 ) -> tuple[Float[Tensor, "n K"], float]:
     """Responsibilities of K Gaussians with one diagonal covariance, and the log likelihood.
 
-    It starts from the samples farthest from each other (Gonzalez 1985), which is deterministic.
+    The start is deterministic: samples far from each other are the first means (Gonzalez 1985).
     """
     centres = z.square().sum(-1).argmax()[None]
     while len(centres) < K:
@@ -197,8 +197,8 @@ def _context_precision(
 ) -> Float[Tensor, "C C"]:
     """Inverse covariance of contexts around the means of their modes.
 
-    The standard deviation is at least `MINIMUM_SPREAD` of that over all demonstrations, in the
-    mean of the coordinates, because a context is evidence and not proof.
+    `MINIMUM_SPREAD`^2 times the mean variance of all contexts is added to each variance,
+    because a context is evidence and not proof.
     """
     off = (c[:, None] - (r / r.sum(0)).mT @ c) * r.sqrt()[..., None]
     within = off.flatten(0, 1)

@@ -1,9 +1,9 @@
 """Principal components of motions that continue from the state of an arm.
 
 A motion is a cubic spline. Its first control points follow from the state, so that it continues
-what is being executed. The others are predicted from that state, and what is left is expressed
-in orthogonal components, those with the most variance first. The components are parameters that
-a network predicts: continuous ones for flows and diffusion, or as tokens (`tokens.py`).
+the current motion. The others are predicted from that state, and their deviation from the
+prediction is expressed in orthogonal components, in order of decreasing variance. A network
+predicts the components, as continuous parameters (flows, diffusion) or as tokens (`tokens.py`).
 """
 
 import torch
@@ -14,24 +14,25 @@ from hrc_learn.dmp._arguments import Times, Vectors, checked_vector, seconds
 from hrc_learn.dmp.samples import Samples
 
 MARGIN = 0.1
-"""Distance that motions may leave the demonstrated range, relative to the range."""
+"""Distance by which motions may exceed the demonstrated range, relative to the range."""
 SHRINKAGE = 0.1
-"""Weight of a separable covariance (time times columns), which few motions determine."""
+"""Weight of a separable covariance (time times columns), for which few motions are enough."""
 RIDGE = 1e-3
-"""Ridge of the prediction from the start: from 1e-4 to 1e-2 are equally good."""
+"""Ridge of the prediction from the start: values from 1e-4 to 1e-2 are equally good."""
 POINTS = (6, 8, 10, 13, 16, 20, 26, 32, 40, 50, 64)
 """Numbers of control points to choose from."""
 ROUGHNESS = 1e-8
-"""Weight of squared second differences of control points, which act where samples are few."""
+"""Weight of squared second differences of control points; it matters where samples are few."""
 SAME_DURATION = 0.01
 """Relative difference of durations up to which they count as equal."""
 LONGEST = 3.0
 """Bound on the logarithm of a duration relative to the mean: a factor of 20."""
 TINY = 1e-24
-"""Smallest variance, of columns that never move."""
+"""Smallest variance, for columns that never move."""
 TURN = 6.0
-"""Distance of the third control point from a limit relative to that of the second beyond it:
-motions stay within if the second is no farther beyond than 2.5 times the margin."""
+"""Distance of the third control point inside a limit, relative to the distance of the second
+beyond it. Motions then keep the limit if the second exceeds it by at most 2.5 times the
+margin."""
 KNOWN_STATE = 2
 DEGREE = 3
 
@@ -39,8 +40,8 @@ DEGREE = 3
 class MotionComponents(nn.Module):
     """Linear map from P parameters and a start to motions of D columns.
 
-    Parameters have unit variance; zero gives the most likely motion from that start.
-    Differentiable in parameters and start. Computes in float64.
+    Parameters have unit variance; if all are zero, the motion is the most likely one from that
+    start. The map is computed in float64 and differentiable in parameters and start.
     """
 
     centre: Tensor
@@ -54,22 +55,23 @@ class MotionComponents(nn.Module):
     start: Tensor
     """Mean start, (D,)."""
     prediction: Tensor
-    """Free control points by features of the start, (features, F)."""
+    """Map from features of the start to free control points, (features, F)."""
     synthesis: Tensor
-    """Free control points by components, (P, F)."""
+    """Map from components to free control points, (P, F)."""
     analysis: Tensor
-    """Components by free control points, (F, P)."""
+    """Map from free control points to components, (F, P)."""
     spread: Tensor
     """Standard deviations of the components, (P,), largest first. The sum of their squares is
-    the mean square deviation from the prediction, in units of the columns, of all columns."""
+    the mean square deviation from the prediction, summed over the columns in their units."""
 
     def __init__(self, config: dict[str, float | int], tensors: dict[str, Tensor]):
         """Restore components; `fit` makes them.
 
         Args:
-            config: `points` (number of control points), `known` (number of those that the start
-                determines: 0; 1, its position; or 2, its velocity, too), `duration` (mean
-                duration [s]) and `varying` (1: the duration is the last free value).
+            config: `points` (number of control points), `known` (number of control points that
+                the start determines; 1: by position; 2: by position and velocity),
+                `duration` (geometric mean [s]) and `varying` (1: the logarithm of the duration
+                is the last free value).
             tensors: The buffers of this class, by name.
         """
         super().__init__()
@@ -122,18 +124,18 @@ class MotionComponents(nn.Module):
         *,
         order: int = 0,
     ) -> Float[Tensor, "*batch T D"]:
-        """Motion from a start, which it meets in position and velocity.
+        """Motion that begins with the given position and velocity.
 
         Args:
-            parameters: P parameters, or the first of them.
+            parameters: All P parameters, or the first ones if the others are zero.
             time: Time since the start [s], (T,) or (*batch, T). After its end a motion rests.
-            start: (*batch, D); None: the mean start, or the encoded one.
-            start_velocity: Velocity at the start [1/s], (*batch, D). None: zero where
-                velocities are known, otherwise the encoded one.
+            start: (*batch, D). None: the encoded start if starts are not known, else the mean.
+            start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
+                components were fitted with start velocities, else the encoded velocity.
             order: Derivative with respect to time, 0, 1 or 2.
 
         Raises:
-            ValueError: Another number of columns, more than P parameters, or bad times.
+            ValueError: A wrong number of columns, more than P parameters, or bad times.
         """
         polygon, duration = self.polygon(parameters, start, start_velocity)
         s = seconds(time, polygon.device) / duration[..., None]
@@ -145,7 +147,7 @@ class MotionComponents(nn.Module):
     def encode(
         self, samples: Samples, start_velocity: Float[Tensor, "*batch D"] | None = None
     ) -> Float[Tensor, "B P"]:
-        """Parameters of B recorded motions; arguments as those of `fit`."""
+        """Parameters of B recorded motions; arguments as for `fit`."""
         features, free, _ = self._splines(samples, start_velocity)
         return (free - features @ self.prediction) @ self.analysis / self.spread
 
@@ -173,7 +175,7 @@ class MotionComponents(nn.Module):
             duration, x = duration * x[..., -1].clamp(-LONGEST, LONGEST).exp(), x[..., :-1]
         free = x.unflatten(-1, (-1, len(self.start)))
         if given and not self.known:
-            # What was encoded bends towards the start, less and less along the motion.
+            # Bend the encoded motion towards the given start, less and less along the motion.
             bend = 1 - torch.arange(self.points).to(free)[:, None] / (self.points - 1)
             free = free + bend**2 * (first - free[..., 0, :])[..., None, :]
         low, high = ((edge - self.centre) / self.scale for edge in (self.low, self.high))
@@ -188,7 +190,7 @@ class MotionComponents(nn.Module):
             begun.append(begun[0] + rate / (DEGREE * (self.points - DEGREE)))
         points = [*begun, *points[len(begun) - self.known :]]
         if len(begun) == KNOWN_STATE:
-            # A velocity beyond a limit turns back before the motion is there.
+            # If the start velocity leads beyond a limit, turn back before reaching the limit.
             low, high = low[..., 0, :], high[..., 0, :]
             turned = points[1].clamp(low, high) * (1 + TURN) - TURN * points[1]
             turned = turned.clamp(low, high)
@@ -204,7 +206,7 @@ class MotionComponents(nn.Module):
         return torch.cat([torch.ones_like(first[..., :1]), first, rate][: 1 + self.known], -1)
 
     def _splines(self, samples: Samples, start_velocity: Tensor | None) -> tuple[Tensor, ...]:
-        """Features of the start, free values, and control points of least squared error."""
+        """Features of the start, free values, and least-squares control points."""
         y = (samples.position.mT.double() - self.centre) / self.scale
         velocity = None
         if start_velocity is not None and self.known == KNOWN_STATE:
@@ -231,15 +233,15 @@ class MotionComponents(nn.Module):
         N, _, D = C.shape
         s = torch.linspace(0, 1, 10 * self.points, dtype=C.dtype)
         B = spline(s, self.points)[:, self.known :]
-        # The mean square of a motion is the sum of squares of its free values times this.
+        # The mean square of a motion is the sum of squares of its free values times `metric`.
         root = torch.linalg.cholesky(B.mT @ B / len(B)).contiguous()
         metric = torch.kron(root, torch.eye(D).to(C))
         if self.varying:
-            # A relative error of time moves samples by the speed times as much.
+            # A relative error of the duration moves samples by the speed times this error.
             speed = (spline(s, self.points, 1) @ C).square().sum(-1).mean().sqrt()
             metric = torch.block_diag(metric, speed[None, None])
         ridge = RIDGE * N * torch.eye(features.shape[1]).to(C)
-        ridge[0, 0] = 0  # the constant is free
+        ridge[0, 0] = 0  # the constant is not penalised
         W = torch.linalg.solve(features.mT @ features + ridge, features.mT @ free)
         x = (free - features @ W) @ metric
         covariance, F = x.mT @ x / N, len(root) * D

@@ -1,7 +1,7 @@
 """The last layer of a network that plans motions: it maps parameters to trajectories.
 
-A head needs no demonstration. Its parameters are whitened: for independent unit normal ones,
-motions deviate by a given amplitude from the straight minimum-jerk path to the goal, in
+A head needs no demonstration. Its parameters are whitened: if they are independent and unit
+normal, motions deviate by a given amplitude from the straight minimum-jerk path to the goal, in
 orthogonal modes, the smoothest first. Networks and searches thus see numbers of similar size.
 The motion is linear in all parameters but duration and delay, so a Gaussian over parameters is
 a Gaussian over motions, with density, divergence and samples in closed form (Li et al. 2023,
@@ -41,18 +41,19 @@ from hrc_learn.dmp.trajectory import ContinuedTrajectory, output
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function at which the modes of a motion are computed."""
 ENCODING_NOISE = 1e-4
-"""Noise of encoded samples relative to the amplitude: far below the differences of motions."""
+"""Noise of samples that `encode` assumes, relative to the amplitude: far below the differences
+between motions."""
 
 
 class MotionHead(nn.Module):
     """Map from network parameters to a motion of D columns from any initial state.
 
-    The P = D (N + 1) + timing parameters are, for each column in turn, N whitened weights and
-    the goal; then those of timing: the duration if it has a range, and the delay if it is
-    allowed. All zero, they give the minimum-jerk motion to the centre of the goals with the
-    geometric mean of the durations.
+    The P parameters are, for each of the D columns in turn, N whitened weights and the goal;
+    then come those of timing: the duration if it has a range, and the delay if one is allowed.
+    If all are zero, the motion is the minimum-jerk motion to the centre of the goals, with the
+    geometric mean of the shortest and longest duration and half the longest delay.
 
-    Differentiable in all arguments, with any number of leading batch axes.
+    The map is differentiable in all arguments and takes any number of leading batch axes.
     """
 
     amplitude: Tensor
@@ -61,7 +62,7 @@ class MotionHead(nn.Module):
     goal_centre: Tensor | None
     """Centre of the goals, (D,); None: the start."""
     modes: Tensor
-    """Weights of the mode of each whitened parameter, smoothest first, (N, N)."""
+    """Weights of each mode, a column for each whitened parameter, smoothest first, (N, N)."""
 
     def __init__(
         self,
@@ -78,15 +79,16 @@ class MotionHead(nn.Module):
         Args:
             columns: D.
             n_basis: N.
-            duration: Duration [s], or a range in which a parameter selects it, geometrically.
-            delay: Longest delay before a motion [s]; 0: no parameter for it.
+            duration: Duration [s], or a range, in which a parameter selects its logarithm.
+            delay: Longest delay before a motion [s]; 0: no delay and no parameter for it.
             amplitude: Root mean square deviation over a motion for unit normal weights, and
                 standard deviation of the goal for a unit normal parameter, in the units of the
                 columns; (D,) or one for all.
             goal_centre: Centre of the goals, (D,); None: the start of each motion.
 
         Raises:
-            ValueError: Numbers with the wrong sign or count.
+            ValueError: A duration, delay or amplitude of wrong sign, or a wrong number of
+                values.
         """
         super().__init__()
         low, high = duration if isinstance(duration, tuple) else (duration, duration)
@@ -132,22 +134,22 @@ class MotionHead(nn.Module):
     ) -> "PlannedTrajectory":
         """Motion from a given state.
 
-        To plan again during a motion, call it with new parameters and the current state: a new
-        motion begins. With `since` as well, the motion continues from there at its current
-        phase, and ends when the first one would have.
+        To plan again during a motion, call the head with new parameters and the current state;
+        a new motion then begins. With `since` as well, the motion continues from this state at
+        its current phase, and ends when the first motion would have ended.
 
         Args:
             parameters: Parameters from a network.
             time: Time since the start [s], (T,) or (*batch, T). During the delay, the motion
                 rests at its start.
             start: Start, or current position, (*batch, D).
-            start_velocity: Velocity there [1/s], (*batch, D); zero by default.
-            since: Time [s] of that state, (*batch); no time may be before it.
+            start_velocity: Velocity at the start [1/s], (*batch, D); zero by default.
+            since: Time [s] of the current state, (*batch); no time may be before it.
             origin: Start of the path to the goal, (*batch, D), only with `since`; `start` by
                 default.
 
         Raises:
-            ValueError: Another number of parameters or columns, or bad times.
+            ValueError: A wrong number of parameters or columns, or bad times.
         """
         plan = self._plan(parameters, start, start_velocity, since, origin)
         s, waiting = self._normalised(time, plan)
@@ -168,8 +170,7 @@ class MotionHead(nn.Module):
         Args:
             parameters: Mean of the parameters.
             scale_tril: Cholesky factor of the covariance of the first L = D (N + 1) parameters.
-                Duration and delay are
-                certain.
+                Duration and delay are certain.
             start: (*batch, D), certain.
             start_velocity: Per second, (*batch, D).
             since: Time [s], (*batch).
@@ -194,7 +195,8 @@ class MotionHead(nn.Module):
         """Timing parameters for durations and delays [s] within their ranges.
 
         Raises:
-            ValueError: A value without a range, a missing value, or one out of its range.
+            ValueError: A value for a fixed duration or delay, a missing value, or a value out
+                of its range.
         """
         found = []
         for name, value, low, high in (
@@ -267,7 +269,7 @@ class MotionHead(nn.Module):
                 f"parameters must have shape (..., {self.n_parameters}), got "
                 f"{tuple(parameters.shape)}"
             )
-        # Networks under autocast give half precision, in which paths are off visibly.
+        # Networks under autocast give half precision, which visibly distorts paths.
         if parameters.dtype not in FLOATING:
             parameters = to_tensor(parameters, self.amplitude.dtype, parameters.device)
         finite("parameters", parameters)
@@ -326,7 +328,7 @@ class MotionHead(nn.Module):
         H = self._by_mode(self.response.evaluate(s)[..., 0, :])
         if plan.since is None:
             return H
-        # The state is certain, so the motions of all parameters start at rest there.
+        # The state is certain, so no parameter changes position or velocity at `since`.
         there = self._by_mode(self.response.evaluate(plan.since)[..., :2, :])
         back = spring_rows(self.response, s - plan.since[..., None], 0)
         return H - back @ there
@@ -345,9 +347,9 @@ class _Plan:
     delay: Float[Tensor, "*#batch"]
     position: Float[Tensor, "*#batch D"]
     velocity: Float[Tensor, "*#batch D"]
-    """Velocity at the position [1/s]."""
+    """Velocity at this position [1/s]."""
     since: Float[Tensor, "*#batch"] | None = None
-    """Normalised time of this state; None at the start."""
+    """Normalised time of the state; None at the start."""
 
 
 class PlannedTrajectory(ContinuedTrajectory):
@@ -440,7 +442,7 @@ class MotionDistribution:
     ) -> Float[Tensor, "*batch"]:
         """KL divergence KL(self || other) of positions observed with noise.
 
-        It is finite also if start, velocity or timing differ, which are certain.
+        It is finite even if start, velocity or timing differ, although these are certain.
 
         Args:
             other: Distribution of motions with as many columns.
@@ -481,7 +483,7 @@ def _each_column(amplitude: Any, columns: int) -> Float[Tensor, "D"]:
 def _modes(response: Response) -> Float[Tensor, "N N"]:
     """Weights of orthogonal motions, smoothest first, with a mean square of one in total.
 
-    Finer modes are as small as white forcing makes them.
+    The modes have the relative sizes that white forcing causes.
     """
     N = response.basis.count
     s = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)

@@ -1,8 +1,8 @@
-"""The interface of all movement primitives, and their one implementation.
+"""The interface of all movement primitives, and their common implementation.
 
 A linear primitive moves columns. A kind of primitive maps its values to columns and back:
-joints are columns themselves, an orientation becomes its error to a reference, a pose is
-position, orientation error and body, and a moving goal is the frame in which joints are seen.
+joints are columns themselves, an orientation becomes its error to a reference, a pose becomes
+position, orientation error and body, and joints with a moving goal are relative to that goal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ REFIT_SAMPLES = 20
 
 
 class EndOptions(TypedDict, total=False):
-    """Ends that some kinds of primitive have."""
+    """Arguments for start and goal that only some kinds of primitive accept."""
 
     start_body: Vectors | None
     """Body at the start, (*batch, K); poses only."""
@@ -50,7 +50,7 @@ class EndOptions(TypedDict, total=False):
 
 
 class MotionPrimitive[Value, Path, State](nn.Module):
-    """Learned motion that start, goal, duration and via points reshape.
+    """Learned motion that adapts to start, goal, duration and via points.
 
     Kinds differ in their values: joints, a quaternion, a `Pose`. The class of each kind
     documents its values, velocities and couplings.
@@ -65,15 +65,15 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     options: ClassVar[frozenset[str]] = frozenset()
     """Arguments of this kind beyond start, goal and start velocity."""
 
-    # The frame is what columns are relative to and may differ between motions: the reference
-    # of an orientation error, the velocity of a moving goal; None where there is none. What
-    # follows is right for values that are columns themselves; other kinds override it.
+    # Columns are relative to a frame, which may differ between motions: the reference of an
+    # orientation error, or the velocity of a moving goal; None if there is no frame. The next
+    # methods suit values that are columns themselves; other kinds override them.
 
     def with_motion[S: "MotionPrimitive"](self: S, motion: Any, frame: Any = None) -> S:
-        """Primitive of the same kind around another linear one.
+        """Primitive of the same kind with another linear primitive.
 
         Args:
-            motion: Replaces the linear primitive.
+            motion: The new linear primitive.
             frame: Frame of the columns; None keeps that of this primitive.
         """
         return motion
@@ -106,7 +106,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     def _retarget(
         self, columns: DMPState, frame: Any, goal: Any, filtered: bool, **options: Any
     ) -> tuple[DMPState, Any, Any]:
-        """Columns, frame and goal in columns for a new goal, with the same value and velocity.
+        """Columns, frame and new goal in columns; value and velocity stay the same.
 
         Args:
             columns: Current state.
@@ -155,7 +155,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         return self.duration.shape[0]
 
     def __bool__(self) -> bool:
-        """Return True, also for an empty batch: a primitive is not a container of truth."""
+        """Return True, even for an empty batch, so that `if primitive` only tests for None."""
         return True
 
     def __getitem__[S: "MotionPrimitive"](self: S, index: Any) -> S:
@@ -200,10 +200,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
                 the duration so that the path stays the same, and turned and scaled with the
                 displacement if the scaling is `"rotation"`.
             speed: Speed relative to the demonstration, instead of a duration.
-            dt: Sampling interval [s], instead of times: from zero to the end of the longest
-                motion, or the first sample past it.
+            dt: Sampling interval [s], instead of times: samples run from zero to the first one
+                at or past the end of the longest motion.
             forcing_gain: Factor on the forcing term, (*batch): the amplitude of a rhythm.
-            options: Ends of this kind of primitive.
+            options: Further arguments of this kind of primitive.
         """
         given = Boundary(start, goal, start_velocity)
         boundary, tau, frame = self._resolved(given, duration, speed, **options)
@@ -248,19 +248,19 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """Advance by `dt`, exactly for terms that are constant over the step.
 
         Uncoupled steps of any length end where the rollout does. A coupling that depends on
-        the state is evaluated at the start of the step, which is of first order in `dt`; so is
-        a filtered goal with the scaling `"paper"`, whose forcing it scales. A new goal changes
-        neither the current value nor its velocity.
+        the state is evaluated at the start of the step, with an error of first order in `dt`.
+        The same holds for a filtered goal with the scalings `"paper"` and `"rotation"`, because
+        it scales the forcing. A new goal changes neither the current value nor its velocity.
 
         Args:
             state: From `initial_state` or the last step.
             dt: [s], (*batch).
             goal: New goal from now on, (*batch).
             goal_filter: Rate, per duration, at which the goal moves to the commanded one, which
-                avoids a jump of the acceleration. None: it jumps.
+                avoids a jump of the acceleration. None: the goal jumps.
             coupling: External acceleration added to the motion [1/s^2], (*batch).
-            phase_stopping: The clock of the whole system, phase and spring, runs slower by the
-                factor 1 + this, (*batch), >= 0. The motion slows down on its path.
+            phase_stopping: Number p >= 0, (*batch). The clock of phase and spring runs slower
+                by the factor 1 + p, so the motion slows down on its path.
             forcing_gain: Factor on the forcing term, (*batch).
             goal_body: New goal of the body, (*batch, K); poses only.
         """
@@ -295,7 +295,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             state: Current state.
             goal: (*batch).
             goal_body: Goal of the body, (*batch, K); poses only.
-            filtered: False if the next step has no `goal_filter`: faster for orientations.
+            filtered: False if the next step has no `goal_filter`; this is faster for
+                orientations.
         """
         if goal is None and goal_body is None:
             return state
@@ -317,16 +318,16 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     ) -> S:
         """Primitive that passes exactly through via points.
 
-        Start and goal stay, with their velocities, and so does any column without a via point.
-        With `within`, so does the motion outside of that time. Via points hold for the
-        primitive's own start, goal and duration: set others before, with `with_boundary`.
-        Gradients flow to times, values and velocities. No change is larger than 1.5 times that
-        of the curve through the via points; where that fails, the points are too close.
+        Start and goal keep their values and velocities, and columns without a via point do not
+        change. With `within`, the motion outside of this time does not change either. Via
+        points hold for the primitive's own start, goal and duration: set others before, with
+        `with_boundary`. Gradients flow to times, values and velocities. The motion may change
+        1.5 times as much as the curve through the via points; beyond, they are too close.
 
         Args:
             time: Times of the via points [s], (*batch, n).
             value: Values as for `via_points`, like the velocity; NaN leaves them free.
-            velocity: Velocities. None or NaN keeps that of the motion if a value is given.
+            velocity: Velocities. If a value is given, None or NaN keeps the motion's velocity.
             within: Times [s] between which the motion may change; None: from start to end.
 
         Raises:
@@ -341,16 +342,16 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     ) -> ViaPoints:
         """Via points as columns (float64); the body of a pose stays free.
 
-        An orientation becomes the error on the branch nearest to the motion there, so that both
-        signs mean the same. An angular velocity becomes the rate of the error at the given
-        orientation, or at that of the motion.
+        An orientation becomes its error on the branch nearest to the motion, so both signs of
+        a quaternion mean the same. An angular velocity becomes the rate of the error at the
+        given orientation or, without one, at that of the motion.
 
         Args:
             time: [s], (*batch, n).
             value: Joints (*batch, n, D); unit quaternions (*batch, n, 4); or a `Pose` of
                 (*batch, n). NaN leaves a coordinate free; in a quaternion, the orientation.
-            velocity: Of joints (*batch, n, D); angular [rad/s], (*batch, n, 3); or a twist
-                (*batch, n, 6). NaN leaves it free.
+            velocity: Joint velocities (*batch, n, D), angular velocities [rad/s] (*batch, n, 3)
+                or twists (*batch, n, 6). NaN leaves a velocity free.
 
         Raises:
             ValueError: Negative times, or shapes that do not fit.
@@ -451,7 +452,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
 
 class WrappedPrimitive[Value, Path, State](MotionPrimitive[Value, Path, State]):
-    """Primitive with a linear one as a module of its own."""
+    """Primitive that holds a linear primitive as a submodule."""
 
     motion: LinearPrimitive
 
@@ -500,7 +501,8 @@ def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     The result has a fit report if all primitives have one.
 
     Raises:
-        ValueError: The list is empty, or the primitives differ; the message says in what.
+        ValueError: The list is empty, or the primitives differ; the message names the
+            difference.
     """
     if not primitives:
         raise ValueError("there are no primitives to stack")

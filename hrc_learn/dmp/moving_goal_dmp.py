@@ -3,8 +3,8 @@
 y'' = alpha (beta (g + (s - 1) v - y) + v - y') + f,   s = t / tau
 
 (Kober et al. 2010, "Movement templates for learning of hitting and batting", with the goal's
-velocity in the damping term). The goal passes g at s = 1 with velocity v. Relative to it,
-x = y - (s - 1) v, this is the equation of a goal at rest: rollouts and steps stay exact.
+velocity in the damping term). The goal passes g at s = 1 with velocity v. For the relative
+motion x = y - (s - 1) v, this is the equation of a goal at rest: rollouts and steps stay exact.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class MovingTrajectory(Trajectory):
     """Motion to a moving goal; each output is computed on first access."""
 
     def __init__(self, relative: Trajectory, velocity: Float[Tensor, "*#batch D"]):
-        """Add the motion of the goal at this velocity [1/s] to the motion relative to it."""
+        """Add the goal's motion at this velocity [1/s] to the motion relative to the goal."""
         super().__init__(
             coordinates=relative._given,
             s=relative.s,
@@ -45,7 +45,7 @@ class MovingTrajectory(Trajectory):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingGoalState:
-    """State of a primitive with a moving goal in closed loop; a pytree."""
+    """State in closed loop of a primitive with a moving goal; a pytree."""
 
     motion: DMPState
     """State relative to the goal."""
@@ -73,8 +73,9 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     """Joint primitive that passes its goal with a given velocity.
 
     Values are (*batch, D) in the units of the demonstration, velocities the same per second.
-    `rollout` and `initial_state` meet the `end_velocity` exactly at the end of the duration; by
-    default it is the demonstrated one. The goal is the place of the moving goal at the end.
+    `rollout` and `initial_state` meet the `end_velocity` exactly at the end of the duration;
+    without it, the goal does not move. The value of `goal` is where the moving goal is at the
+    end of the duration.
     """
 
     motion: JointDMP
@@ -88,7 +89,7 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         """
         super().__init__()
         if motion.forcing_scale.depends_on_boundary:
-            raise ValueError("a moving goal needs a scaling that does not depend on start")
+            raise ValueError("a moving goal needs a scaling independent of start and goal")
         self.motion = motion
 
     @property
@@ -104,7 +105,7 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     def with_motion[S: "MovingGoalDMP"](
         self: S, motion: JointDMP, frame: Tensor | None = None
     ) -> S:
-        """Primitive with another motion, whose own end velocity is the demonstrated one."""
+        """Primitive with another motion, whose own end velocity is the default."""
         return type(self)(motion)
 
     def state_of(self, columns: DMPState, frame: Tensor) -> MovingGoalState:
@@ -117,14 +118,14 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     def _boundary(
         self, given: Boundary, duration: Tensor, end_velocity: Vectors | None = None
     ) -> tuple[Boundary, Tensor]:
-        """Start and rate relative to the goal whose motion leads to `end_velocity`."""
+        """Boundary relative to the moving goal, and the goal velocity for `end_velocity`."""
         motion, end = self.motion, duration[..., None]
         start, goal, per_s = motion.resolve_boundary(given, duration)
         rate = per_s / end
         at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
         at_rest = at_rest.velocity[..., 0, :]
-        # A unit of v shifts the start by v and its rate by -v. Columns -2 and -3 of the
-        # response are the start and its rate; the goal's own velocity is one.
+        # In units of s, a goal velocity of 1 changes the start by 1 and the start velocity by
+        # -1 (columns -2 and -3 of the response), and itself adds 1 to the end velocity.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         gain = 1 + at_end[-2] - at_end[-3]
         # The end velocity is linear in v, so the difference gives v directly.

@@ -97,7 +97,7 @@ class OrientationState(ErrorColumns):
     """State of an orientation primitive in closed loop."""
 
     motion: DMPState
-    """State of the columns, the error to the reference among them."""
+    """State of the columns, which include the error to the reference."""
     reference: Float[Tensor, "*batch 4"]
     """Reference of the error; the goal by default."""
 
@@ -136,8 +136,9 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            motion: Motion of the columns. If its own goal of the error is not zero, the
-                reference is exp(that) * goal, as for primitives with different goals.
+            motion: Motion of the columns. If its error e at the goal is not zero, the reference
+                is exp(e) * goal, for instance if primitives with different goals have one
+                reference.
             goal_orientation: Unit quaternion (w, x, y, z) at the end.
         """
         super().__init__()
@@ -160,7 +161,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
     def with_motion[S: "OrientedPrimitive"](
         self: S, motion: JointDMP, frame: Tensor | None = None
     ) -> S:
-        """Primitive with another motion of the columns, to this reference or another."""
+        """Primitive with another motion of the columns, relative to `frame` (None: as now)."""
         reference = self.reference if frame is None else frame
         return type(self)(
             motion, to_orientation(motion.goal[..., self.error_columns], reference)
@@ -243,7 +244,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
 
         Args:
             rate: Demonstrated rate, for the duration of the motion.
-            start: New start; None keeps the demonstrated one, as for all that follow.
+            start: New start; None keeps the demonstrated value, here and below.
             goal: New goal.
             omega: New angular velocity at the start [rad/s].
         """
@@ -289,7 +290,8 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Columns and reference of one motion for a goal that jumps, in Python's numbers.
 
         Returns:
-            None where PyTorch has to compute, or for a wrong value, which it reports.
+            None where PyTorch has to compute, or for a wrong value, which PyTorch's path
+            reports.
         """
         E, motion, parts = self.error_columns, self.motion, (columns.position, columns.rate)
         if frame.ndim != 1 or type(motion) is not JointDMP or not fits_numpy(frame, *parts):
@@ -311,7 +313,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
     ) -> DMPState:
         """Columns with the error to another reference, for the same motion of the orientation.
 
-        With a goal filter, the acceleration is continuous.
+        If `filtered`, the acceleration is continuous too.
         """
         motion, E = self.motion, self.error_columns
         position, rate = columns.position, columns.rate
@@ -325,7 +327,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             return moved
         second = motion.second_derivative(columns)
         slope = orientation_error.angular_acceleration(*error, second[..., E])
-        # It is linear in the second derivative, plus a bias from the turning.
+        # The angular acceleration is linear in e'', plus a bias from the rotation.
         bias = orientation_error.angular_acceleration(*turned, torch.zeros_like(slope))
         curve = orientation_error.error_rate(turned[0], slope - bias)
         goal = motion.equilibrium_goal(moved, _with_columns(second, E, curve))
@@ -334,7 +336,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
     def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
         """Second derivatives of the columns for a linear acceleration, an angular one, or both.
 
-        That of the error is linear in the angular acceleration in the base frame.
+        The error's second derivative is linear in the angular acceleration in the base frame.
         """
         values, E, (P, _) = columns.position, self.error_columns, self._others
         coupling = to_tensor(coupling, values.dtype, values.device)
@@ -370,9 +372,9 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
     The error e to a reference, the goal by default, is the state of a linear primitive that is
     exact at all angles, or of the formulation of Ude et al. 2014. Both signs of a quaternion
     give the same motion. Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and
-    couplings are angular, in the base frame, (*batch, 3). A new start or goal is reached in the
-    sense of rotation of the demonstration. The fit report has residuals of the components of
-    the error [rad], which bound those of the angle.
+    couplings are angular, in the base frame, (*batch, 3). Motions to a new start or goal rotate
+    in the same direction as the demonstration. The fit report holds residuals of the components
+    of the error [rad], which bound the residual of the angle.
     """
 
     error_columns: ClassVar[slice] = OrientationState.error_columns
@@ -451,7 +453,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
 
 
 def _formulated(name: Any) -> type[JointDMP]:
-    """Class of the motion of the error in a formulation."""
+    """Class of the primitive that moves the error in this formulation."""
     formulations = {"log": JointDMP, "ude": UdePrimitive}
     if name not in formulations:
         known = ", ".join(formulations)

@@ -1,4 +1,4 @@
-"""Orientations as errors to a goal, the coordinates in which an orientation moves linearly.
+"""Orientation errors to a goal: coordinates in which an orientation primitive is linear.
 
 e = log(g * conj(q)), a rotation vector [rad] in the base frame, so that q = exp(-e) * g
 (Koutras and Doulgeri 2019, "A correct formulation for the orientation dynamic movement
@@ -21,8 +21,8 @@ type Numbers = list[float]
 _NO_AXIS = 1e-9
 """Length [rad] below which a rotation vector has no direction."""
 MEAN_ITERATIONS = 10
-"""Iterations of a mean. Each leaves a small fraction of the distance, or of its cube where all
-orientations are close."""
+"""Iterations of a mean. Each leaves a small fraction of the distance to the mean, or of the
+cube of this distance if all orientations are close."""
 NORM_TOLERANCE = 1e-2
 """Deviation from one up to which the norm of a recorded quaternion is corrected."""
 
@@ -52,7 +52,7 @@ def to_orientations(
     error: Float[Tensor, "*#batch T 3"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch T 4"]:
     """Orientations over time with these errors to one goal."""
-    # One 4x4 product each: row i of the matrix is the unit quaternion i times the goal.
+    # One product with a 4x4 matrix each: row i is the unit quaternion i times the goal.
     unit = torch.eye(4, dtype=goal.dtype, device=goal.device)
     return quaternion.exp(-error) @ quaternion.multiply(unit, goal[..., None, :])
 
@@ -78,8 +78,8 @@ def error_rate(
 ) -> Float[Tensor, "*batch 3"]:
     """Rate de/dt for an angular velocity [rad/s]; the inverse of `angular_velocity`.
 
-    Whole turns away from the goal, the error can only change along its own axis: the part of
-    the velocity across it is lost there.
+    If the error is a whole number of turns, it can only change along its own axis: the part of
+    the velocity across this axis is then lost.
     """
     error, velocity = torch.broadcast_tensors(error, velocity)
     return -velocity - axis_drift(error, velocity)
@@ -90,7 +90,7 @@ def nearest_turn(
 ) -> Float[Tensor, "*batch 3"]:
     """The same rotation as `error`, with the whole turns that bring it closest to `reference`.
 
-    A new start or goal is thereby reached in the sense of rotation of the demonstration.
+    Motions to a new start or goal thereby rotate in the same direction as the demonstration.
     """
     error, reference = torch.broadcast_tensors(error, reference)
     own = error.norm(dim=-1, keepdim=True) > _NO_AXIS
@@ -115,7 +115,7 @@ def retarget(
 def retarget_numbers(
     error: Numbers, rate: Numbers, old: Numbers, goal: Numbers
 ) -> tuple[Numbers, Numbers]:
-    """`retarget` of one motion in Python's numbers, in a fiftieth of the time."""
+    """`retarget` for one motion in Python's numbers, in a fiftieth of the time."""
     angle, axis = _polar(error)
     between = quaternion.product_of_components(goal, [old[0], *(-x for x in old[1:])])
     turned = quaternion.product_of_components(between, exp_numbers(error))
@@ -142,7 +142,7 @@ def exp_numbers(v: Numbers) -> Numbers:
 
 
 def _polar(v: Numbers) -> tuple[float, Numbers]:
-    """Length and direction of a vector; zeros have none."""
+    """Length and direction of a vector; a zero vector has the direction zero."""
     length = math.hypot(*v)
     return length, [x / length for x in v] if length else v
 
@@ -164,8 +164,8 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
     """
     q = to_tensor(value, dtype=like.dtype, device=like.device)
     shaped = q.ndim > 0 and q.shape[-1] == 4
-    # Far from one on purpose: it tells quaternions from zeros and from Euler angles. A tracer
-    # cannot look at values.
+    # A loose bound: it only has to exclude zeros and Euler angles. A tracer cannot look at
+    # values.
     norm = q.norm(dim=-1) if shaped else q
     if not (shaped and (not readable(q) or ((norm > 0.5) & (norm < torch.inf)).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
@@ -175,8 +175,8 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
 def intrinsic_mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
     """Orientation from which the rotation vectors to all others sum to zero.
 
-    (Moakher 2002, "Means and averaging in the group of rotations".) Fixed-point iteration from
-    the extrinsic mean, which does not depend on signs.
+    (Moakher 2002, "Means and averaging in the group of rotations".) The fixed-point iteration
+    starts from the extrinsic mean, which does not depend on signs.
     """
     return _refined(quaternion.mean(q), q, torch.full_like(q[:, :1], 1 / len(q)))
 
@@ -241,7 +241,7 @@ def centred_error(
     centre = mean_along(q, mask)
     error = to_error(q, centre[..., None, :])
     # Past half a turn the logarithm jumps to the other side, which unwrapping would undo.
-    # The jump has length 2 pi: any threshold well between rounding and that will do.
+    # The jump has length 2 pi: any threshold well between rounding and 2 pi detects it.
     far = (quaternion.unwrap_log(error) - error).norm(dim=-1) > 1
     if far.any():
         i, k = far.reshape(-1, far.shape[-1]).nonzero()[0].tolist()
@@ -256,7 +256,7 @@ def _without_gaps(
     orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
 ) -> Float[Tensor, "*batch T 4"]:
     """Orientations with masked samples replaced by the last valid one before them."""
-    # Samples before the first valid one take that.
+    # Samples before the first valid one take its value.
     index = torch.arange(mask.shape[-1], device=mask.device).expand(mask.shape)
     first = mask.long().argmax(-1, keepdim=True)
     latest = torch.where(mask, index, first).cummax(-1).values

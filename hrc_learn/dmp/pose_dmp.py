@@ -1,4 +1,4 @@
-"""Movement primitive of a pose, and of body coordinates such as an arm angle along with it."""
+"""Movement primitive of a pose together with body coordinates, such as an arm angle."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Unpack
@@ -97,9 +97,9 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
     `with_boundary` also take `start_body` and `goal_body`, (*batch, K); `step` takes
     `goal_body`.
 
-    The fit report has residuals by column: position [m], orientation error [rad], body. Those
-    of the components of the error bound those of the angle. The largest range, by which
-    `nrmse` divides, mixes units.
+    The fit report has residuals by column: position [m], orientation error [rad], body. The
+    residuals of the error's components bound that of the angle. `nrmse` divides by the largest
+    range although the units of the columns differ.
     """
 
     error_columns: ClassVar[slice] = ERROR

@@ -1,7 +1,7 @@
-"""Gaussians over primitives and their mean, from several demonstrations.
+"""Gaussians over primitives, and means of primitives, from several demonstrations.
 
-Orientations and poses move linearly in columns, so everything is computed on the columns of
-their `motion`.
+The columns of orientations and poses move linearly too, so everything is computed on the
+columns of `motion`.
 """
 
 from copy import deepcopy
@@ -36,26 +36,28 @@ from hrc_learn.model_files import SavedModel, write_model
 KINDS: dict[str, type[MotionPrimitive]] = {
     kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)
 }
-"""Kinds of primitive by the names in files."""
+"""Kinds of primitive by their names in files."""
 
 PATH_TIMES = 30
-"""Times at which paths are compared; no two routes separate and join again between them."""
+"""Number of times at which paths are compared; routes do not part and rejoin between two of
+them."""
 FEWEST, SINGULAR = 4, 1e-6
-"""Smallest number of primitives by which the dependence of paths on their ends is judged, and
-relative singular value below which ends do not vary."""
+"""Smallest number of primitives from which the dependence of paths on start and goal is
+estimated, and relative singular value below which start and goal count as constant."""
 KNOWN_DURATION = 1e-6
 """Standard deviation of the logarithm of a known duration."""
 GAUSSIAN = ("mean", "spread", "timing")
 SAME_ORIENTATION = 1e-9
-"""Angle [rad] below which orientations count as equal: above rounding, below any sensor."""
+"""Angle [rad] below which orientations count as equal: no sensor resolves it, and rounding is
+smaller."""
 
 
 def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
     """Mean over all batch dimensions of a primitive.
 
-    A rollout is linear in weights, start, goal and start velocity. For one duration, and a
-    scaling that does not depend on start and goal, its mean is the rollout of the means. The
-    duration is the geometric mean.
+    A rollout is linear in weights, start, goal and start velocity. If durations are equal and
+    the scaling does not depend on start and goal, the mean of the rollouts is therefore the
+    rollout of the means. The duration of the result is the geometric mean.
 
     Args:
         primitives: Primitives fitted to several demonstrations of one motion.
@@ -64,7 +66,8 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
         A primitive without batch dimensions and without a fit report.
 
     Raises:
-        ValueError: The scaling is `"rotation"`, with weights in a frame per demonstration.
+        ValueError: The scaling is `"rotation"`, whose weights are in a frame of their own for
+            each demonstration.
     """
     motion, columns = _mean_motion(primitives.motion), primitives.error_columns
     if columns is None:
@@ -76,7 +79,7 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
 
 
 def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
-    """Batch of primitives whose columns mean the same for all of them.
+    """Batch of primitives whose orientation errors have one common reference.
 
     Orientations with different goals become errors to the mean of their references. The map is
     not linear, so the errors are fitted again.
@@ -102,7 +105,7 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
 
 
 def common_reference(primitives: MotionPrimitive) -> Tensor | None:
-    """Reference that all orientations of a batch have, (4,); None for joints."""
+    """Common reference of the orientation errors of a batch, (4,); None for joints."""
     found = getattr(primitives, "reference", None)
     return None if found is None else found.reshape(-1, 4)[0]
 
@@ -132,16 +135,16 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     """Gaussian over the coordinates x = (weights, start velocity, start, goal) of a primitive.
 
     A motion is linear in its coordinates, y(s) = H(s) x, and therefore Gaussian too: means,
-    likelihoods and conditioning on via points are closed form. All joints vary together, in
-    float64. Any kind of primitive is accepted; for orientations and poses the error to one
-    reference is Gaussian.
+    likelihoods and conditioning on via points are closed form. The Gaussian is joint over all
+    columns, in float64. Any kind of primitive is accepted; for orientations and poses, the
+    error to one reference is Gaussian.
     """
 
     primitive: P
     """Primitive with the common spring, basis, duration, names and reference."""
     mean: Float[Tensor, "D M"]
     spread: Float[Tensor, "DM rank"]
-    """Square root of the covariance, with the rank of the demonstrations."""
+    """Square root of the covariance, with columns for demonstrations and free forcing."""
     timing: Float[Tensor, "rank"]
     """Deviation of the logarithm of the duration for each column of `spread`."""
     dependence: float = 1.0
@@ -154,10 +157,11 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Args:
             primitives: Primitives of one motion, fitted with `scaling="none"`.
             slack: Freedom beyond the variation of the demonstrations, as in `around`. Without
-                it, a via point that no mixture of them passes is approached but not reached.
+                it, a via point that no combination of demonstrations passes is approached but
+                not reached.
 
         Raises:
-            ValueError: Fewer than two primitives, or a scaling, which is not linear.
+            ValueError: Fewer than two primitives, or a scaling other than `"none"`.
         """
         batch = primitives.motion.weights.shape[:-2]
         if batch.numel() < 2 or not batch:
@@ -268,12 +272,13 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Gradients flow to times, values, velocities, mean and spread.
 
         Args:
-            time: Times of the via points [s], (n,), in the most likely motion. Empty: the
-                duration alone is known.
+            time: Times of the via points [s], (n,), in the most likely motion. Empty: only the
+                duration is known.
             value: Joints (n, D), unit quaternions (n, 4) or a `Pose` of (n). NaN leaves a
                 coordinate free; in a quaternion, the orientation.
-            velocity: Of joints (n, D), angular (n, 3) or a twist (n, 6), per second. An angular
-                one without an orientation is taken at that of the mean motion.
+            velocity: Joint velocities (n, D), angular velocities (n, 3) or twists (n, 6), per
+                second. An angular velocity without an orientation refers to the orientation of
+                the mean motion.
             noise: Standard deviation of each value in the units of its coordinate ([rad] for an
                 orientation), or of each velocity per second; one number, (D,) or (n, D).
             duration: Known duration [s].
@@ -284,7 +289,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         if duration is not None:
             motion = self.primitive.motion
             ratio = positive("duration", duration, self.mean) / motion.duration.double()
-            # The logarithm of the duration, as exactly as numbers allow.
+            # Condition on the logarithm of the duration, almost without noise.
             known = self._given(
                 self.timing[None] / KNOWN_DURATION, ratio.log()[None] / KNOWN_DURATION
             )
@@ -309,8 +314,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def _given(
         self, root: Float[Tensor, "k rank"], residual: Float[Tensor, "k"]
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian given root z = residual with unit noise, z the coordinates of the spread."""
-        # The unit covariance keeps it positive definite for any number of equal via points.
+        """Gaussian given root z = residual with unit noise, for coordinates z of the spread."""
+        # The prior's identity keeps this positive definite for any number of equal via points.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)
         z = torch.cholesky_solve((root.mT @ residual)[:, None], factor)[:, 0]
@@ -332,9 +337,10 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     ) -> "ProbabilisticDMP[P]":
         """Gaussian with a certain start and goal, by default those of the mean.
 
-        Few demonstrations show no reliable dependence of a path on its ends. The covariance
-        with them is therefore multiplied by the factor, 0 to 1, with which each demonstration
-        is predicted best from the others: in the mean it predicts as well as the mean of all.
+        Few demonstrations do not show reliably how a path depends on start and goal. The
+        covariance of the path with them is therefore multiplied by the factor, 0 to 1, that
+        best predicts each demonstration from the others. On average, this predicts at least as
+        well as the mean of all demonstrations.
 
         Args:
             start: Start of one motion, as `rollout` of the primitive takes it.
@@ -349,7 +355,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         E, k = spread[:, -2:].flatten(0, 1), self.dependence
         back = torch.linalg.pinv(E, rtol=SINGULAR)
         z = k * (back @ (ends - self.mean[:, -2:]).flatten())
-        # A root of I - k^2 P, P the projection on what the ends determine.
+        # A root of I - k^2 P, where P projects onto what start and goal determine.
         left = torch.eye(len(z)).to(E) - (1 - (1 - k**2) ** 0.5) * (back @ E)
         mean = torch.cat([(self.mean + spread @ z)[:, :-2], ends], dim=1)
         remaining = torch.nn.functional.pad(spread[:, :-2] @ left, (0, 0, 0, 2))
@@ -364,8 +370,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         )
 
     def observed(self, noise: float) -> LowRankMultivariateNormal:
-        """Gaussian of all columns at `PATH_TIMES` even fractions of the motion, one after
-        another, and of the logarithm of the duration, observed with independent noise.
+        """Gaussian of all columns at `PATH_TIMES` evenly spaced times of the motion, followed
+        by the logarithm of the duration, observed with independent noise.
 
         Its entropy, log density, samples and divergences are those of the motion with its
         duration, in float64.
@@ -389,8 +395,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     ) -> Float[Tensor, "*batch"]:
         """Log density of values (*batch, n, D) observed at times (n,) with this sensor noise.
 
-        For orientations it is the density of the error to the primitive's reference. NaN marks
-        values that were not observed.
+        For orientations, this is the density of the error to the primitive's reference. NaN
+        marks values that were not observed.
         """
         deviation = positive("noise", noise, self.mean)
         value = value if isinstance(value, Pose) else to_tensor(value)
@@ -436,7 +442,7 @@ def gaussians_of_modes[P: MotionPrimitive](
         slack: Freedom beyond the variation of the demonstrations, as in `around`.
 
     Raises:
-        ValueError: A scaling, which is not linear.
+        ValueError: A scaling other than `"none"`.
     """
     _linear_coordinates(primitives.motion)
     primitives, r = with_common_reference(primitives), responsibilities
@@ -445,7 +451,7 @@ def gaussians_of_modes[P: MotionPrimitive](
     lasting = motion.duration.detach().double().flatten().log()
     fraction = r / r.sum(0)
     means, logarithms = torch.einsum("nk,ndm->kdm", fraction, x), fraction.mT @ lasting
-    # Each primitive is weighted by its responsibilities. Each mean takes a degree of freedom.
+    # Primitives are weighted by their responsibilities. Each mean takes a degree of freedom.
     weight = (r / max(n - r.shape[1], 1)).sqrt()
     spread = ((x[:, None] - means) * weight[..., None, None]).flatten(2).flatten(0, 1).mT
     timing = ((lasting[:, None] - logarithms) * weight).flatten()
@@ -478,7 +484,7 @@ def gaussian(
 
 
 def _dependence_on_ends(motion: LinearPrimitive, x: Float[Tensor, "n D M"]) -> float:
-    """Factor on the dependence of paths on start and goal that predicts held-out ones best."""
+    """Factor on the dependence of paths on start and goal that best predicts held-out paths."""
     n, s = len(x), torch.linspace(0, 1, PATH_TIMES).to(x)
     if n < FEWEST:
         return 1.0
@@ -496,7 +502,7 @@ def _dependence_on_ends(motion: LinearPrimitive, x: Float[Tensor, "n D M"]) -> f
 
 
 def columns_of_ends(like: Any, moved: Any) -> Float[Tensor, "2 D"]:
-    """Start and goal of a primitive in the columns of another, of the same kind."""
+    """Start and goal of the primitive `moved`, in the columns of `like` (of the same kind)."""
     ends = torch.stack([moved.motion.start, moved.motion.goal])
     if (errors := like.error_columns) is not None:
         turned = [getattr(end, "orientation", end) for end in (moved.start, moved.goal)]
@@ -513,7 +519,7 @@ def _linear_coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D 
 
 
 def _free_forcing(primitive: LinearPrimitive, slack: float) -> Float[Tensor, "DM DN"]:
-    """Spread of independent weights with which the forcing varies equally at all times."""
+    """Spread of independent weights that makes the forcing vary equally at all times."""
     basis, amplitude = primitive.basis, primitive.amplitude.detach().double()
     D, N = len(amplitude), basis.count
     unit = 1 / basis.phase(basis.centre_times().to(amplitude))

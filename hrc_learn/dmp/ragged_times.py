@@ -1,13 +1,13 @@
 """Motions on ragged time grids: each element of a batch has its own duration or timestamps.
 
-On one shared grid, a batch is one product with a response matrix. On many grids there would be
-one such matrix per motion, fifty times as large as the motion. Here the polynomials of the
-response are multiplied by the coordinates first. The result is a piecewise polynomial per
-column, whose value at any time is a sum of a few rows weighted by powers.
+On one shared grid, a batch is one product with a response matrix. On many grids, each motion
+would need such a matrix, with N + 3 numbers per sample. Here the polynomials of the response
+are multiplied by the coordinates first. The result is a piecewise polynomial per column, whose
+value at any time is a sum of a few coefficients weighted by powers.
 
-That sum is linear in the coordinates, and its derivative by time is the motion of the next
-order. A motion, its adjoint and their derivatives of any order are therefore the same two
-functions.
+This sum is linear in the coordinates, and its derivative by time is the motion of the next
+order. The same two functions therefore compute a motion, its adjoint, and their derivatives of
+any order.
 """
 
 from collections.abc import Iterator
@@ -34,10 +34,10 @@ NEGLIGIBLE = 4
 largest value of a column: a sum of fifty products rounds off as much."""
 CHUNK = {"cpu": 2**16, "cuda": 2**22}
 """Samples processed at a time. On a CPU, their indices and powers fit the cache, which halves
-the time of a million; a GPU is kept busy within a gigabyte."""
+the time for a million samples; on a GPU, they occupy the device and take under a gigabyte."""
 LONG = 2**14
-"""Samples of one grid above which matrices for all of them would take more memory than the
-motion, and longer."""
+"""Number of samples of a grid above which the matrices of the grid would take more memory and
+time than the motion."""
 
 
 def motion(
@@ -52,7 +52,7 @@ def motion(
         order: 0 for y itself, 1 for y', and so on.
 
     Raises:
-        NotImplementedError: Two forward derivatives (`refuse_nested_forward`).
+        NotImplementedError: Two nested forward derivatives (`refuse_nested_forward`).
     """
     if torch.compiler.is_compiling():
         # Plain operations, which a compiler fuses.
@@ -70,9 +70,10 @@ def motion(
 class CoefficientTable:
     """Map from coordinates to the coefficients of a motion, or of one of its derivatives by s.
 
-    Piece p has K coefficients: of 1, u, u^2 ... with u from -1 to 1 along the piece, and of
-    functions of time that are not polynomial. One more piece covers all times after the forcing
-    ends: there the state at its end, relative to the goal, decays as the unforced spring does.
+    Each piece has K coefficients: those of 1, u, u^2 ... with u from -1 to 1 along the piece,
+    and those of functions of time that are not polynomial. One more piece covers all times
+    after the forcing: there the state at its end, relative to the goal, decays as the unforced
+    spring does.
     """
 
     response: Response
@@ -93,7 +94,7 @@ class CoefficientTable:
     def locate(
         self, s: Float[Tensor, "B T"], dtype: torch.dtype
     ) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T K"]]:
-        """Piece around each time, and the values that multiply its coefficients."""
+        """Piece that contains each time, and the values that multiply its coefficients."""
         forced = self.response.forced
         pieces, periodic = len(forced.coefficients), forced.periodic
         x = s / forced.interval
@@ -158,7 +159,7 @@ def _tabulate(
     rate, start = free[..., 1:], free[..., :1]
     others = row.new_zeros(N + 3, 2)
     if forced.periodic:
-        # The motion is the limit cycle plus the decaying distance to it at the start.
+        # The motion is the limit cycle plus the initial distance to it, which decays.
         others[:N] = -forced(row.new_zeros(())).mT
         others[N, 1] = others[N + 1, 0] = 1.0
         others[N + 2, 0] = -1.0
@@ -190,7 +191,8 @@ def _lowest_degree(
     """Polynomials of the lowest degree within a tolerance, relative to the largest value."""
     k = torch.arange(coefficients.shape[1]).to(coefficients)
     angle = torch.pi * (k[:, None] + 0.5) / len(k)
-    # Powers and Chebyshev polynomials, whose sums bound what leaving out the last ones changes.
+    # In Chebyshev polynomials, the sum of the last coefficients bounds the error of omitting
+    # them.
     powers, chebyshev = torch.cos(angle) ** k, torch.cos(angle * k)
     terms = torch.linalg.solve(chebyshev, powers) @ coefficients
     rest = terms.abs().flip(1).cumsum(1).flip(1).amax(0)
@@ -282,7 +284,7 @@ def _motion(s: Tensor, coordinates: Tensor, response: Response, order: int) -> T
 
 
 def _adjoint(s: Tensor, grad: Tensor, response: Response, order: int) -> Tensor:
-    """Gradient of `_motion` by its coordinates, linear in the gradient by the motion."""
+    """Gradient by the coordinates of `_motion`, for the gradient `grad` by the motion."""
     table = _table(response, order, grad)
     B, _, D = grad.shape
     by_x = grad.new_empty(B, D, len(table.matrix))
@@ -312,7 +314,7 @@ def _adjoint(s: Tensor, grad: Tensor, response: Response, order: int) -> Tensor:
 
 
 class _Linear(torch.autograd.Function):
-    """`_motion` or `_adjoint`, each linear in its values and the derivative of the other."""
+    """`_motion` or `_adjoint`: each is linear in `values`, and each is the other's adjoint."""
 
     @staticmethod
     def forward(s, values, response, order, adjoint):

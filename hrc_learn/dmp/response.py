@@ -2,7 +2,7 @@
 
 With x = (y - g, y'), the forcing alone drives x' = A x + (0, phi(s)), with the solution
 x(b) = E(b - a) x(a) + integral from a to b of E(b - u) (0, phi(u)) du, where E is the
-transition matrix of the spring. It is integrated piece by piece, accumulated, and kept as a
+transition matrix of the spring. The integral is computed piece by piece, summed, and kept as a
 table of polynomials.
 """
 
@@ -34,14 +34,14 @@ GAUSS_POINTS = 12
 DEGREE = 12
 """Degree of the polynomials; pieces are so short that the remaining error is rounding."""
 GRIDS_KEPT = 16
-"""Time grids whose matrices are cached. A program uses few: 16 grids of 1000 times take 10 MB
-in float32 with 50 functions."""
+"""Number of time grids whose matrices are cached. A program uses few grids; 16 of 1000 times
+take 10 MB in float32 with 50 functions."""
 
 SMALL_MATRIX_CORES = {"SkylakeX", "Cooperlake", "SapphireRapids"}
 """OpenBLAS core types (version 0.3.29) with kernels for small matrices, which skip packing: all
 processors with AVX-512, including AMD's."""
 MINIMUM_ROWS = 4
-"""Rows from which those kernels beat one flat product of all motions."""
+"""Number of rows from which those kernels are faster than one flat product of all motions."""
 
 
 def chebyshev_points() -> Float[Tensor, "P"]:
@@ -55,8 +55,8 @@ def powers_of(
 ) -> Float[Tensor, "*batch K"]:
     """Powers u^0 to u^(size - 1), and other values after them.
 
-    Products, because derivatives of `**` by tensors of exponents hold logarithms, of negative
-    numbers too.
+    They are computed by products, because derivatives of `**` with a tensor of exponents
+    contain the logarithm of u, which may be negative.
     """
     if torch.compiler.is_compiling() or u.requires_grad or transforming():
         columns = [torch.ones_like(u)]
@@ -144,15 +144,15 @@ class TimeGrid:
 
     s: Tensor
     version: int
-    """Version counter of the tensor, where its values cannot be read; see `holds`."""
+    """Version counter of the tensor, compared where its values cannot be read; see `holds`."""
     content: bytes
     """Values when the matrices were made."""
     matrices: tuple[Tensor, Tensor, Tensor]
     to_position: np.ndarray | None
-    """The first of the matrices in NumPy; None on another device than the CPU."""
+    """The first of the matrices in NumPy; None if it is not on the CPU."""
 
     def holds(self, s: Tensor) -> bool:
-        """True if `s` has the same times. Nothing may trace it, or differentiate by it."""
+        """True if `s` has the same times; it must not be traced or differentiated."""
         # Reading another device would wait for its queue, and transforms refuse it.
         if not s.is_cpu or transforming():
             return s is self.s and s._version == self.version
@@ -187,7 +187,7 @@ class Response:
         self.basis = basis
         self.approach = approach
         self.name = json.dumps([asdict(spring), basis_config(basis), approach])
-        """The parts, for `named_response`."""
+        """The parts as JSON text, for `named_response`."""
         self.size = basis.count + 3
         """M, the number of coordinates: N weights, start velocity, start, goal."""
         # Tensors made in inference mode cannot take part in a backward pass later.
@@ -246,7 +246,7 @@ class Response:
         """Rows H(s), H'(s), H''(s); differentiable any number of times in `s`.
 
         Raises:
-            NotImplementedError: Two forward derivatives (`refuse_nested_forward`).
+            NotImplementedError: Two nested forward derivatives (`refuse_nested_forward`).
         """
         refuse_nested_forward(s)
         state = _StateAt.apply(s, self)
@@ -274,7 +274,7 @@ class Response:
         return torch.cat([forced, velocity, start, at_rest - start], dim=-1)
 
     def approach_force(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Forcing per unit of goal - start that makes the motion between them m(s)."""
+        """Forcing, per unit of goal - start, that moves from start to goal along m(s)."""
         offset, slope, curvature = (approach_curve(s, self.approach, k) for k in range(3))
         return curvature - self.spring.acceleration(offset, slope)
 
@@ -308,7 +308,7 @@ class Response:
             state = torch.cat([state[:stride], state[stride:] + E @ state[:-stride]])
             stride *= 2
         if self.basis.periodic:
-            # The start to which a period returns: x = E x + (state from rest).
+            # Start to which the motion returns after a period: x = E x + (state from rest).
             E = propagate(knots[-1])
             cycle = torch.linalg.solve(torch.eye(2, dtype=torch.float64) - E, state[-1])
             state = state + propagate(knots) @ cycle
@@ -364,7 +364,7 @@ def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Re
 
 
 def named_response(name: str) -> Response:
-    """The shared response with this name, for operators, which take no objects."""
+    """The shared response of this name, for custom operators, which cannot take objects."""
     spring, basis, approach = json.loads(name)
     return response_of(SpringDamper(**spring), restored_basis(basis), approach)
 
@@ -414,7 +414,7 @@ def product(
 def empty_in_large_pages(like: Tensor, *shape: int) -> Tensor:
     """Uninitialised tensor, on a CPU in memory that NumPy requested in large pages.
 
-    With small pages, the system takes as long to map hundreds of megabytes as the product.
+    With small pages, mapping hundreds of megabytes takes as long as the product.
     """
     if not like.is_cpu:
         return like.new_empty(shape)

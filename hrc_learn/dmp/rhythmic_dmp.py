@@ -54,7 +54,7 @@ def fit_rhythmic(
         units: Units of the coordinates.
 
     Raises:
-        ValueError: Bad samples (the message names them), or less than one period of them.
+        ValueError: Bad samples (the message names them), or samples of less than one period.
     """
     samples = check_samples(time, position, mask=mask)
     response = response_of(SpringDamper(), PeriodicBasis(count=n_basis))
@@ -120,7 +120,7 @@ def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
     # Padded to twice the length, so that the end does not overlap the start.
     power = torch.fft.rfft(even_y - even_y.mean(0), n=2 * T, dim=0).abs().square()
     similar = torch.fft.irfft(power, n=2 * T, dim=0)[:T].sum(-1)
-    # Late lags overlap little, which makes their sums small: compare means, and drop the last.
+    # Late lags overlap little, so their sums are small: compare means, except the last quarter.
     similar = similar[: T * 3 // 4] / torch.arange(T, T - T * 3 // 4, -1).to(y)
     crossed = (similar < 0).cummax(0).values
     peak = (similar[1:-1] >= similar[:-2]) & (similar[1:-1] >= similar[2:]) & crossed[1:-1]
@@ -173,7 +173,7 @@ def fit_rhythmic_orientation(
         mask: (*B, T), false at samples to ignore.
 
     Raises:
-        ValueError: Bad samples (the message names them), less than one period of them, or a
+        ValueError: Bad samples (the message names them), samples of less than one period, or a
             motion that passes half a turn from its mean.
     """
     error, reference = centred_error(time, orientation, mask)

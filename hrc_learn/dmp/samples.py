@@ -1,10 +1,10 @@
-"""Recorded samples of demonstrations: checked, batched, and smoothed; residuals of a fit.
+"""Recorded samples of demonstrations, checked, batched and smoothed, and residuals of a fit.
 
 Noise is removed by penalised splines (Eilers and Marx 1996, "Flexible smoothing with B-splines
 and penalties"): y = B c + noise, with a penalty on the third differences of c, which stand for
 the jerk. The strength of the penalty maximises the restricted likelihood of the samples (Wood
 2011) for Gaussian jerks, in each column separately. The same likelihood gives the standard
-deviation of the noise, whether it comes from encoders, a tracker or a trembling person.
+deviation of the noise, whether it comes from encoders, a tracker or a trembling hand.
 """
 
 import math
@@ -27,8 +27,8 @@ MINIMUM_SAMPLES = 3
 MAXIMUM_KNOTS = 120
 """Intervals of the splines: finer than any reasonable number of basis functions."""
 STRENGTHS = -10, 6, 81
-"""Exponents of the first and the last penalty compared, relative to the samples, and their
-number: a fifth of a decade apart, which changes the error by less than a percent."""
+"""Decimal exponents of the first and the last penalty compared, relative to the samples, and
+the number of penalties. They are 0.2 decades apart: the error changes by less than 1 %."""
 LIKELIHOOD_MARGIN = 1.0
 """Twice the logarithm of a likelihood ratio that is not significant; two standard deviations
 would be four."""
@@ -41,7 +41,7 @@ SAMPLES_EACH = 1.5
 """Samples per basis function from which a fit determines the motion between samples: with
 fewer, accelerations exceed the true ones several times."""
 DENSE = 4
-"""Samples per basis function of denser grids, on which a spline hides no detail."""
+"""Samples per basis function of the grids of `densified`, enough to show the cubics' detail."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,7 +118,7 @@ class Samples:
     @cached_property
     def span(self) -> Float[Tensor, "B D"]:
         """Range of each coordinate."""
-        # Padding repeats the first sample, which leaves the range unchanged.
+        # Masked samples are replaced by the first one, which leaves the range unchanged.
         position = self._filled(self.position, self.first[..., None])
         # Two reductions, because `aminmax` takes ten times as long.
         return position.amax(-1) - position.amin(-1)
@@ -281,7 +281,7 @@ def _floating(values: Points) -> Tensor:
     tensor = to_tensor(values)
     dtype = tensor.dtype if tensor.is_floating_point() else torch.get_default_dtype()
     check_precision(dtype)
-    return to_tensor(tensor, dtype)  # which refuses truth values: they are no positions
+    return to_tensor(tensor, dtype)  # refuses booleans, which are no positions
 
 
 def _expand(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:
@@ -310,7 +310,8 @@ def _check_finite(
     name: str, values: Float[Tensor, "B D T"], mask: Bool[Tensor, "B T"], batch: Sequence[int]
 ) -> Tensor:
     """Values with masked NaN and infinities zeroed; ValueError if a valid sample holds one."""
-    # A finite sum of finite values proves them all finite, short of overflow: look twice.
+    # A finite sum proves that all values are finite. Finite values may overflow in a sum, so a
+    # sum that is not finite proves nothing yet.
     if math.isfinite(values.sum().item()):
         return values
     bad = ~values.isfinite() & mask[:, None]
@@ -371,10 +372,10 @@ def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]) -> tuple[Tensor
 
 
 def densified(samples: Samples, n_basis: int) -> Samples:
-    """Samples dense enough to determine all functions, in each demonstration.
+    """Samples that are dense enough to determine all functions in each demonstration.
 
-    Between recorded samples they follow cubics with the recorded velocities, or with slopes of
-    second order, which are exact for parabolas.
+    Between recorded samples they follow cubics with the recorded velocities, or with slopes by
+    second-order differences, which are exact for parabolas.
     """
     few = samples.mask.sum(-1) <= SAMPLES_EACH * n_basis
     if not few.any():
@@ -409,7 +410,7 @@ def _cubic(
     rate: Float[Tensor, "C T"],
     s: Float[Tensor, "G"],
 ) -> tuple[Float[Tensor, "C G"], Float[Tensor, "C G"]]:
-    """Value and derivative of the cubics between samples with these rates (Hermite)."""
+    """Value and derivative of the Hermite cubics between samples with these rates."""
     k = torch.searchsorted(knots, s, right=True).clamp(1, len(knots) - 1) - 1
     h = knots.diff()[k]
     u, chord = (s - knots[k]) / h, y.diff()[:, k] / h
@@ -425,7 +426,7 @@ class _Spline:
     first: Int[Tensor, "T"]
     """First of the four splines that are not zero at each sample."""
     values: Float[Tensor, "T 4"]
-    """Values of these four."""
+    """Values of these four splines."""
     V: Float[Tensor, "K K"]
     """Maps coordinates to control points."""
     data: Float[Tensor, "K"]
@@ -455,7 +456,7 @@ class _Spline:
         total = e + strengths * r
         free = r < 1e-9
         n = T - int(free.sum())
-        # Penalty plus squared distance to the samples, at their minimum.
+        # Minimum of the penalty plus the squared distance to the samples.
         misfit = y.square().sum(-1, keepdim=True) - c.square() @ (1 / total).mT
         misfit = misfit.clamp(min=torch.finfo(y.dtype).tiny)
         prior = torch.where(free, 1.0, strengths * r)
@@ -469,7 +470,7 @@ class _Spline:
         return fitted + middle, noise
 
 
-# Demonstrations on one grid share a spline.
+# Demonstrations on one grid use one spline.
 @lru_cache(maxsize=16)
 def _spline(timestamps: bytes, device: torch.device) -> _Spline:
     s = torch.frombuffer(bytearray(timestamps), dtype=torch.float64).to(device)
@@ -479,14 +480,14 @@ def _spline(timestamps: bytes, device: torch.device) -> _Spline:
     first = x.long().clamp(max=knots - 1)
     values = cubic_spline((x - first)[:, None] - torch.arange(-1, DEGREE).to(s))
     D = torch.diff(torch.eye(K, dtype=s.dtype, device=s.device), n=ORDER, dim=0)
-    # In units in which penalty and samples have equal weight overall.
+    # Scale the penalty to the same total weight as the samples.
     data, penalty = torch.zeros(K, K).to(s), D.mT @ D
     for k in range(DEGREE + 1):
         for m in range(DEGREE + 1):
             place, value = (first + k, first + m), values[:, k] * values[:, m]
             data.index_put_(place, value, accumulate=True)
     penalty = penalty * (data.trace() / penalty.trace())
-    # The small diagonal keeps splines without samples, which have a penalty only, invertible.
+    # Splines without samples only have a penalty; the small diagonal keeps the sum invertible.
     L = torch.linalg.cholesky(data + penalty + 1e-13 * torch.eye(K).to(s))
     half = torch.linalg.solve_triangular(L, data, upper=False)
     e, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, half.mT, upper=False))

@@ -1,7 +1,7 @@
 """Least-squares solvers: from samples to weights and start velocity, and ridge regression.
 
-Demonstrations with the same normalised times are fitted by one matrix product, those with
-times of their own by batched normal equations.
+Demonstrations with the same normalised times are fitted by one matrix product, demonstrations
+with different times by batched normal equations.
 """
 
 import math
@@ -25,11 +25,11 @@ METHODS = ("trajectory", "ridge", "lwr")
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function of the even grid on which columns are orthonormal."""
 WELL_POSED = 1e-3
-"""Bound on the ratio of the smallest to the largest diagonal entry of a Cholesky factor; at
-1e-8, half of the digits of float64 are lost."""
+"""Smallest ratio of the smallest to the largest diagonal entry of a Cholesky factor; at 1e-4,
+half of the digits of float64 are lost, because the products have the square of this ratio."""
 CONSTANT = 1e-12
-"""Standard deviation relative to the size below which a feature counts as constant: what is
-left after the mean is subtracted is rounding."""
+"""Standard deviation relative to the size below which a feature counts as constant: only
+rounding is left when the mean is subtracted."""
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
 """Weights and start velocity dy/ds."""
 
@@ -107,9 +107,9 @@ def normal_products(
         known: The last k coordinates: start velocity dy/ds if it is known, start, and goal.
 
     Returns:
-        Products, over the valid samples, of the first n columns and of what is left of the
-        positions. The columns are orthonormal on an even grid: if the samples determine all
-        functions, squaring them loses no digits.
+        Products, over the valid samples, of the first n columns and of the positions without
+        the effect of `known`. The columns are orthonormal on an even grid: if the samples
+        determine all functions, squaring them loses no digits.
     """
     M = response.size
     n = M - known.shape[1]
@@ -190,8 +190,8 @@ def _fit(
     # The timestamps as bytes are the key of the cached operators.
     grid = response, s.cpu().numpy().tobytes(), s.device
     if method == "trajectory":
-        # The squared distance to the samples, without differentiation. Start and goal are the
-        # first and the last sample; the start velocity is the recorded or a fitted one.
+        # Minimise the squared distance to the samples, without differentiation. Start and goal
+        # are the first and last sample; the start velocity is recorded or fitted.
         K, to_weights = _trajectory_operator(*grid, rate is None, regularization)
         unknown = _apply(position, K)
         if rate is None:
@@ -216,11 +216,11 @@ def _apply(
 def differentiate(
     s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]
 ) -> Float[Tensor, "*batch T"]:
-    """Derivative dy/ds of second order on any spacing, ends included (exact for parabolas)."""
+    """Second-order accurate dy/ds on any spacing, ends included (exact for parabolas)."""
     return torch.gradient(y, spacing=(s,), dim=-1, edge_order=2)[0]
 
 
-# 16 grids are as many datasets: demonstrations of one grid share an operator.
+# Demonstrations on one grid use one operator, so 16 grids serve as many datasets.
 @lru_cache(maxsize=16)
 def _trajectory_operator(
     response: Response,
@@ -232,7 +232,7 @@ def _trajectory_operator(
     """Matrix from samples to unknowns, and the effect of a known start velocity on them.
 
     With y_0 = y(0) and g = y(1) taken from the samples, the residual is linear in the samples,
-    so that one matrix does it all.
+    so one matrix maps samples to unknowns.
     """
     N = response.basis.count
     s = _timestamps(timestamps, device)
@@ -255,7 +255,7 @@ def _force_operator(
     method: str,
     regularization: float,
 ) -> Float[Tensor, "N T"]:
-    """Matrix from a force to the weights closest to it."""
+    """Matrix that maps a force to the weights that fit the force best."""
     s, basis = _timestamps(timestamps, device), response.basis
     if method == "ridge":
         return ridge_inverse(basis.forcing(s), regularization)
@@ -321,7 +321,7 @@ def fit_ridge(
     if not 0 < regularization < torch.inf:
         raise ValueError(f"regularization must be positive, got {regularization}")
     mean, deviation = features.mean(0), features.std(0, correction=0)
-    # A constant feature has a deviation by rounding only.
+    # A constant feature deviates from its mean by rounding only.
     varies = standardize & (deviation > CONSTANT * features.abs().amax(0))
     scale = torch.where(varies, deviation, 1.0)
     A = torch.cat([torch.ones_like(features[:, :1]), (features - mean) / scale], dim=1)

@@ -1,4 +1,4 @@
-"""Closed-loop steps of one joint primitive in NumPy, for loops that count microseconds."""
+"""Closed-loop steps of one joint primitive in NumPy, for loops in which microseconds count."""
 
 import math
 from copy import deepcopy
@@ -29,7 +29,7 @@ class StepperState(NamedTuple):
     forced: Pair
     """State (y, dy/ds) caused so far by the unscaled forcing term alone."""
     scale: Float64[np.ndarray, "D D"] | None
-    """Scaling of the forcing term, to multiply from the right; None: no scaling."""
+    """Scaling of `forced`, multiplied from the right; None: independent of start and goal."""
     start: Vector
     goal: Vector
     displacement: Vector
@@ -37,7 +37,7 @@ class StepperState(NamedTuple):
     duration: float
     """Duration of the motion if nothing slows it [s]."""
     pace: float
-    """Speed of the clock in the last step, 1 undisturbed."""
+    """Relative speed of the clock in the last step: 1 if undisturbed."""
 
     @property
     def position(self) -> Vector:
@@ -58,12 +58,12 @@ class Stepper:
     """
 
     def __init__(self, dmp: JointDMP):
-        """Freeze a primitive; later changes of it have no effect.
+        """Freeze a primitive; later changes of the primitive have no effect.
 
         Raises:
             ValueError: The primitive is a batch or of another kind.
         """
-        if type(dmp) is not JointDMP:  # a subclass may move otherwise
+        if type(dmp) is not JointDMP:  # a subclass may move differently
             raise ValueError(
                 f"a stepper takes a JointDMP, got {type(dmp).__name__}: use the program of "
                 "export_dmp"
@@ -79,7 +79,7 @@ class Stepper:
         self._shown = Demonstrated(start=start, goal=goal, amplitude=amplitude)
         if not self._scaling.depends_on_boundary:
             weights = self._scaling.scale(weights, start, goal, self._shown, np)
-        # One motion instead of one for each basis function.
+        # Tabulate the one forced motion instead of one for each basis function.
         forced = motion.response.forced
         table = forced.coefficients.cpu() @ torch.from_numpy(weights.copy())
         self._table = PiecewisePolynomial(table, forced.interval, forced.periodic)
@@ -116,9 +116,9 @@ class Stepper:
         Args:
             state: From `initial_state` or the last step.
             dt: [s].
-            goal: New goal from now on; it jumps.
+            goal: New goal from now on, to which the goal jumps.
             coupling: External acceleration [1/s^2].
-            phase_stopping: The clock runs slower by the factor 1 + this.
+            phase_stopping: Number p >= 0; the clock runs slower by the factor 1 + p.
         """
         check_not_negative("dt", dt)
         check_not_negative("phase_stopping", phase_stopping)
@@ -133,7 +133,7 @@ class Stepper:
             # Loops repeat their step length, so its matrix is kept.
             self._transition = ds, self._spring.propagator(ds).numpy()
         E = self._transition[1]
-        # Past its end, the spring alone moves what the forcing caused.
+        # After the forcing, the state it caused moves by the spring alone.
         forced = after = self._forced(now) if s < self._end else E.dot(before)
         if scale is not None:
             before, after = before.dot(scale), after.dot(scale)
@@ -155,7 +155,7 @@ class Stepper:
         return self._scaling.scale(np.eye(len(start)), start, goal, self._shown, np)
 
     def _forced(self, s: float) -> Pair:
-        """State (y, dy/ds) caused by the forcing term, by the table and the spring after it."""
+        """State (y, dy/ds) caused by the forcing: from the table, then by the spring alone."""
         forced = self._table.at(s)
         if s <= self._end:
             return forced

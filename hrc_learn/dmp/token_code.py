@@ -5,11 +5,11 @@ is it positive, is its magnitude above a threshold, is the next one zero, ... Th
 token form a binary tree with one leaf for each token of the vocabulary. Splitting the most
 probable leaf until the vocabulary is used up makes all tokens about equally probable (Tunstall
 1967, "Synthesis of noiseless compression codes"), so that each carries nearly the most
-information it can. Every leaf belongs to some integers: no sequence is invalid, and a prefix
-determines the first integers.
+information it can. Every leaf stands for possible integers: no sequence is invalid, and a
+prefix determines the first integers.
 
-Encoder and decoder build equal trees on every machine, because only sums, products, quotients
-and comparisons of float64 numbers decide about them.
+Encoder and decoder build equal trees on every machine, because the trees depend only on sums,
+products, quotients and comparisons of float64 numbers.
 """
 
 import heapq
@@ -26,9 +26,9 @@ from torch import Tensor
 END = 0
 """Token after which all integers are zero; it also pads."""
 PRIOR = 20.0
-"""Weight of a Laplace distribution against the counts of an integer, in vectors."""
+"""Weight of the Laplace distribution that is added to the counts of an integer, in vectors."""
 LEAST = 0.02
-"""Mean magnitude of an integer that was always zero."""
+"""Mean magnitude assumed for an integer that was always zero."""
 HEADROOM = 2.0
 """Largest magnitude of an integer relative to those seen."""
 
@@ -48,7 +48,7 @@ class _Tree(NamedTuple):
     index: array
     """Integer that each question is about."""
     threshold: array
-    """Largest magnitude in the first branch; -1: the second branch is the negative sign."""
+    """Largest magnitude in the first branch; -1: the second branch is that of negative sign."""
     branches: array
     """Two for each question: the next question, or -1 - i for leaf i."""
     after: list[Interval]
@@ -58,7 +58,7 @@ class _Tree(NamedTuple):
 
 
 class TokenCode:
-    """Code of vectors of K integers in tokens 0 ... vocabulary_size - 1."""
+    """Code for vectors of K integers, with tokens 0 ... vocabulary_size - 1."""
 
     def __init__(self, vocabulary_size: int, table: Float[np.ndarray, "K M"]):
         """Prepare the code.
@@ -88,13 +88,13 @@ class TokenCode:
         return cls(vocabulary_size, table / table.sum(1, keepdims=True))
 
     def bits(self) -> Float[Tensor, "K M"]:
-        """Information of each magnitude of each integer; infinite above its largest."""
+        """Information [bit] of each magnitude of each integer; infinite above the largest."""
         signed = np.where(np.arange(self.table.shape[1]) > 0, 0.5, 1.0)
         with np.errstate(divide="ignore"):
             return torch.from_numpy(-np.log2(signed * self.table))
 
     def encode(self, values: Sequence[int]) -> list[int]:
-        """Tokens of a vector; magnitudes are limited to the largest ones."""
+        """Tokens of a vector; magnitudes are limited to the largest of each integer."""
         values = [max(-m, min(m, v)) for v, m in zip(values, self._largest, strict=True)]
         last = max((k for k, v in enumerate(values) if v), default=-1)
         state, ids = self._whole(0), []
@@ -143,7 +143,7 @@ class TokenCode:
         return threshold, (row[threshold + 1] - start) / total, *parts
 
     def _tree(self, root: Interval) -> _Tree:
-        """Tree that splits the most probable leaf until there is one for each token but 0."""
+        """Tree that splits the most probable leaf until each token but 0 has a leaf."""
         if root in self._trees:
             return self._trees[root]
         tree = _Tree(array("i"), array("i"), array("i"), [], [])

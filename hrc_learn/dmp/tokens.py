@@ -1,11 +1,12 @@
-"""Tokens of motions: short sequences of integers, all of which decode to a bounded motion.
+"""Tokens of motions: short sequences of integers. Every sequence decodes to a bounded motion.
 
-Networks that write language also write motions, as tokens. The components of a motion are
-rounded to multiples of one step, so that those of less variance take fewer bits, which loses
-the least (reverse water-filling: Cover and Thomas, "Elements of information theory", section
-10.3). `TokenCode` turns these integers into tokens, the first components first.
+Language models can predict motions as tokens. The components of a motion are rounded to
+multiples of one step, so components of less variance take fewer bits. This minimises the error
+(reverse water-filling: Cover and Thomas, "Elements of information theory", section 10.3).
+`TokenCode` turns the integers into tokens, the first components first.
 
-Columns of grippers that open and close are steps: their integers say when they switch.
+Columns that jump between a few values, such as those of grippers, are columns of steps: their
+integers encode when they switch.
 """
 
 from collections.abc import Iterable, Sequence
@@ -33,8 +34,8 @@ from hrc_learn.dmp.token_code import END, HEADROOM, TokenCode
 from hrc_learn.model_files import SavedModel, write_model
 
 PRICE = 0.1155
-"""Price of a bit in squared steps: (ln 4) / 12, at which the error of fine steps falls with
-their bits."""
+"""Price of a bit in squared steps: (ln 4) / 12, by which one more bit reduces the error of fine
+steps."""
 REPRESENTED = 1 / 3
 """Largest error of the splines relative to that of the tokens: it adds 5 % to the total."""
 ROUNDS = 8
@@ -42,8 +43,8 @@ ROUNDS = 8
 SMALLEST, LARGEST = 16, 2**15
 """Bounds of the vocabulary."""
 STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
-"""Largest number of values of a column of steps, number of its switches in a motion (later ones
-are left out), and largest number of times at which it can switch."""
+"""Largest number of values of a column of steps, largest number of its switches in a motion
+(later ones are left out), and largest number of times at which it can switch."""
 OF_SCALE = 0.07
 """Tolerance times FAST's scale at equal error, on five teleoperated datasets."""
 
@@ -52,13 +53,13 @@ class MotionTokenizer(nn.Module):
     """Map between motions of D columns and tokens 0 ... vocabulary_size - 1.
 
     Token 0 ends and pads sequences. Every sequence decodes to a motion within the demonstrated
-    range and a tenth of it to either side, and its first tokens to a coarser one.
+    range, extended by a tenth to either side; its first tokens decode to a coarser motion.
     """
 
     end = END
     """Token that ends and pads sequences."""
     levels: Tensor
-    """Values of each column of steps in order, the last one repeated, (steps, L)."""
+    """Values of each column of steps in order, padded with the last value, (steps, L)."""
 
     def __init__(
         self,
@@ -70,8 +71,9 @@ class MotionTokenizer(nn.Module):
         """Join the parts; `fit` makes them.
 
         Args:
-            config: `steps` (columns), `slots` (times at which they may switch), `step` (of the
-                components) and `shift` (of their mean beyond an integer, in steps).
+            config: `steps` (columns of steps), `slots` (number of times at which they can
+                switch), `step` (to whose multiples components are rounded) and `shift` (mean
+                magnitude of components beyond their integer, in steps).
             components: Components of all other columns.
             code: Code of the integers.
             levels: (steps, L).
@@ -119,8 +121,8 @@ class MotionTokenizer(nn.Module):
             start_known: False: tokens determine the start, too.
             tolerance: Root mean square error of decoded motions, relative to the range of each
                 column between its quantiles of 1 and 99 %.
-            steps: Columns that jump between a few values, as those of grippers; by default
-                those with 2 to 4 values.
+            steps: Columns that jump between a few values, such as those of grippers; by default
+                all columns with 2 to 4 values.
 
         Raises:
             ValueError: Fewer than two motions, shapes that differ, or values out of range.
@@ -151,7 +153,7 @@ class MotionTokenizer(nn.Module):
         z = components.encode(parts, velocity) * components.spread
         # Errors of all columns add up.
         aim = tolerance * max(len(smooth), 1) ** 0.5
-        # Steps grow from where all components are exact enough.
+        # Start from a step with which all components are exact enough.
         step, bits = aim * (12 / max(1, z.shape[1])) ** 0.5, None
         for _ in range(ROUNDS):
             q = _rounded(z / step, bits)
@@ -215,9 +217,10 @@ class MotionTokenizer(nn.Module):
     ) -> Float[Tensor, "*batch T D"]:
         """Motions of any sequences of tokens.
 
-        A motion begins with exactly the given state. It stays in the demonstrated range and a
-        tenth of it to either side. A start beyond that moves the limit. A start velocity may
-        exceed it if it takes the second control point a quarter of the range beyond.
+        A motion begins exactly in the given state. It stays within the demonstrated range,
+        extended by a tenth to either side. A start outside moves the limits. A motion can
+        leave them if its start velocity puts the second control point more than a quarter of
+        the range outside.
 
         Args:
             ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.
@@ -226,7 +229,7 @@ class MotionTokenizer(nn.Module):
             start: (*batch, D); by default the mean start, or the encoded one.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
                 tokenizer was fitted with velocities, otherwise the encoded one.
-            order: Derivative with respect to time, 0, 1 or 2; zero for steps.
+            order: Derivative with respect to time, 0, 1 or 2; those of steps are zero.
 
         Raises:
             ValueError: Tokens that are not in the vocabulary, or shapes that do not match.
@@ -250,11 +253,11 @@ class MotionTokenizer(nn.Module):
         return whole
 
     def length(self, ids: Sequence[int]) -> int:
-        """Number of tokens that a network has to write: until nothing changes the motion."""
+        """Number of tokens that a network has to predict: more would not change the motion."""
         for i in range(1, len(ids) + 1):
             if ids[i - 1] == END or self._code.decode(ids[:i])[1]:
                 return i
-        return len(ids) + 1  # and the end
+        return len(ids) + 1  # with the end token
 
     def save(self, folder: str | Path) -> None:
         """Write or replace a folder with `config.json` and `model.safetensors`."""
@@ -268,7 +271,7 @@ class MotionTokenizer(nn.Module):
         """Read a saved tokenizer.
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: The folder holds no saved tokenizer.
             ValueError: A file is not valid.
         """
         saved = SavedModel(folder, cls.__name__)
@@ -297,13 +300,13 @@ class MotionTokenizer(nn.Module):
         return self.components.encode(parts, velocity).reshape(*samples.batch, -1)
 
     def _given(self, name: str, value: Vectors | None) -> Tensor | None:
-        """Columns of a given start or velocity that are no steps."""
+        """A given start or velocity without the columns of steps."""
         if value is None:
             return None
         return checked_vector(name, value, self._start())[..., self._smooth]
 
     def _start(self) -> Float[Tensor, "D"]:
-        """Mean start, the first value for steps."""
+        """Mean start; for columns of steps, the lowest value."""
         mean = self.levels.new_empty(self.columns)
         mean[self._smooth] = self.components.start
         mean[self.steps] = self.levels[:, 0]
@@ -344,9 +347,9 @@ class MotionTokenizer(nn.Module):
 
 
 class ActionProcessor:
-    """Tokens of action chunks by the interface of FAST's processor, which LeRobot calls.
+    """Tokens of action chunks with the interface of FAST's processor, which LeRobot calls.
 
-    Chunks are encoded with their start, because that interface does not tell it.
+    The tokens encode the start of a chunk too, because the interface does not pass it.
     """
 
     pad_token_id = eos_token_id = END
@@ -371,10 +374,10 @@ class ActionProcessor:
 
         Args:
             action_data: The chunks.
-            scale: Scale of FAST's coefficients whose accuracy the tokens have.
+            scale: FAST's scale of coefficients; the tokens have the accuracy of this scale.
             vocab_size: Number of tokens.
-            time_horizon: T, and `action_dim` D: read from the chunks.
-            action_dim: D.
+            time_horizon: Ignored; T is read from the chunks.
+            action_dim: Ignored; D is read from the chunks.
         """
         chunks = np.stack(list(action_data))
         time, tolerance = np.arange(chunks.shape[1]), OF_SCALE / scale
@@ -398,7 +401,7 @@ class ActionProcessor:
         time_horizon: int | None = None,
         action_dim: int | None = None,
     ) -> Float[np.ndarray, "B T D"]:
-        """Chunks of any tokens; arguments as those of `fit`."""
+        """Chunks of `time_horizon` frames, by default T, from any tokens."""
         frames = np.arange(time_horizon or self.time_horizon)
         return self.tokenizer.decode([list(row) for row in tokens], frames).numpy()
 
@@ -451,9 +454,9 @@ def _nearest(
 def _switches(
     samples: Samples, start: Float[Tensor, "B S"], steps: list[int], levels: Tensor, slots: int
 ) -> Float[Tensor, "B K"]:
-    """Integers of steps: the slots of switches in turn, with the signs of their directions.
+    """Integers of columns of steps: the slots of their switches in turn, negative if downwards.
 
-    Slot k stands for the time (k - 1) / slots of the duration.
+    Slot k is at the fraction (k - 1) / slots of the duration.
     """
     y = torch.cat([start[:, None], samples.position.mT[..., steps].to(start)], 1)
     changes = _nearest(y, levels).diff(dim=1) * samples.mask[..., None]
@@ -469,7 +472,7 @@ def _switches(
 
 
 def _rounded(x: Float[Tensor, "B P"], bits: Tensor | None) -> Float[Tensor, "B P"]:
-    """Integers of least squared error plus the price of their bits, (P, M) by magnitude."""
+    """Integers that minimise squared error plus the price of `bits`, (P, M) by magnitude."""
     if bits is None:
         return x.round()
     size = x.abs()

@@ -1,4 +1,4 @@
-"""Motions over time as results of a rollout."""
+"""Motions over time, the results of rollouts."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -124,7 +124,7 @@ class Trajectory(ArrayOutputs):
         s = self.s
         latest = None if s.requires_grad else self._response.latest_grid(s)
         if not order and self._array is not None and latest is not None:
-            # A shortcut of what follows for a single motion without gradients.
+            # A shortcut for a single motion without gradients.
             x, h = self._array, latest.to_position
             if h is not None and h.dtype == x.dtype and len(x) * h.size <= numpy_limit():
                 return torch.from_numpy(x.dot(h).T)
@@ -147,7 +147,7 @@ class Trajectory(ArrayOutputs):
     def _at_ragged_times(self, X: Tensor, order: int) -> Float[Tensor, "*batch T D"]:
         s, (D, M) = self.s.double(), X.shape[-2:]
         if X.ndim == 2:
-            # The times of a batch are times of the one motion.
+            # All times of the batch belong to the one motion.
             y = motion(self._response, s.reshape(1, -1), X[None], order)
             y = y.view(*s.shape, D)
         else:
@@ -170,12 +170,12 @@ class Trajectory(ArrayOutputs):
 
 
 class ContinuedTrajectory(Trajectory):
-    """Motion that continues from any state; the difference to it decays as the spring does.
+    """Motion that continues from any state; its difference to H x decays as the spring does.
 
     y(s) = H(s) x + E(s - s_0) [state - (H, H')(s_0) x],   E the unforced spring's motion
 
     The motion is exact, linear in x and the state, and starts with the given position and
-    velocity. From a state of the motion itself, it is the remainder of that motion.
+    velocity. If the state lies on H x, the motion is the remainder of H x.
     """
 
     def __init__(
@@ -196,9 +196,9 @@ class ContinuedTrajectory(Trajectory):
             s: Normalised times, not before `since`.
             duration: Duration of the whole motion [s].
             response: Response of the primitive.
-            since: Normalised time s_0 of the state; None: the motion starts as x does.
-            position: Position at that time.
-            velocity: Velocity there [1/s].
+            since: Normalised time s_0 of the state; None: the motion is H x from its start.
+            position: Position at s_0.
+            velocity: Velocity at s_0 [1/s].
         """
         motion: Any = {"coordinates": coordinates, "duration": duration, "response": response}
         super().__init__(s=s, **motion)

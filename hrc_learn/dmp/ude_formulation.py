@@ -1,17 +1,17 @@
-"""The orientation primitive of Ude et al. 2014, whose state is the angular velocity.
+"""The orientation primitive of Ude et al. 2014, whose state contains the angular velocity.
 
 eta' = alpha (beta log(g conj q) - eta) + f,   q' = (0, eta) q / 2,   eta = tau omega
 
-("Orientation in Cartesian space dynamic movement primitives", eq. 16; primes by s = t / tau,
-the logarithm here the full angle). With the error e = log(g conj q) and v = -eta,
+("Orientation in Cartesian space dynamic movement primitives", eq. 16; primes are derivatives by
+s = t / tau, the logarithm here has the full angle). With e = log(g conj q) and v = -eta,
 
     v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
 
-which is the linear primitive except for n, zero while the axis of rotation is constant. The
-linear part is solved exactly, and n is integrated by the Runge-Kutta method of order 4 in the
-frame of the linear motion (Lawson 1967, "Generalized Runge-Kutta processes for stable
-systems"): a step is stable at any length and exact about one axis. The logarithm is followed
-continuously.
+which is the linear primitive except for n. This drift is zero while the axis of rotation is
+constant. The linear part is solved exactly, and n is integrated by the Runge-Kutta method of
+order 4 in the frame of the linear motion (Lawson 1967, "Generalized Runge-Kutta processes for
+stable systems"): a step is stable at any length and exact for rotations about one axis. The
+logarithm is followed continuously.
 """
 
 from dataclasses import replace
@@ -35,17 +35,17 @@ from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 MAXIMUM_STEP = 1 / 200
-"""Longest integration step of a rollout, in s; the error is of fourth order in it."""
+"""Longest integration step of a rollout, in normalised time; the error is of fourth order."""
 SAMPLES_PER_FUNCTION = 10
 """Times per basis function at which the force of a demonstration is evaluated."""
 
 
 class UdePrimitive(JointDMP):
-    """Error columns in which (e, v) moves linearly except for the drift of the axis."""
+    """Primitive of error columns whose state (e, v) is linear except for the axis drift n."""
 
     @classmethod
     def refitted(cls, linear: JointDMP, errors: Samples) -> "UdePrimitive":
-        """Primitive with the force that this state needs to follow the path of a linear one.
+        """Primitive whose forcing makes this state follow the motion of a linear primitive.
 
         Args:
             linear: Fitted to the errors.
@@ -72,7 +72,7 @@ class UdePrimitive(JointDMP):
             v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, second)
             force = slope - second + motion.spring.alpha * (v - rate)
             change = (ridge_inverse(motion.basis.forcing(s), REGULARIZATION) @ force).mT
-            # A new tensor, because both primitives share the weights until here.
+            # A new tensor, because both primitives have the same weights until here.
             motion.weights = torch.nn.Parameter(motion.weights + change.to(motion.weights))
             motion.fit_report = errors.compare(motion.rollout().position)
         return motion
@@ -100,7 +100,7 @@ class UdePrimitive(JointDMP):
         time: Times | None = None,
         forcing_gain: Scalars | None = None,
     ) -> "UdeMotion":
-        """Motion of the error, of order 4 in `MAXIMUM_STEP`."""
+        """Motion of the error, integrated with order 4 in steps up to `MAXIMUM_STEP`."""
         s = self.timestamps if time is None else normalised_time(time, duration)
         start, _, per_s = self.resolve_boundary(boundary, duration)
         start, per_s = torch.broadcast_tensors(start, per_s)
@@ -111,7 +111,7 @@ class UdePrimitive(JointDMP):
         return UdeMotion(coordinates=x, s=s, duration=duration, response=self.response)
 
     def step_columns(self, state: DMPState, dt: Scalars, **inputs: Any) -> DMPState:
-        """State of the error after `dt` [s], of order 4 in it."""
+        """State of the error after `dt` [s], of order 4 in `dt`."""
         v = drift_free_rate(state.position, state.rate)
         begin = replace(state, rate=v)
         half = to_tensor(dt, v.dtype, v.device) / 2
@@ -150,7 +150,7 @@ class UdeMotion(Trajectory):
         z = self._state - torch.stack([linear.position, linear.velocity], dim=-2)
         free = self._response.spring.acceleration(z[..., 0, :], z[..., 1, :])
         slope = linear.acceleration + free
-        # v' is linear in e'', with the map that turns e' to v; `axis_drift` inverts that.
+        # v' is linear in e'', with the same map as from e' to v; `axis_drift` inverts this map.
         rest = slope - drift_free_slope(e, rate, torch.zeros_like(rate))
         return (rest + axis_drift(e, rest)) / tau**2
 

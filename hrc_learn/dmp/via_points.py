@@ -4,7 +4,7 @@ After Zhou, Gao and Asfour 2019, "Learning via-movement primitives": a motion is
 trajectory plus the shape that a demonstration adds, and via points change the elementary
 trajectory piecewise. Here the weights make that change, so that the result is an ordinary
 primitive: it follows the curve as closely as the basis allows, and passes the via points and
-the end exactly. `MotionPrimitive.condition` applies it to values of any kind.
+the end exactly. `MotionPrimitive.condition` does this for values of any kind.
 """
 
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ DEPENDENT = 1e-12
 OVERSHOOT = 1.5
 """Largest change of a motion relative to that of the curve through its via points."""
 CLOSEST, CLOSEST_TO_WINDOW = 2, 6
-"""Distances, in those of basis functions, of via points from one another and from start and
-end, and from the ends of a window, at which no overshoot occurs with any basis, gain or change;
-the next smaller steps, 1.5 and 5, overshoot."""
+"""Smallest distances of via points without overshoot for any basis, gain or change, in units of
+the distance between basis functions: from one another, start and end; and from the ends of a
+window. At the next smaller distances tried, 1.5 and 5, motions overshoot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,7 +111,7 @@ def _check_overshoot(
     curve: Float[Tensor, "*batch D G"],
     window: tuple[float, float],
 ) -> None:
-    """Raise ValueError if the motion leaves the curve through its via points far behind."""
+    """Raise ValueError if the motion changes far more than the curve through the via points."""
     if not readable(change, curve):
         return
     largest, asked = (x.detach().abs().amax(-1) for x in (change, curve))
@@ -199,7 +199,7 @@ class _CurveFollower:
     Q: Float[Tensor, "G3 K"]
     to_weights: Float[Tensor, "K K"]
     end: Float[Tensor, "2 K"]
-    """Position and rate at the end of the window, per z."""
+    """Position and rate at the end of the window, per unit of z."""
 
     def follow(self, curve: Float[Tensor, "*batch G 3 D"]) -> Float[Tensor, "*batch D K"]:
         """Coordinates z of the closest motion."""

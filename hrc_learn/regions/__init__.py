@@ -1,4 +1,4 @@
-"""Regions of joint, Cartesian and image space and the potentials that steer by them."""
+"""Regions of joint, Cartesian and image space, with potentials that guide the robot."""
 
 from hrc_learn.regions.region import AxisRegion as AxisRegion
 from hrc_learn.regions.region import JointRegion as JointRegion

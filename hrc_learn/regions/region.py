@@ -72,8 +72,8 @@ class PositionRegion(Region):
     half_size: Float[Tensor, "*#batch 3"]
     """Half edges of the box, all positive, along the base axes [m]."""
     stiffness: float | tuple[float, float, float] = static(4e-3)
-    """k_c, one for all or one for each axis of the box. Ten times the value of Table I, with
-    which the excess near a wall of a box with half size 0.12 m takes 9 s to decay."""
+    """k_c, one for all or one for each axis of the box. Table I has 4e-4 for x and y, with
+    which the excess near a wall decays in 9 s if the half size is 0.12 m."""
     formulation: Literal["paper", "saturated"] = static("paper")
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
@@ -135,7 +135,7 @@ class _Cone(Region):
         """sin(phi/2) n with the axis n of the error, sin(phi/2) and cos(phi/2)."""
 
     def _potential_and_slope(self, sine: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-        """Potential, and its derivative by phi over sin(phi/2)."""
+        """Potential, and its derivative by phi, divided by sin(phi/2)."""
         f = (self.sharpness * torch.atan2(sine, cosine) - 1).clamp(min=0)
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
         # Divided by the sine, because the vector part of the error is sin(phi/2) n.
@@ -155,15 +155,16 @@ class OrientationRegion(_Cone):
     phi <= 2/alpha_o: 7.6 degrees for alpha_o = 15. The error has the sign of the shortest
     rotation, so p and -p are the same orientation.
 
-    The gradient is that of the geometric Jacobian, dP over a small rotation of the end effector
-    about the base axes: k_o max(0, f) (alpha_o/2) n with the axis n of the error.
-    `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n (orient_diff_potential),
-    which has the same direction and 2 phi times the length.
+    The gradient suits the geometric Jacobian: it is the derivative of P by a small rotation of
+    the end effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis n of the
+    error. `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n
+    (orient_diff_potential), which has the same direction and 2 phi times the length.
 
-    With `coordinates="rotation_vector"` the gradient is that of the analytic Jacobian, dP over
-    the rotation vector of x: J_l^T times the above. `formulation="paper"` is then twice that:
-    it equals the printed chain (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever the
-    chain's divisions by the components of both quaternions are defined.
+    With `coordinates="rotation_vector"` the gradient suits the analytic Jacobian: it is the
+    derivative of P by the rotation vector of x, J_l^T times the gradient above.
+    `formulation="paper"` is then twice this derivative: it equals the printed chain
+    (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever the chain's divisions by the
+    components of both quaternions are defined.
     """
 
     formulation: Literal["exact", "paper"] = static("exact")
@@ -200,9 +201,9 @@ class AxisRegion(_Cone):
     free.
 
     f and P are those of `OrientationRegion` for the angle phi between both axes. The gradient
-    is dP over a small rotation of the end effector about the base axes. It is perpendicular to
-    both axes, so it requests no rotation about the tool's own axis. If the two are
-    opposite, the goal determines the axis of rotation.
+    is the derivative of P by a small rotation of the end effector about the base axes. It is
+    perpendicular to both axes, so it requests no rotation about the tool's own axis. If both
+    axes are opposite, the goal determines the axis of rotation.
     """
 
     def feedback(
@@ -216,8 +217,8 @@ class AxisRegion(_Cone):
     def _half_angle(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """sin(phi/2) n in the goal's frame, sin(phi/2) and cos(phi/2).
 
-        The rotation from goal to x is a rotation about z, then one by phi about n,
-        perpendicular to z (swing-twist decomposition).
+        The rotation from goal to x is a rotation about z, followed by a rotation by phi about
+        n, which is perpendicular to z (swing-twist decomposition).
         """
         error = quaternion.multiply(quaternion.conjugate(self.goal), x)
         w, i, j, k = error.split(1, dim=-1)
@@ -243,20 +244,20 @@ class VisionRegion(Region):
     f = ((u - u_d) / b_1)^2 + ((v - v_d) / b_2)^2 - 1                    (eq_vision_re_func)
     P = k_v/2 (1 - min(0, f)^2)                                          (eq_vision_p)
 
-    This pull is zero at the target and at the edge of the ellipse, and so weak near both.
-    `formulation="saturated"` has the same pull close to the target and a nearly constant one
-    further out, anywhere in the image:
+    This pull is zero at the target and at the edge of the ellipse, and therefore weak near
+    both. `formulation="saturated"` has the same pull close to the target and a nearly constant
+    pull further out, anywhere in the image:
 
     P = 2 k_v s^2 (sqrt(1 + rho^2/s^2) - 1),   rho^2 = f + 1,   s = 1/2
 
-    A feature of several points, such as the corners of a marker, has an ellipse about each of
-    them, and its potential is the mean of theirs.
+    A feature of several points, such as the corners of a marker, has an ellipse about each
+    point, and its potential is the mean over the points.
     """
 
     target: Float[Tensor, "*#batch rows"]
     """Desired feature position (u, v) [px], or u and v of several points in turn."""
     half_size: Float[Tensor, "*#batch rows"]
-    """Half axes b_1, b_2 of the ellipse, positive [px]. It should lie inside the image."""
+    """Half axes b_1, b_2 of the ellipse, positive [px]; the ellipse should be in the image."""
     stiffness: float = static(0.3)
     """k_v."""
     formulation: Literal["paper", "saturated"] = static("paper")
@@ -297,7 +298,7 @@ class VisionRegion(Region):
     def feedback(
         self, x: Float[Tensor, "*batch rows"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both rows"]]:
-        """Potential and its gradient over the feature position [1/px]; means over points."""
+        """Potential and its gradient by the feature position [1/px]; means over the points."""
         scaled = (x - self.target) / self.half_size
         if scaled.shape[-1] > 2:
             P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
@@ -327,13 +328,13 @@ class VisionRegion(Region):
 class JointRegion(Region):
     """Range of the joints; repels each joint from the nearer of its limits.
 
-    With the distance delta_i to the limit, negative past it:
+    With the distance delta_i to the nearer limit, negative past the limit:
 
         f_i = delta_i - margin,   f_ri = delta_i - reference_margin
         P   = sum_i k_q/2 min(0, f_i)^2 + k_r/2 min(0, f_ri)^2           (jointxp)
 
     `formulation="paper"` is Table I's f_i = delta_i^2 - margin^2. Its push vanishes at the
-    limit and points outwards past it, because the square loses the sign.
+    limit and points outwards past the limit, because the square loses the sign of delta_i.
     """
 
     centre: Float[Tensor, "*#batch n"]
@@ -403,7 +404,7 @@ class PostureRegion(Region):
     stiffness: float = static(2.0)
     """k, convergence rate close to the goal [1/s]."""
     saturation: float = static(0.75)
-    """s, distance at which the pull saturates [rad]; its limit is k s [rad/s]."""
+    """s, distance at which the pull saturates [rad]; the largest pull is k s [rad/s]."""
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both"]:
         """Region function f at the joint position x [rad]."""
