@@ -37,7 +37,7 @@ class ByValue:
 def worker_pool(
     number: int, begin: Callable[..., object], *given: object
 ) -> Iterator[ProcessPoolExecutor]:
-    """Pool of new processes, initialized by `begin(*given)`; the end of the block cancels
+    """Pool of new processes, initialised by `begin(*given)`; the end of the block cancels
     pending work.
 
     The processes are spawned: forked ones would inherit locks of threads that they lack.

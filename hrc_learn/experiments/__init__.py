@@ -1,3 +1,3 @@
-"""The paper's experiments and studies of the controller: scenario, metrics, report,
-recording.
+"""The paper's experiments, in simulation and on a real arm: scenarios, metrics, reports and
+recordings.
 """

@@ -35,16 +35,16 @@ Pulls = Literal["scripted", "random", "none"]
 """Times at which a scripted person pulls the elbow: while the robot waits above the first
 object, at random moments of the whole job, or never."""
 
-# Time for the elbow to come to rest after the last drag [s], as after the two without a worker.
+# Time for the elbow to come to rest after the last drag [s], the same as without a worker.
 _AFTER_DRAGS = 1.0
 
 _NO_NULL_SPACE = (
-    "The pose of its tool takes them all: a push at the elbow would move the tool, so no "
-    "person pushes there."
+    "The pose of the tool needs all of them: a push at the elbow would move the tool, so the "
+    "simulated person does not push."
 )
 _FEWER_JOINTS = (
-    "They set the position of the tool, its pitch and its turn about the approach; its yaw "
-    "follows from the position. The table has a target for each. "
+    "They set the tool's position, its pitch and its rotation about the approach direction; "
+    "its yaw follows from the position. The table has targets for pitch and yaw. "
 )
 
 
@@ -62,7 +62,7 @@ class CollaborationExperiment(CollaborationScenario):
         "An arm grasps objects with an uncalibrated camera. If it has a null space, a person "
         "pushes its elbow aside meanwhile to reach under it. It then carries each object to a "
         "cabinet along a motion learned from demonstrations, and places it on a shelf. "
-        "Simulated in MuJoCo, which also decides on success by contacts."
+        "The run is simulated in MuJoCo, whose contacts decide on success."
     )
 
     aiming: Path
@@ -86,7 +86,7 @@ class CollaborationExperiment(CollaborationScenario):
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> CollaborationRun:
         """Do the whole job once; the seed draws object poses, imperfections and image noise."""
-        # The same number of images for any number of objects: 200 of them take 1 GB of memory.
+        # Keep the same number of images for any number of objects: 200 images take 1 GB.
         keep_every = self.cell.keep_image_every * len(self.shelves)
         robot = self.robot.work_arm()
         scenario = replace(
@@ -166,7 +166,7 @@ class CollaborationExperiment(CollaborationScenario):
         return {"none": (), "random": "random", "scripted": drags}[self.pulls]
 
     def _job(self) -> PickAndPlaceConfig:
-        """Job with the time that the drags take, also without drags: runs stay comparable."""
+        """Job that also waits for the drags if there are none: runs stay comparable."""
         if not self.worker:
             return self.config
         end = DRAGS_NEAR_WORKER[-1].end + _AFTER_DRAGS

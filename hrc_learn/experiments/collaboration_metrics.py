@@ -1,4 +1,4 @@
-"""Metrics of a collaboration. For several objects the worst counts.
+"""Metrics of a collaboration. With several objects, the worst one counts.
 
 Success is read from contacts and poses of the simulator, not from the report of the task.
 """
@@ -70,7 +70,7 @@ def collaboration_metrics(
 def _delivered(
     name: str, of: Callable[[CollaborationRun], Collection[str]], count: int, claim: str = ""
 ) -> Metric[CollaborationRun]:
-    """Metric of the number of objects that meet a condition, with all of them as the target."""
+    """Metric of the number of objects that meet a condition; its target is all objects."""
 
     def others(run: CollaborationRun) -> str:
         names = [item.name for item in run.workplace.scene.objects]
@@ -83,12 +83,12 @@ def _delivered(
 
 
 def _near_worker(of: Callable[[NearWorker], float | int]) -> Measure:
-    """Measure of the arm near the worker; none without a worker."""
+    """Measure of the arm near the worker; None without a worker."""
     return lambda run: None if run.near_worker is None else of(run.near_worker)
 
 
 def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
-    """Metric of the unwanted contacts with something."""
+    """Metric of the number of unwanted contacts with `hit`."""
     return never(
         name,
         lambda run: len(_contacts(run)[hit]),
@@ -110,7 +110,7 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
     Metric("contacts with the worker", lambda run: _worker_contacts(run)),
     Metric("min distance", lambda run: _min_distance(run), "mm"),
-    # Steps in which the arm could not have stopped before the worker.
+    # Steps in which the arm could not have stopped before reaching the worker.
     never("separation violations", _near_worker(lambda near: int((near.margin < 0).sum()))),
     Metric(
         "force of contacts, of the limit",
@@ -211,7 +211,8 @@ _PULLS: Sequence[Metric[CollaborationRun]] = (
         "elbow moved",
         lambda run: _elbow_pulled(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.elbow),
         "mm",
-        # Enough to reach under the arm; without it the deviation above proves nothing.
+        # Enough to reach under the arm. If the elbow moves less, a small deviation of the end
+        # effector proves nothing.
         at_least=100.0,
         claim="joint 4 dragged forward for 7 s, backward for 4 s",
     ),
@@ -265,13 +266,13 @@ def _elbow_pulled(run: CollaborationRun) -> float | None:
 
 
 def _worst(run: CollaborationRun, name: str) -> float | None:
-    """Largest value over the objects released on a shelf; None if there were none."""
+    """Largest value over the objects taken from the table and released; None without any."""
     grasped = [e for e in run.picks if e.release is not None and e.receipt is None]
     return max((float(getattr(job, name)) for job in grasped), default=None)
 
 
 def _pushed(run: CollaborationRun, of: Callable[[Deviation], np.ndarray]) -> float | None:
-    """Largest deviation in a run in which a person pushed the elbow; None in any other."""
+    """Largest deviation in a run in which a person pushed the elbow; None without a push."""
     log = run.cell.log
     if not (log["nullspace_input"] != 0).any():
         return None

@@ -67,16 +67,17 @@ NULL_SPACE_FORCES = (
     ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
     ScriptedForce(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), max_force=60.0),
 )
-"""A worker reaches under the arm: the elbow is pushed aside and back. A force of 60 N moves it
-by 0.2 to 0.4 m within the 4.5 s of an interval."""
+"""Forces that push the elbow aside and back, so that a worker can reach under the arm. A force
+of 60 N moves the elbow by 0.2 to 0.4 m within the 4.5 s of an interval."""
 
 DRAGS_NEAR_WORKER = NULL_SPACE_FORCES + tuple(
     replace(force, start=force.start + 10.0) for force in NULL_SPACE_FORCES
 )
-"""Forward and back twice: in the paper the expert drags joint 4 while a worker reaches."""
+"""The same forces twice: in the paper the expert drags joint 4 while a worker reaches under the
+arm."""
 
-# Acceleration that the watch expects of a person who brings an object [m/s^2]. It is lower than
-# for others: the person watches the arm, and must come near enough to hand the object over.
+# Acceleration that the person watch assumes for a person who brings an object [m/s^2]. It is
+# lower than usual: the person sees the arm, and must come near enough to hand the object over.
 _GIVER_ACCELERATION = 3.0
 
 
@@ -97,8 +98,8 @@ class CollaborationScenario:
     camera: CameraKind = "auto"
     """Kind of camera that watches the table."""
     forces: Sequence[ScriptedForce] | Literal["random"] = NULL_SPACE_FORCES
-    """Forces of the person on the elbow, in time since the robot waits for them; or forces at
-    random moments of the whole job."""
+    """Forces of the person on the elbow, timed from when the robot waits for them; "random":
+    forces at random moments of the whole job."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     """Configuration of the job."""
@@ -111,7 +112,7 @@ class CollaborationScenario:
     handover: bool = False
     """A person hands over the last object."""
     page: PageConfig | None = None
-    """Serves a page on which people push and draw too, in real time; None: no page."""
+    """Page, served in real time, on which users can also push and draw; None: no page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,9 +123,9 @@ class CollaborationRun(CellRun):
     picks: tuple[PickPlaceJob, ...]
     """Result for each object, in order."""
     cameras: tuple[tuple[float, CameraModel], ...]
-    """True cameras, each with the time from which it watched [s]."""
+    """True cameras, each with the time from which it was used [s]."""
     pulls: tuple[ScriptedForce, ...] = ()
-    """Forces on the elbow at random moments, in the time of the run."""
+    """Forces on the elbow at random moments, timed from the start of the run."""
     visit: WorkerVisit | None = None
     """True motion of the worker; None without a worker."""
     hand_over: HandOver | None = None
@@ -142,7 +143,7 @@ class CollaborationRun(CellRun):
 
     @cached_property
     def near_worker(self) -> NearWorker | None:
-        """Margin of the distance from the worker, and force of contacts; None without one."""
+        """Margin of the worker's distance, and force of contacts; None without a worker."""
         if self.visit is None:
             return None
         log = self.cell.log
@@ -195,13 +196,13 @@ def simulate_collaboration(
             f"the shelves are {', '.join(shelves)}."
         )
     if scenario.worker and scenario.handover:
-        raise ValueError("only one person comes: give --worker or --handover, not both.")
+        raise ValueError("only one person can come: give --worker or --handover, not both.")
     rng, sizes = np.random.default_rng(seed), scenario.imperfections
     # Scripted forces wait for the robot; random ones do not, and the robot does not wait.
     config, forces, begin = scenario.config, scenario.forces, None
     pulls: tuple[ScriptedForce, ...] = ()
     if forces == "random":
-        # A generator of its own keeps runs with and without pulls alike otherwise.
+        # A separate generator: runs with and without pulls draw the same other values.
         forces = pulls = random_pulls(np.random.default_rng([seed, 1]))
         config, begin = replace(config, interactions=0), 0.0
     person = ScriptedPerturbation(workplace.robot.chain, forces, begin)
@@ -275,7 +276,7 @@ class _Stage:
     Attributes:
         world: World at rest, with all objects at their random poses.
         giving: Person who hands over the last object; None without a hand-over.
-        watch: Watch for a person by the robot's tracker; None without a person.
+        watch: Person watch with the robot's tracker; None without a person.
     """
 
     def __init__(
@@ -287,7 +288,7 @@ class _Stage:
         rng: np.random.Generator,
     ):
         self._workplace, self._sizes = workplace, scenario.imperfections
-        # Generators of their own keep runs with and without a person alike otherwise.
+        # Separate generators: runs with and without a person draw the same other values.
         person_rng = np.random.default_rng([seed, 2])
         scene, worker = workplace.scene, None
         if scenario.worker:
@@ -331,7 +332,7 @@ class _Stage:
 
     @property
     def visit(self) -> WorkerVisit | None:
-        """Motion of the person, as far as decided; None without one."""
+        """Motion of the person, as far as decided; None without a person."""
         if self.watch is None:
             return None
         return self._visit if self.giving is None else self.giving.hand_over.visit

@@ -68,7 +68,7 @@ class ExperimentRun(Protocol):
 
     @property
     def failure(self) -> str:
-        """Reason of the task to give up; empty if it did not. Metrics are evaluated apart."""
+        """Reason why the task was given up; empty if it was not. Metrics are separate."""
         ...
 
     @property
@@ -84,7 +84,7 @@ class Experiment[Run: ExperimentRun](Protocol):
     title: ClassVar[str]
     """Heading of the report."""
     summary: ClassVar[str]
-    """Description of the experiment, in plain text; blank lines part paragraphs."""
+    """Description of the experiment, in plain text; blank lines separate paragraphs."""
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> Run:
         """Draw a scenario from the seed and carry it out once."""
@@ -125,8 +125,8 @@ def evaluate_all[Run: ExperimentRun](
 ) -> Evaluation:
     """Evaluate a run and its trials.
 
-    Without trials the run itself counts as the only one, so that the keys of the values do not
-    depend on the number of trials. Totals over all trials replace the counts of the single run.
+    Without trials the run itself counts as the only trial, so that the keys of the values do
+    not depend on the number of trials. Totals over all trials replace the counts of the run.
     """
     total = evaluate(experiment.metrics(), run, run.failure)
     single = Trial(seed=seed, values=total.values, failure=total.failure)
@@ -143,14 +143,14 @@ class RunOptions:
     out: Path
     """Folder for recordings, report and measured values."""
     seed: int = 0
-    """Seed of the run; the first one of the trials."""
+    """Seed of the run, and of the first trial."""
     trials: int = 0
-    """Number of further runs, each with the next seed, for statistics. The same command resumes
+    """Number of trials for statistics, with consecutive seeds. The same command resumes
     interrupted trials."""
     processes: int = 1
     """Number of parallel trials."""
     serve: bool = False
-    """Serve the dashboard of the run in the browser while it goes on."""
+    """Serve the dashboard in the browser during the run."""
     film: bool = True
     """Make a film of the run, in the folder and in the report."""
     overwrite: bool = False
@@ -184,7 +184,7 @@ def run_experiment[Run: ExperimentRun](
     console, study, view = Console(), experiment.study(), no_live_view
     if options.serve:
         view = live_view(experiment.title, lambda at: console.print(f"Dashboard at {at}"))
-    # Next to the folder, which exists only when all is done: interrupted trials resume.
+    # Next to the folder, which exists only after the run, so that interrupted trials resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
     try:
         with new_folder(options.out, configuration, options.overwrite) as folder:
@@ -236,8 +236,8 @@ def _write_recordings[Run: ExperimentRun](
 def live_view(title: str, on_open: Callable[[str], None]) -> LiveView:
     """Serve the dashboard of a run on a page of its own.
 
-    The loop pays for its log only: another thread makes and sends recordings of the run so
-    far. A page that is open when the run ends keeps its content.
+    The loop only writes its log: another thread makes recordings of the run so far and sends
+    them. A page that is open when the run ends keeps its content.
 
     Args:
         title: Title of the dashboard.

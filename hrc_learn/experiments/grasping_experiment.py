@@ -48,8 +48,8 @@ from hrc_learn.viz.report import Section
 LIFTED = 0.10
 """Height above the table at which an object counts as lifted [m]: half of the lift."""
 GRASP_OFFSET = 15.0
-"""Horizontal distance of the end effector from the object at which the open fingers still take
-it [mm]; they leave 18 mm on either side."""
+"""Largest horizontal distance of the end effector from the object at which the open fingers
+still enclose the object [mm]; they leave 18 mm on either side."""
 ROTATION_SCALE = 0.15
 """Weight of a radian in the norm of a Jacobian [m/rad]: a typical lever arm."""
 REACH = 0.02
@@ -91,9 +91,8 @@ def lift(run: GraspingRun) -> float:
 
 
 def jacobian_errors(run: GraspingRun) -> tuple[float, float]:
-    """Relative errors of the linear image Jacobian as vision starts, and at descent.
-
-    NaN if vision never started.
+    """Relative errors of the image Jacobian's translational part when vision starts, and at
+    the descent; NaN if vision never started.
     """
     log = run.cell.log
     guided = np.flatnonzero(log["vision_activation"] > 0)
@@ -226,8 +225,9 @@ def compare_with_truth(
 
     Returns:
         `relative_error_median` and `_p95`: |estimate - truth| / |truth|, Frobenius norms with
-        rotation counted in metres. `within_1_sigma` and `within_2_sigma`: fractions of
-        the entries that close to the truth; 0.68 and 0.95 of a Gaussian.
+        rotation scaled to metres by `ROTATION_SCALE`. `within_1_sigma` and `within_2_sigma`:
+        fractions of entries within one or two standard deviations of the truth; a Gaussian has
+        0.68 and 0.95.
     """
     scale = torch.tensor([1.0] * 3 + [1 / ROTATION_SCALE] * 3, dtype=torch.float64)
     marker = poses.apply(torch.from_numpy(offset)).numpy()
@@ -248,17 +248,17 @@ def compare_with_truth(
 
 @dataclass(frozen=True, kw_only=True)
 class GraspingExperiment:
-    """Grasp an object once, seen by a camera that was moved since the demonstrations."""
+    """Grasp an object once with a camera that was moved since the demonstrations."""
 
     title: ClassVar[str] = "Grasping with an uncalibrated camera"
     summary: ClassVar[str] = (
         "The arm starts far from the table and has to grasp an object that it sees with one "
         "fixed camera. The camera was moved, tilted or turned since the demonstrations from "
-        "which the image Jacobian was learned, in a manner unknown to the controller. An "
-        "approach in joint space brings the end effector near, a region in Cartesian space "
-        "into the camera's view, and visual servoing to above the object; then it descends, "
-        "grasps and carries the object home. Simulated in MuJoCo; success is read from "
-        "contacts and poses there."
+        "which the image Jacobian was learned, in a manner unknown to the controller. The end "
+        "effector first approaches in joint space. A region in Cartesian space then brings it "
+        "into the camera's view, and visual servoing moves it above the object. It descends, "
+        "grasps the object and carries it home. The run is simulated in MuJoCo, whose contacts "
+        "and poses decide on success."
     )
 
     aiming: Path
@@ -271,11 +271,12 @@ class GraspingExperiment:
     """Imperfections of arm, calibration, camera and object."""
     camera: CameraKind = "synthetic"
     look: UnmarkedLook | None = None
-    """Look of a scene without markers, its clutter and light drawn anew by each seed; None:
+    """Look of a scene without markers, in which each seed draws new clutter and light; None:
     tool and object carry markers."""
     config: GraspingConfig = field(default_factory=GraspingConfig)
     page: PageConfig | None = None
-    """Serves a page on which people draw and pull the arm too, in real time; None: no page."""
+    """Page, served in real time, on which users can also draw and pull the arm; None: no
+    page."""
     robot: ArmChoice = field(default_factory=ArmChoice)
     """The arm."""
     arm: ArmDriver = "sim"

@@ -33,7 +33,8 @@ from hrc_learn.vision import CameraModel
 
 # Joint speed [rad/s] and time between samples [s] of the approach checked for contacts.
 _APPROACH_SPEED, _PATH_STEP = 0.6, 0.05
-# Largest yaw of objects in a scene without imperfections, either way [rad]: as laid by hand.
+# Largest yaw of objects in a scene without imperfections, either way [rad]: people lay objects
+# roughly parallel to the table's edges.
 _ALONG_EDGES = 0.06
 CAMERA_SHIFT = 0.10
 """Largest shift of a random camera along each axis [m]."""
@@ -56,7 +57,7 @@ class GraspingSceneConfig:
     camera_roll: float = 0.0
     """Rotation of the camera about its axis since the demonstrations [rad]."""
     random_camera: bool = False
-    """Shift and tilt the camera, and rotate it by any angle in place of `camera_roll`."""
+    """Shift and tilt the camera, and rotate it by a random angle instead of `camera_roll`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,7 +100,7 @@ class GraspingScene:
             imperfections: Imperfections of arm, calibration, camera and object; None: none.
         """
         scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
-        # A generator of its own: the scenes are the same with any imperfections.
+        # A separate generator, so that the scenes do not depend on the imperfections.
         robot = workplace.robot
         drawn = sizes.draw(rng.spawn(1)[0], robot.joints, robot.hand_size)
         yaw = max(_ALONG_EDGES, sizes.object_yaw)
@@ -151,9 +152,9 @@ def simulate_grasp(
         config: Configuration of the grasp.
         rng: Source of image noise and of lost images.
         access: Access to the arm.
-        human: Person near the arm; None: nobody.
-        page: Serves a page on which people draw and pull the arm too, in real time; None: no
-            page.
+        human: Person near the arm; None: no person.
+        page: Page, served in real time, on which users can also draw and pull the arm; None:
+            no page.
         observer: Live dashboard and messages.
     """
     workplace = scene.workplace.approached(aiming.approach)
@@ -208,7 +209,7 @@ def _draw_camera(
         position = position + CAMERA_SHIFT * rng.uniform(-1, 1, 3)
         middle = workplace.hover().position.numpy()
         sight = middle + _CAMERA_MISS * rng.uniform(-1, 1, 3) - position
-        # Sine of the angle times its axis: close to the rotation vector for these small tilts.
+        # Rotation axis times the sine of the angle: near the rotation vector of small tilts.
         tilt = np.cross(rotation[:, 2], sight / np.linalg.norm(sight))
         rotation = _rotation(tilt) @ rotation
         roll = rng.uniform(-np.pi, np.pi)
@@ -239,7 +240,7 @@ def _starts(
 def _has_free_path(
     world: World, workplace: Workplace, start: Float[np.ndarray, " joints"]
 ) -> bool:
-    """True if straight lines in joint space lead home, directly or by way of the table."""
+    """True if straight joint-space lines lead home, directly or via a hover posture."""
 
     def free(a: Float[Tensor, " joints"], b: Float[Tensor, " joints"]) -> bool:
         return not world.collisions_along(joint_line(a, b, _APPROACH_SPEED, _PATH_STEP).numpy())

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.viz.report import Measurement
 
-# Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; contacts in MuJoCo are as soft. The
-# same noise of seven joints is sqrt(7) * 1e-4 rad. That of a detected marker centre is 0.08 px
-# per coordinate (docs/concepts/training.md). The last one is the control step.
+# mm: encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm, and contacts in MuJoCo yield by
+# as much. deg: the same noise in seven joints adds up to sqrt(7) * 1e-4 rad. px: the noise of a
+# detected marker centre is 0.08 px per coordinate. s: the control step.
 RESOLUTIONS = {"mm": 0.1, "deg": 0.02, "px": 0.1, "s": 0.01}
 """Resolution of measurements by unit; values in other units are shown as they are."""
 
@@ -118,7 +118,7 @@ class Evaluation:
 
 
 def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run, given_up: str = "") -> Evaluation:
-    """Measure a run by each of the metrics.
+    """Measure a run with each of the metrics.
 
     Args:
         metrics: The metrics.
@@ -145,7 +145,7 @@ def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run, given_up: str = "") 
 _Z = 1.959964
 
 _UNITS = {"s", "m", "mm", "rad", "deg", "px", "%"}
-"""Units at the ends of keys; statistics are named before them: `place_error_p95_mm`."""
+"""Units at the ends of keys; the name of a statistic comes before: `place_error_p95_mm`."""
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -159,7 +159,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
         ValueError: If there are no trials, or more successes than trials.
     """
     if not 0 <= successes <= trials or trials == 0:
-        raise ValueError(f"{successes} successes of {trials} trials are no rate.")
+        raise ValueError(f"{successes} successes in {trials} trials do not give a rate.")
     rate, z2 = successes / trials, _Z**2 / trials
     middle = rate + z2 / 2
     half = _Z * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials))
@@ -182,7 +182,7 @@ class Summary:
     failed: Mapping[int, str]
     """Reason by seed."""
     spread: Mapping[str, Mapping[str, float]]
-    """Quantiles of the values that are no counts, by key; failed trials are included."""
+    """Quantiles of the values that are not counts, by key; failed trials are included."""
     totals: Mapping[str, int]
     """Sums of the counts, by key."""
 
@@ -225,7 +225,7 @@ class Summary:
         )
 
     def figures(self) -> dict[str, float | int]:
-        """All of it as one flat object of numbers; seeds and reasons left out."""
+        """The summary as one flat mapping of numbers, without seeds and reasons."""
         low, high = self.interval
         values: dict[str, float | int] = {
             "trials": self.trials,

@@ -1,8 +1,8 @@
-"""Motions of an arm judged in physics: in the work cell, or in any MuJoCo scene.
+"""Judges that replay motions of an arm in physics: in the work cell, or in any MuJoCo scene.
 
-A judge puts the objects in their places, lets the arm follow joint positions at the rate of the
-frames, and asks for success at the end: MuJoCo's contacts in the work cell, a Python function
-for other scenes.
+A judge puts the objects in their places, lets the arm follow joint positions at the frame rate,
+and checks for success at the end: by MuJoCo's contacts in the work cell, by a Python function
+in other scenes.
 """
 
 from __future__ import annotations
@@ -64,19 +64,20 @@ class JudgeConfig:
     """Physics in which motions are judged."""
 
     scene: str = ""
-    """"grasping" or "placing" of our work cell, or an MJCF file with position actuators on the
-    arm's joints; "none": no physics. Default: our work cell if it was demonstrated there."""
+    """Scene: "grasping" or "placing" in hrc_learn's work cell, or an MJCF file with position
+    actuators on the arm's joints; "none": no physics. Default: the work cell if the
+    demonstrations come from it."""
     shelf: str = "middle"
-    """Shelf of placing."""
+    """Shelf for placing."""
     success: str = ""
-    """Function of an MJCF scene as MODULE:FUNCTION, which takes model and data at the end and
-    returns True after a success."""
+    """Success function for an MJCF scene, as MODULE:FUNCTION. It takes model and data at the
+    end of a motion and returns True after a success."""
     gripper: tuple[str, ...] = ()
     """Actuators of the gripper in an MJCF scene. Default: all that move no arm joint."""
     base: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the arm's base in an MJCF scene [m]."""
     processes: int = 2
-    """Processes that judge."""
+    """Number of processes that judge motions."""
 
     def open(self, robot: ArmChoice, fps: float, widest: float) -> CellJudge | SceneJudge:
         """The judge for an arm.
@@ -105,7 +106,10 @@ class CellJudge:
         self._item = scenario.workplace.scene.objects[0].name
 
     def begin(self, trial: Trial) -> None:
-        """The first object lies on the table, or in the gripper; others are places."""
+        """Put the first object on the table, or into the gripper if it is to be placed.
+
+        The other objects of the trial are places, which the simulation does not need.
+        """
         self._names, self._places = [*trial.objects], dict(trial.objects)
         if self._holds or not self._names:
             self.run.world.hold(self._item, trial.joints[0])
@@ -177,7 +181,7 @@ class SceneJudge:
         mujoco.mj_forward(self.model, self.data)
 
     def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
-        """Joints and bodies."""
+        """Joint positions, NaN for the gripper's opening, and poses of the objects."""
         bodies = {name: self.data.body(name) for name in self._names}
         objects = {
             name: np.concatenate([body.xpos - self._config.base, body.xquat])
@@ -194,9 +198,9 @@ class SceneJudge:
         return joints
 
     def failure(self) -> str:
-        """Answer of the success function."""
+        """Failure according to the success function."""
         done = bool(self.succeeded(self.model, self.data))
-        return "" if done else f"{self._config.success} says no"
+        return "" if done else f"{self._config.success} returned False"
 
     def _put(self, name: str, pose: Float[np.ndarray, "7"]) -> None:
         """Put a body somewhere: its free joint, its mocap pose, or its place in its parent."""
@@ -243,7 +247,7 @@ def _function(text: str) -> Callable[[Any, Any], bool]:
         return pkgutil.resolve_name(text)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"judge.success={text!r} is no MODULE:FUNCTION that can be imported ({error})"
+            f"judge.success={text!r} is not a MODULE:FUNCTION that can be imported ({error})"
         ) from None
     finally:
         sys.path.pop(0)
@@ -272,7 +276,7 @@ def judging(
 ) -> Iterator[Judge]:
     """Judge in several processes; arguments and errors as for `JudgeConfig.open`."""
     given = (config, robot, fps, widest)
-    # Opened here first, so that a mistake is one error of this process.
+    # Opened here first, so that a wrong setting raises one error, in this process.
     _begin(*given)
     if config.processes <= 1:
         yield partial(map, _replay)

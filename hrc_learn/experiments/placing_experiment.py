@@ -1,7 +1,7 @@
-"""Experiment 1 of the paper: the demonstrated shelf, then the others, planned in two spaces.
+"""Experiment 1 of the paper: placing on the demonstrated shelf and on others.
 
-In joint space with a shifted goal, as in the paper, and in task space with the learned
-null-space posture.
+Motions are planned in joint space with a shifted goal, as in the paper, and in task space with
+the learned null-space posture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,10 +51,10 @@ class PlacingExperiment:
     title: ClassVar[str] = "Placing: demonstrated once, reproduced faster, on other shelves"
     summary: ClassVar[str] = (
         "An expert guides the end effector of an arm into a cabinet and at the same time moves "
-        "its elbow around the open door. A movement primitive learned from that reproduces the "
-        "motion faster and more smoothly, and adapts it to the shelves above and below: in "
-        "task space with the learned null-space posture, and, for comparison, in joint space "
-        "with a shifted goal, as in the paper.\n\n"
+        "its elbow around the open door. A movement primitive learned from this demonstration "
+        "reproduces the motion faster and more smoothly, and adapts it to the shelves above "
+        "and below: in task space with the learned null-space posture, and, for comparison, in "
+        "joint space with a shifted goal, as in the paper.\n\n"
         "Everything runs in MuJoCo with the object held by friction; contacts, poses and the "
         "place of the object are read from the simulator. Values are for task space and the "
         "worst shelf unless stated otherwise."
@@ -67,7 +67,7 @@ class PlacingExperiment:
     speed: float = 1.5
     """Speed relative to the demonstration."""
     noise: float = 0.1
-    """Standard deviation of each joint at random starts, about home [rad]."""
+    """Standard deviation of each joint about home at random starts [rad]."""
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Imperfections of arm, calibration and objects."""
     taught: bool = True
@@ -173,8 +173,8 @@ class PlacingExperiment:
         )
         text = (
             "One demonstration on one shelf, three goals. Goals in joint space come from the "
-            "analytic inverse kinematics. The paper keeps joint 7 fixed, with which this arm "
-            "does not reach all shelves, so it is free here."
+            "analytic inverse kinematics. The paper keeps joint 7 fixed. This arm would then "
+            "not reach all shelves, so joint 7 is free here."
         )
         return [Section(heading="Other shelves", text=text, figures=(paths, joints))]
 
@@ -184,7 +184,8 @@ class PlacingExperiment:
             title="Placing on each shelf from random starts",
             trial=RandomStart(self),
             metrics=TRIAL_METRICS,
-            text="Every joint of the start is drawn about home; planned in task space.",
+            text="Each seed draws every start joint about home. Motions are planned in task "
+            "space.",
         )
 
     @property

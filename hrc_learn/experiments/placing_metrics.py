@@ -35,7 +35,7 @@ class PlacingOutcome:
     """Measured outcome of one placing."""
 
     deviation: float
-    """Deviation of the approach path from the demonstrated one, moved to the goal [m]."""
+    """Deviation of the approach path from the demonstrated one, shifted to this goal [m]."""
     place_error: float
     """Horizontal distance of the object on its board from its intended place [m]."""
     place_tilt: float
@@ -82,16 +82,16 @@ def approach_deviation(
     demonstrated: Float[np.ndarray, "frames 3"],
     edge: float,
 ) -> float:
-    """Largest distance of an approach from the demonstrated one, moved to the goal [m].
+    """Largest distance of an approach from the demonstrated one, shifted to the goal [m].
 
-    Approaches run against y, as boards that open towards +y require. They are compared
-    sideways and in height at the same depth, so that different shelves can be compared.
+    Approaches run along -y, because the boards open towards +y. They are compared sideways and
+    in height at the same depth, so that different shelves can be compared.
 
     Args:
         path: Path of the end effector [m].
         goal: Intended end of the path [m].
         demonstrated: Demonstrated path of the end effector, which ends behind the edge [m].
-        edge: y at which the approach begins, when it is crossed for the last time [m].
+        edge: The approach begins where the path crosses this y for the last time [m].
 
     Returns:
         Distance [m]; infinite if the path ends in front of the edge.
@@ -236,7 +236,7 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
         ),
         Metric("reproduction, joint RMSE", _joint_rmse, "deg", at_most=2.0),
         *(m.of_part(lambda run: run.outcomes["pose"]) for m in table),
-        # Only compared: the table shows the rows of each shelf.
+        # Joint space, for comparison only: the table lists only the rows of single shelves.
         *(
             replace(
                 m.of_part(lambda run: run.outcomes["joint"], joint_space, bounded=False),

@@ -32,7 +32,7 @@ from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}
-"""Spaces in which motions to other shelves are planned: ours, and the paper's."""
+"""Spaces in which motions to other shelves are planned; the paper's is joint space."""
 
 # Iterations of the taught correction: each reduces errors of milliradians a thousandfold.
 _TEACHING_ITERATIONS = 4
@@ -91,7 +91,7 @@ class PlacingScene:
     skill: PlacingSkill
     workplace: Workplace
     world: World
-    """World of that workplace, reused by each placing with its imperfections."""
+    """World of that workplace; all placings use it, with the same imperfections."""
     demonstration: Demonstration
     demonstrated_shelf: str
     correction: PlaceCorrection | None = None
@@ -194,7 +194,7 @@ def random_start(
         rng: Source of the noise.
 
     Raises:
-        TaskFailedError: If no start drawn is free.
+        TaskFailedError: If every drawn start collides or exceeds a limit.
     """
     home, item = workplace.home_joints(), workplace.scene.objects[0].name
     for _ in range(_DRAWS):
@@ -204,7 +204,7 @@ def random_start(
         world.hold(item, start.numpy())
         if not world.collisions_along(start.numpy()[None], item):
             return start
-    raise TaskFailedError(f"no free start in {_DRAWS} draws with noise of {noise:g} rad")
+    raise TaskFailedError(f"no collision-free start in {_DRAWS} draws, noise {noise:g} rad")
 
 
 def demonstrated_path(

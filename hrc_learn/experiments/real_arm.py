@@ -1,8 +1,8 @@
 """Tasks of the experiments on a real arm with a real camera.
 
-The task code is that of the simulated work cell. The truth is unknown here: results are those
-that the robot itself measures. A simulated world of the assumed surroundings checks the plans,
-and follows the arm for the recording.
+The task code is the same as in the simulated work cell. True poses are unknown here: results
+are what the robot itself measures. A simulated world of the assumed surroundings checks the
+plans for collisions, and mirrors the arm for the recording.
 """
 
 import sys
@@ -83,11 +83,12 @@ class ArmSite:
     leader: dict[str, Any] = field(default_factory=dict)
     """LeRobot's settings of the teleoperator, which `--teleop.NAME=VALUE` sets."""
     lerobot: LeRobotConfig = field(default_factory=LeRobotConfig)
-    """Settings of LeRobot's robot as our driver leads it."""
+    """Settings of hrc_learn's driver for a robot of LeRobot."""
     ros2: Ros2Config = field(default_factory=Ros2Config)
-    """Topics of an arm over ROS 2."""
+    """Topics of an arm in ROS 2."""
     camera_delay: float = 0.0
-    """Delay from exposure to arrival of an image [s]: `hrc_learn.hardware.measure_delay`."""
+    """Delay from exposure to arrival of an image [s]; `hrc_learn.hardware.measure_delay`
+    measures it."""
     realtime: bool = True
     """Refuse a kernel without real-time scheduling."""
     dynamics: float = 0.3
@@ -142,7 +143,7 @@ def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[Stop
         opened = partial(Ros2Arm, chain or site.chain, site.ros2)
     elif not site.ip:
         raise ValueError("ip is empty: give the address of the control box of the arm.")
-    # Never both: each driver registers the same types, and refuses to be loaded with the other.
+    # Only one driver is imported: both register the same types, which fails the second time.
     elif site.driver == "franka":
         loop = FrankaConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
         with FrankaArm(site.ip, site.chain, loop) as arm:
@@ -186,7 +187,7 @@ class ArmRun(CellRun):
 
 
 def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: float) -> Task:
-    """Task: carry the object in the hand home and to a shelf, and release it there.
+    """Task that carries the object in the gripper home and to a shelf, and releases it there.
 
     Args:
         skill: Learned placing motion.
@@ -271,7 +272,7 @@ def run_on_arm(
     with torch.inference_mode(), opened_arm(site) as arm:
         believed.follow(arm.read())
         config = site.cell_config()
-        # The clock of the arm counts: that of a simulator may be slower than ours.
+        # The arm's clock times the loop: a simulator may be slower than real time.
         rate = Rate(config.dt, clock=lambda: arm.read().time)
         held: str | None = None
 

@@ -25,7 +25,7 @@ from hrc_learn.vision import CameraModel
 ELBOW = 3
 """Index of the elbow among the frames of the links."""
 
-# Time after its end during which a pull still counts, while the arm moves back [s].
+# Time after the end of a pull in which its effect still counts, while the arm moves back [s].
 _AFTER = 1.0
 # Largest lag of the end effector behind its goal [s]: servos lag, and a motion that waits for
 # a limit lags further.
@@ -40,7 +40,7 @@ _IN_HAND = quaternion.from_matrix(
 
 
 def lasting(phases: Sequence[Event], last: float = math.inf) -> list[tuple[Event, float]]:
-    """Each phase with its end: the start of the next one, or the last end [s]."""
+    """Each phase with its end [s]: the start of the next phase; `last` for the last one."""
     return list(zip(phases, [*(phase.time for phase in phases[1:]), last], strict=False))
 
 
@@ -62,7 +62,7 @@ def true_image_jacobian(
     Args:
         log: Log of the run.
         world: World with the true place of the marker on the gripper.
-        cameras: True cameras, each with the time from which it watched [s].
+        cameras: True cameras, each with the time from which it was used [s].
     """
     used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
     jacobian = np.full_like(log["image_jacobian"], np.nan)
@@ -133,7 +133,8 @@ class Deviation:
 
     @classmethod
     def from_path(cls, log: LoggedSteps, chain: SerialChain) -> "Deviation":
-        """Deviation from the path, by the encoders, while the arm follows one and is pushed.
+        """Deviation from the path, measured by the encoders, while a path is followed and the
+        arm is pushed.
 
         Args:
             log: Log of the run.
@@ -274,18 +275,18 @@ def pull_effects(
     chain: SerialChain,
     encoder_offset: Float[np.ndarray, " joints"] | None = None,
 ) -> list[PullEffect]:
-    """Effects of the pulls of a run that acted during it.
+    """Effects of those pulls that acted during a run.
 
-    While the arm follows a motion or holds its end effector, its path is known, and so is its
-    distance from that path. Visual servoing has no path: there the grasp offset is the measure.
+    While the arm follows a motion or holds its end effector, the path is known, and so is the
+    distance from it. Visual servoing has no path: the grasp offset is measured instead.
 
     Args:
         log: Log of a work cell.
         pulls: Pulls in the time of the log [s].
         chain: Kinematics of the arm.
-        encoder_offset: Constant errors of the encoders [rad]. With them distances are true
-            ones, also where a displaced elbow changes the joints for the same pose. None:
-            distances are those of the encoders.
+        encoder_offset: Constant errors of the encoders [rad], to compute true distances: the
+            errors act differently where a displaced elbow changes the joints. None: distances
+            as the encoders show them.
     """
     time, joints = log["time"], torch.from_numpy(log["joint_position"])
     tool = chain.forward(joints).position.numpy()
@@ -314,8 +315,9 @@ def _hidden_displacement(
 ) -> Float[np.ndarray, "time 3"]:
     """Displacement of the end effector by a push that the encoders do not show [m].
 
-    It is the change of the encoders' error at the end effector against that without the push:
-    on the path, or else when no input last moved the null space.
+    The encoders' errors move the end effector by an amount that depends on the joints. The
+    result is this amount minus that at the undisturbed joints: those of the path, or without a
+    path the last joints before the push.
     """
     joints = torch.from_numpy(log["joint_position"])
     path = torch.from_numpy(log["path_joints"])
@@ -361,7 +363,7 @@ def path_distance(
     Args:
         position: Position of the end effector [m].
         goal: Goal of the end effector [m]; NaN without a path.
-        time: Time of both [s].
+        time: Time of each sample [s].
     """
     nearest = _distance_across(position - goal, goal, time)
     start, step = goal[:-1], np.diff(goal, axis=0)
@@ -371,7 +373,7 @@ def path_distance(
         a, d, square = start[: len(here)], step[: len(here)], length[: len(here)]
         fraction = ((here - a) * d).sum(axis=1) / np.maximum(square, 1e-12)
         away = np.linalg.norm(here - a - np.clip(fraction, 0, 1)[:, None] * d, axis=1)
-        # A segment with an unknown end is none: fmin leaves NaN out.
+        # fmin ignores the NaN of segments with an unknown end.
         nearest[lag + 1 :] = np.fmin(nearest[lag + 1 :], away)
     return np.where(np.isfinite(goal).all(axis=1), nearest, np.nan)
 
@@ -381,7 +383,7 @@ def _distance_across(
     goal: Float[np.ndarray, "time 3"],
     time: Float[np.ndarray, " time"],
 ) -> Float[np.ndarray, " time"]:
-    """Size of the part of an error across the recent direction of the goal [m]."""
+    """Length of the part of an error perpendicular to the recent motion of the goal [m]."""
     lag = min(_lag_samples(time), len(time))
     motion = np.full_like(goal, np.nan)
     motion[lag:] = goal[lag:] - goal[: len(goal) - lag]

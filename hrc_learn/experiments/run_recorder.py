@@ -1,7 +1,7 @@
 """Recording of a simulated run, and its film.
 
-The film is rendered from the recording, or drawn on machines that cannot render. Its length is
-bounded, and so is its cost.
+The film is rendered from the recording, or drawn on machines that cannot render. Its length,
+and with it the computing time, is bounded.
 """
 
 import math
@@ -47,7 +47,7 @@ from hrc_learn.viz.report import Film
 # Joint, counted from 1, whose frame is at the elbow of an arm with seven joints: the person
 # takes hold of the arm there (paper, Experiment 3).
 _PUSHED = 4
-# Null-space input below which nobody pushes [N m], and length of the arrow of a push [m].
+# Null-space input below which no push is shown [N m], and length of a push's arrow [m].
 _NO_PUSH, _ARROW = 0.5, 0.45
 
 WIDTH, HEIGHT = 720, 450
@@ -66,7 +66,7 @@ with as_file(files(__package__) / "film_captions.toml") as _path:
 
 _CARRYING = (HOME, TRANSFER, RELEASE, "retreat")
 _ABOVE = 0.15  # height of the arrow above the forearm [m]
-_HAND = 0.04  # width of the forearm that pulls [m]
+_HAND = 0.04  # width of the person's forearm [m]
 _NEAR = 1.0  # largest distance of a worker that is shown [m]
 _TRAIL = 2.0  # duration for which the path of the tool stays in the picture [s]
 _POINTS = 60  # points of a drawn path
@@ -90,9 +90,9 @@ def record(
         cell: Work cell of the run.
         world: World of the run, with everything that only a simulator knows.
         motion: True poses of everything that moved.
-        plans: Motion to the shelf of each transfer that began.
-        cameras: True cameras, each with the time from which it watched [s]; by default that
-            of the world.
+        plans: Planned motion to the shelf, for each transfer that began.
+        cameras: True cameras, each with the time from which it was used [s]; by default the
+            camera of the world.
         region: Box above the table in which the vision region takes over.
         demonstration: Demonstration that the motion was learned from.
     """

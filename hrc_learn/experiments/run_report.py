@@ -1,4 +1,4 @@
-"""Report of a run: sections, and figures after those of the paper's Experiments 2 and 3.
+"""Report of a run: sections, and figures like those of the paper's Experiments 2 and 3.
 
 Each figure takes the recording of the run and the time interval of each object, by its name.
 """
@@ -61,7 +61,7 @@ class _Texts:
 
 
 def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -> list[Section]:
-    """Report sections: timeline, servoing, person and worker if they came, motion.
+    """Report sections: timeline, servoing, person and worker if present, motion.
 
     `run_report.toml` holds their texts.
 
@@ -99,7 +99,7 @@ def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -
 
 
 def person_figure(run: RunRecording) -> Figure:
-    """Curves of the person, from the first to the last action; the actions are shaded."""
+    """Effort of the person and its effects, from the first to the last action (shaded)."""
     assert run.nullspace_input is not None
     acting = np.asarray(run.nullspace_input.any(axis=1))
     present = acting
@@ -235,7 +235,7 @@ def _within(
 
 
 def _out_of_sight(run: RunRecording) -> Bool[np.ndarray, " time"]:
-    """True at steps with a target for the marker in which the camera did not see it."""
+    """True at steps in which the marker has a target but is not seen by the camera."""
     if run.camera is None:
         return np.zeros(len(run.time), dtype=bool)
     targeted = np.isfinite(run.camera.target).all(axis=1)

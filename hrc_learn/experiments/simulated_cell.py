@@ -34,8 +34,8 @@ ArmDriver = Literal["sim", "franky", "franka"]
 """Driver of a simulated arm: the simulator itself, or a driver of the real arm."""
 
 PROTOCOL_DELAY = 0.003
-"""Delay from a command to a driver until the servos have it [s]: two cycles of the protocol,
-and one because the state read before it is one cycle old. Measured with commands every 10 ms.
+"""Delay from a command to a driver until the servos receive it [s]: two cycles of the protocol,
+and one because the state that was read is one cycle old. Measured with commands every 10 ms.
 """
 
 
@@ -43,16 +43,16 @@ and one because the state read before it is one cycle old. Measured with command
 class ArmAccess:
     """Connection to the arm of a world, with the delay and dynamics of its driver.
 
-    A driver takes the same task through everything in front of a real arm: the driver package,
-    its sockets, and the 1 ms cycles of the protocol, which the world answers.
+    With a driver, the same task uses all software that a real arm needs: the driver package,
+    its sockets, and the 1 ms cycles of the protocol, to which the simulated world responds.
     """
 
     open: Callable[[World], AbstractContextManager[OpenedArm]]
     """Connects to the arm of a world at rest, until the run ends."""
     delay: float = 0.0
-    """Delay from a command until the servos of the arm have it [s]."""
+    """Delay from a command until the servos of the arm receive it [s]."""
     dynamics: float = 1.0
-    """Fraction of the acceleration of the arm that the driver uses."""
+    """Fraction of the arm's acceleration limits that the driver uses."""
 
     def declared(self, sizes: Imperfections) -> Imperfections:
         """Imperfections that a controller must allow for: those of arm and driver."""
@@ -79,7 +79,7 @@ def access_by(
     Args:
         driver: Name of the driver.
         robot: Arm of the world.
-        dynamics: Fraction of the acceleration of the arm that a real driver uses.
+        dynamics: Fraction of the arm's acceleration limits that a real driver uses.
         serve: Serves the arm over its network protocol.
 
     Raises:
@@ -125,7 +125,7 @@ def no_live_view(*_: object) -> AbstractContextManager[None]:
 
 @dataclass(frozen=True, kw_only=True)
 class Observer:
-    """Outputs of a run while it goes on; by default none."""
+    """Outputs during a run; by default none."""
 
     view: LiveView = no_live_view
     """Live dashboard."""
@@ -146,7 +146,7 @@ class CellRun:
     motion: MotionLog
     """Poses of everything that moved."""
     failure: str = ""
-    """Reason of the robot to give up; empty if it did not. Metrics are evaluated apart."""
+    """Reason why the robot gave up; empty if it did not. Metrics are evaluated separately."""
 
     @property
     def log(self) -> LoggedSteps:
@@ -179,15 +179,15 @@ def simulated_cell(
         world: World with arm, camera and objects, at rest.
         human: Scripted person.
         sensor: Camera that finds tool and objects; None for tasks without a camera.
-        config: Configuration of the loop; the delays, losses and braking of the world and of
-            the driver are allowed for in it.
+        config: Configuration of the loop; its delays, losses and braking are adapted to those
+            of the world and of the driver.
         access: Access to the arm.
-        page: Serves a page on which people push and draw too, in real time; None: no page.
+        page: Page, served in real time, on which users can also push and draw; None: no page.
         title: Title of that page.
         observer: Live dashboard and messages.
         on_phase: Called with name and start time [s] of each phase.
         on_step: Called after each step of the world.
-        rng: Decides which images are lost.
+        rng: Random generator that decides which images are lost.
         clearance: Distance between the arm and its surroundings, kept when it is pushed.
         watch: Watches for people near the arm.
     """

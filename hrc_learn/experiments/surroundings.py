@@ -1,4 +1,4 @@
-"""Surroundings of a run: objects on the table, a worker there, a person who hands one over."""
+"""Surroundings of a run: objects on the table, a worker, a person handing over an object."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -57,7 +57,7 @@ THREE_OBJECTS = (
     ),
 )
 """Three boxes that fit into the gripper."""
-# Added to the seed of a run's look: demonstrations have those of small seeds.
+# Added to the seed of a run's look, because demonstrations use the looks of small seeds.
 _OTHER_LOOK = 10_000
 
 
@@ -68,7 +68,7 @@ def unmarked_for(
 
     Args:
         workplace: Workplace with markers.
-        skill: Skill with landmarks; the place on the tool that it sees is what measures use.
+        skill: Skill with landmarks; metrics use the point of the tool that the skill sees.
         look: Look of the scene.
         seed: Draws clutter and light.
 
@@ -91,24 +91,24 @@ OBJECT_REACH = (0.10, 0.08, 0.0)
 OBJECTS_REACH = (0.12, 0.10)
 """Largest distance of several objects from the middle of the table along x and y [m]."""
 
-# Distance at which the open fingers around one object clear the next one, in any orientation
-# [m]: 0.06 m to the outside of a finger, 0.046 m to the corner of the largest object.
+# Distance between objects at which the open fingers around one clear the other in any
+# orientation [m]: 0.06 m to the outside of a finger, 0.046 m to the farthest object corner.
 _APART = 0.118
-# Arrangements of the objects that are tried.
+# Largest number of arrangements of the objects that are tried.
 _ARRANGEMENTS = 10_000
 
-# Arrival at the elbow [s] and number of reaches: a robot waits above its first object 11 s
-# after the start, and the worker is to reach under it then.
+# Ranges of the arrival at the elbow [s] and of the number of reaches: the robot waits above its
+# first object 11 s after the start, and the worker should reach under it then.
 _ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
-# Distance that people keep from a resting arm in their view, the thickness of a sleeve [m];
-# time between checks of it [s]; and workers drawn until one can reach like that.
+# Distance that people keep from a resting arm that they see, the thickness of a sleeve [m];
+# time between checks of this distance [s]; and workers drawn until one can reach and keep it.
 _KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 200
 # Joints at the ends of the forearm, from 0.
 _FOREARM = slice(3, 5)
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
 # push creep.
 _AT_REST = 0.01
-# Steps that are computed together: some 100 MB.
+# Number of steps that are computed at once, which takes some 100 MB.
 _BLOCK = 250
 # Demonstrated visits by different people: 30 hand-overs among 120 other movements.
 _VISITS = 30
@@ -117,7 +117,7 @@ _VISITS = 30
 _BASIS_FUNCTIONS = 4
 # Waiting position of the end effector relative to its hover position over the table [m].
 _WAITING_OFFSET = (0.05, -0.16, 0.25)
-# Body and hand of a tracked person in which movements are watched.
+# Parts of a tracked person whose movements are watched: body and hand.
 _WATCHED = PARTS.index("pelvis"), PARTS.index("hand_right")
 # Fewest images of a movement to learn from.
 _FEWEST_IMAGES = 8
@@ -138,7 +138,7 @@ def workplace_for(shelves: Sequence[str], robot: Arm) -> Workplace:
     """Workplace of an arm with one object for each shelf.
 
     Raises:
-        ValueError: If no shelf is named, or more than there are objects.
+        ValueError: If no shelf is named, or more shelves than there are objects.
     """
     if not 1 <= len(shelves) <= len(THREE_OBJECTS):
         raise ValueError(
@@ -216,7 +216,8 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
     Raises:
         ValueError: No worker can reach under the arm that waits.
     """
-    # Visits are drawn to the side of +y, as if the side of -x were there, and turned.
+    # Visits are drawn at the side +y of a table that is turned by -90 degrees, so that its side
+    # -x is there. Then they are turned back.
     table = workplace.scene.table
     arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
     elbow, wrist = panda.joint_origins(waiting)[_FOREARM].tolist()
@@ -244,7 +245,7 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
                 is_clear=is_clear,
             )
         except ValueError:
-            continue  # a small person who stands where the arm hinders them
+            continue  # for example, the arm is in the way of a small person
         on_the_way = np.arange(visit.begin, visit.end, _CHECKED_EVERY)
         if is_clear(visit.capsules_at(on_the_way).ends):
             return visit.turned(np.pi / 2)
@@ -261,7 +262,7 @@ def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[
     Args:
         world: Simulation at the end of the run.
         log: Log of the run.
-        motion: Motion of everything in it.
+        motion: True poses of everything that moved.
     """
     objects = {item.name for item in world.config.objects}
     time = log["time"] if len(log) else np.empty(0)
@@ -284,7 +285,7 @@ def margin_to_stop(
     config: SeparationConfig,
     contact: Float[Tensor, "*batch C H"] | None = None,
 ) -> Float[Tensor, "*batch C H"]:
-    """Margin of each distance over the one within which the arm can stop before a person [m].
+    """Margin of each distance over the distance that the arm needs to stop in time [m].
 
     Args:
         found: True distances.
@@ -312,7 +313,7 @@ class NearWorker(NamedTuple):
     """Smallest margin of the distance over the stopping distance [m]."""
     force: Float[np.ndarray, " steps"]
     """Peak force or pressure of a contact into which the arm moves, as a fraction of its limit;
-    zero without one, infinite where none is allowed."""
+    zero without a contact, infinite where no contact is allowed."""
 
 
 def near_worker(
@@ -329,9 +330,10 @@ def near_worker(
     contacts, at each step.
 
     The stopping distance is v_h v/a + v^2/(2 a), for a part of the arm that approaches a part
-    of the worker at speed v while that comes at v_h: the protective distance without reaction
-    time and uncertainty. It is the smallest margin over all parts, infinite while the arm
-    approaches none, and for contacts within the limits of power and force limiting.
+    of the worker at speed v while the latter comes at v_h: the protective distance without
+    reaction time and uncertainty. The margin is the smallest over all parts. It is infinite
+    while the arm approaches no part, and for contacts within the limits of power and force
+    limiting.
 
     Args:
         log: Log of the run.
@@ -339,7 +341,7 @@ def near_worker(
         arm: Capsules of arm and tool.
         config: Protective distance, with the deceleration of the arm.
         encoder_offset: Offset of the logged joint positions: measured minus true [rad].
-        loads: Objects in the gripper, and the steps in which they were.
+        loads: Objects by name, each with the steps in which it was in the gripper.
         furniture: Boxes against which the arm may clamp the worker.
     """
     whole = replace(config, contact=replace(config.contact, used=1.0))
@@ -374,7 +376,7 @@ def near_worker(
 
 
 class GivingPerson:
-    """Moves a person with an object in their hand, reacting to the robot's hand.
+    """Person with an object in the hand, reacting to the motion of the robot's hand.
 
     Attributes:
         hand_over: Actions of the person, as far as decided.
@@ -500,7 +502,7 @@ def _movements(
             if seen is None or seen is newest:
                 continue
             newest = seen
-            # Until the hand arrives: the watch adds samples of a resting hand after that.
+            # Only until the hand arrives: afterwards the watch adds samples of a resting hand.
             if watch.see(seen) and seen.time < reach.end:
                 times, hand = watch.times.copy(), watch.hand.copy()
         if len(times) >= _FEWEST_IMAGES and times[-1] > reach.begin:

@@ -24,7 +24,7 @@ class Trial:
 
     seed: int
     values: Mapping[str, float | int | str]
-    """Measured values by name; of a failed trial those that were measured nevertheless."""
+    """Measured values by name; for a failed trial, those that could still be measured."""
     failure: str = ""
     """Reason of a failure; empty after a success."""
 
@@ -57,7 +57,7 @@ class Trial:
 class TrialFile(Claim):
     """File of trials with the same settings, to which each trial is added as soon as it ends.
 
-    One process at a time may hold it.
+    Only one process at a time may hold the file.
 
     Attributes:
         trials: Trials in the file, by seed.

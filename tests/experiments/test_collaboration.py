@@ -566,7 +566,7 @@ def test_every_object_needs_a_shelf_of_its_own(skills):
 
 
 def test_one_person_comes_at_a_time(skills):
-    with pytest.raises(ValueError, match="one person comes"):
+    with pytest.raises(ValueError, match="one person can come"):
         simulate(*skills, ("upper",), worker=True, handover=True)
 
 

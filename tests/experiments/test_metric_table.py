@@ -30,7 +30,7 @@ def test_the_interval_is_that_of_wilson(successes, trials):
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 0), (2, 1), (-1, 3)])
 def test_no_share_without_trials(successes, trials):
-    with pytest.raises(ValueError, match="no rate"):
+    with pytest.raises(ValueError, match="do not give a rate"):
         wilson_interval(successes, trials)
 
 

@@ -66,15 +66,15 @@ def test_only_what_the_success_function_accepts_succeeds(scene, monkeypatch):
     assert good.failure == ""
     assert good.objects["block"][-1, 2] == pytest.approx(0.13, abs=0.01)
     assert good.joints.shape == (END, 7)
-    assert "says no" in bad.failure
+    assert "returned False" in bad.failure
     assert np.abs(bad.objects["block"][:, 1] - 0.20).max() < 0.01
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"success": "nowhere:function"}, "no MODULE:FUNCTION"),
-        ({"success": "math:nothing"}, "no MODULE:FUNCTION"),
+        ({"success": "nowhere:function"}, "not a MODULE:FUNCTION"),
+        ({"success": "math:nothing"}, "not a MODULE:FUNCTION"),
         ({"scene": "lost.xml"}, "no scene 'lost.xml'"),
     ],
 )

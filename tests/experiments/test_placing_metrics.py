@@ -148,5 +148,5 @@ def test_a_correction_shifts_and_turns_in_the_frame_of_the_tool():
 
 def test_starts_that_cannot_be_free_are_given_up():
     world, rng = World(WORKPLACE.scene), np.random.default_rng(0)
-    with pytest.raises(TaskFailedError, match="no free start"):
+    with pytest.raises(TaskFailedError, match="no collision-free start"):
         random_start(world, WORKPLACE, 1e3, rng)

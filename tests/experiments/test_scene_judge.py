@@ -130,7 +130,7 @@ def test_a_replay_commands_the_next_frame_and_reads_before_it(judge):
     assert made.objects["cup"].shape == (4, 7)
     assert made.failure == ""
     found.succeeded = lambda model, data: False
-    assert replay(found, given).failure == "builtins:bool says no"
+    assert replay(found, given).failure == "builtins:bool returned False"
     # A second replay begins from the same state as the first one.
     found.succeeded = lambda model, data: data.time < 0.2
     again = replay(found, given)
