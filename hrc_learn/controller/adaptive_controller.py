@@ -72,7 +72,7 @@ class ControllerConfig:
     """Blending of vision feedback."""
     way_making: WayMakingConfig | None = None
     """Null-space motion away from people and objects at the `distances` of an observation;
-    None: none, the null space follows the person."""
+    None: the null space follows a person only."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter."""
 
@@ -355,7 +355,7 @@ class AdaptiveController(nn.Module):
         stop: Tensor | None,
         unknown: Tensor,
     ) -> tuple[Tensor, SafetyState, SafetyReport]:
-        """Step of the safety filter, which brakes where something is unknown."""
+        """Step of the safety filter, which brakes where inputs are invalid."""
         observation = given.observation
         if observation.stop is not None:
             stop = observation.stop if stop is None else stop | observation.stop

@@ -52,7 +52,7 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# Smallest fraction of the task given up by the constraint layer that is not rounding.
+# Fraction of the task's speed given up by the constraint layer below which it is rounding.
 _SLOWED = 1e-3
 # Twist below which the task counts as at rest (linear and angular together) [m/s, rad/s].
 _AT_REST = 1e-3
@@ -60,7 +60,7 @@ _AT_REST = 1e-3
 
 @final
 class ArmLoop:
-    """The law of one arm or of a batch of equal arms; all of its state is passed in."""
+    """The law of one arm or of a batch of identical arms; the caller passes in the state."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class ArmLoop:
         )
 
     def _requested_null_velocity(self, reading: ArmReading) -> Tensor:
-        """Joint velocity of which a push or the repulsion requests the null-space part."""
+        """Joint velocity for push and repulsion; only its null-space part acts."""
         config = self.config
         push = null_space_input(
             reading.nullspace_input, _distances(reading), config.way_making, config.damping
@@ -275,8 +275,7 @@ class ArmLoop:
         state = replace(_without_path(state), safety=safety, pace=pace)
         report = ArmReport(command.safety)
         if reading.explain:
-            # Compare with the request of push and joint-space feedback together, as the law
-            # does.
+            # The request includes the joint-space feedback, as in the law.
             push = state.null_velocity - command.xi_q / self.config.damping
             wanted, bounds = null_projection(J, push), self.safety.velocity_bounds(q)
             kept = fraction_kept(wanted, command.null_velocity)

@@ -70,7 +70,7 @@ class WatchedPeople:
     since the observation. NaN, which brakes the arm, without an observation and where people
     may touch the arm but must not."""
     nearest: Float[Tensor, "*batch"]
-    """Smallest distance between people as observed and the arm as it is now [m]."""
+    """Smallest distance between the observed people and the arm at its present joints [m]."""
     age: Float[Tensor, "*batch"]
     """Age of the observation [s]."""
     speed_scale: Float[Tensor, "*batch"]
@@ -101,7 +101,7 @@ class ArmReading:
     """People near the arm, which slow it down and whose distances the safety filter keeps;
     None: people are not tracked."""
     stop: Bool[Tensor, "*batch"] | None = None
-    """True where the arm must come to rest for the sake of people; None: nowhere."""
+    """True where the arm must come to rest because of people; None: nowhere."""
     explain: bool = static(False)
     """True to report what limits the push."""
 
@@ -270,7 +270,7 @@ class ArmReport(NamedTuple):
     path_joints: Float[Tensor, "*batch n"] | None = None
     """Joint positions on the path [rad]."""
     slowed_by_people: Bool[Tensor, "*batch"] | None = None
-    """True where people near the arm hold it back; None: not explained."""
+    """True where people near the arm slow it down; None: not explained."""
     null_motion: tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]] | None = None
     """Null-space velocity before and after the safety filter [rad/s]; None: not explained."""
 

@@ -5,11 +5,11 @@ two unknowns more than the arm has joints: the speed of the task, and the excess
 conflict. The distances are those of the arm from itself, from objects and from people
 (`SeparationConfig`).
 
-The solver is the dual active-set method of Goldfarb and Idnani (1983), batched, in a fixed
-number of steps and without branches. It starts at the optimum without limits and adds one limit
-at a time to the active set, so a program with few active limits is solved exactly in as few
-steps. Each step adds or drops one limit, separately for each element of a batch: the operations
-do not depend on the data, so they compile and export.
+The solver is the dual active-set method of Goldfarb and Idnani (1983), batched, with a fixed
+limit on the number of steps. It starts at the optimum without limits and adds one limit at a
+time to the active set, so a program with few active limits is solved exactly in as few steps.
+Each step adds or drops one limit, separately for each element of a batch: the operations do not
+depend on the data, so they compile and export.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def least_change(
 ) -> LeastChange:
     """Solve  min |y|^2 / 2  subject to  lower <= C y <= upper.
 
-    Any strictly convex program takes this form: with the Hessian L L^T its unknown is
-    y = L^T (x - x_0), counted from the optimum x_0 without limits.
+    Any strictly convex program takes this form: with the Hessian L L^T and the optimum x_0
+    without limits, its unknown is y = L^T (x - x_0).
 
     Args:
         rows: C^T, a column for each limit: sums then run over the first axis, and compiled

@@ -62,10 +62,10 @@ BODY_REGIONS = {name: BodyRegion(**row) for name, row in _REGIONS.items()}
 _TABLE = Constant(torch.tensor(list(BODY_REGIONS.values()), dtype=torch.float64))
 # Transient limits are this many times the quasi-static ones (table A.2).
 _TRANSIENT = 2.0
-# Cosine of 60 degrees: within this angle of the arm's direction to the person, furniture clamps
-# the person.
+# Cosine of 60 degrees: furniture clamps a person if, seen from the arm, it lies within this
+# angle of the person.
 _FACING = 0.5
-# Distance below which its direction is undefined [m].
+# Distance below which the direction is undefined [m].
 _TOUCHING = 1e-6
 # Excess speed that counts as rounding of the constraint solver [m/s].
 _TOLERANCE = 1e-10
@@ -251,7 +251,7 @@ class ContactSpeeds(NamedTuple):
     """Highest relative speeds of contacts [m/s]; zero where no contact is allowed."""
 
     first: Float[Tensor, "*batch C H"]
-    """Speeds at which arm and person may meet."""
+    """Speeds allowed at the first contact."""
     lasting: Float[Tensor, "*batch C H"]
     """Speeds that keep quasi-static limits, for contacts that last."""
 

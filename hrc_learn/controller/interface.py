@@ -50,8 +50,7 @@ class SafetyConfig:
     """Largest relative deviation of a step from its `dt`, in [0, 1). Zero where dt is the
     measured time since the last step: then all limits hold exactly."""
     tcp_speed: float = 1.0
-    """Highest speed of the tool centre point, and of any other point whose Jacobian is given
-    [m/s]."""
+    """Highest speed of the tool centre point, the elbow and the far end of a load [m/s]."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
     """Protective distance from people. It lowers the tool-speed cap where `human_distance` is
     given, and limits all links where `distances` to a person are given."""
@@ -331,7 +330,7 @@ class Command:
     null_velocity: Float[Tensor, "*batch n"]
     """Joint velocity in the null space [rad/s]."""
     xi_x: Float[Tensor, "*batch rows"]
-    """Vision feedback, scaled by the blending."""
+    """Vision feedback, scaled by the blending and limited by `vision_rate`."""
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback, position then orientation."""
     xi_q: Float[Tensor, "*batch n"]
@@ -345,8 +344,8 @@ class Command:
     vision_level: Float[Tensor, "*batch"]
     """Fraction of vision feedback, 0 to 1."""
     potential: Float[Tensor, "*batch"]
-    """Sum of the task-space potentials P_v + P_t + P_o: the part of the Lyapunov function
-    that does not depend on the true weights."""
+    """Sum of the task-space potentials P_t + P_o + P_v, with P_v scaled by the blending: the
+    part of the Lyapunov function that does not depend on the true weights."""
     potential_rate: Float[Tensor, "*batch"]
     """s^T J u, the rate of the potential predicted with the estimated image Jacobian [1/s]; not
     positive while no limit or person turns the motion against the task. A measured potential

@@ -47,13 +47,13 @@ _PUSH_EFFORT, _STOP_EFFORT = 0.3, 0.6
 # Lower bound on the null-space speed with which the arm looks ahead for singularities [rad/s].
 _SLOW = 0.2
 # A correction has no null-space part if that part is smaller than this [rad/s]. A joint does
-# not move if its ratio to the fastest joint is smaller.
+# not take part in it if its ratio to the largest entry is smaller.
 _NEGLIGIBLE = 1e-6
 # Closing speed allowed at the clearance margin [m/s], and depth inside the margin at which it
 # has fallen to zero [m]. Without it, an arm that slides along a surface, and its task, would
 # stop and start with every reading.
 _SLIDING_SPEED, _DEEPEST = 0.002, 0.005
-# Null-space fraction of a push below which the push counts as one of the end effector.
+# Null-space fraction of a push below which the push counts as a push on the end effector.
 _ACROSS = 0.1
 
 type Clearance = Callable[[Float[Tensor, "*batch n"]], Float[Tensor, "*batch"]]
@@ -183,9 +183,9 @@ class EasedVelocity(NamedTuple):
     projected: Float[Tensor, "*batch n"]
     """Null-space part of the requested velocity [rad/s]."""
     slowdown: Float[Tensor, "*batch"]
-    """Fraction left by `null_space_slowdown`."""
+    """Fraction that `null_space_slowdown` allows."""
     fade: Float[Tensor, "*batch"]
-    """Fraction left by `singularity_fade`."""
+    """Fraction that `singularity_fade` allows."""
     unbounded: Float[Tensor, "*batch n"]
     """Velocity after both fractions [rad/s]."""
     bounded: Float[Tensor, "*batch n"]

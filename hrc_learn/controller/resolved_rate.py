@@ -347,8 +347,9 @@ def planned_motion(
     return (fraction * dt).unsqueeze(-1) * task_twist
 
 
-# Region function of the posture beyond which a joint-space approach starts again: at the
-# default tolerance of 0.5 rad a distance of 1.5 rad, more than a person pulls the elbow away.
+# Region function of the posture beyond which a joint-space approach starts again: with the
+# default tolerance of 0.5 rad it is a distance of 1.5 rad, more than a person pulls the elbow
+# aside.
 _FAR_FROM_POSTURE = 2.0
 
 
@@ -364,7 +365,7 @@ class BlendingConfig:
     blend_time: float = 0.3
     """Time in which vision feedback fades in and out [s]; 0: at once."""
     max_feature_age: float = 0.25
-    """Age above which a feature is not used, and stops an arm that needs it [s]."""
+    """Age above which a feature is not used; an arm that follows the feature then stops [s]."""
 
 
 @pytree
@@ -534,13 +535,14 @@ class Feedback(NamedTuple):
     """Feedback vectors of the regions and their combination."""
 
     xi_x: Float[Tensor, "*batch rows"]
-    """Feedback of the vision region, scaled by the vision level."""
+    """Feedback of the vision region, scaled by the vision level and limited by
+    `vision_rate`."""
     xi_r: Float[Tensor, "*batch 6"]
     """Feedback of the Cartesian regions, position then orientation."""
     s: Float[Tensor, "*batch 6"]
     """J_s_hat^T xi_x + xi_r."""
     potential: Float[Tensor, "*batch"]
-    """Sum of the potentials."""
+    """Sum of the potentials, that of vision scaled by the vision level."""
 
 
 def regional_feedback(

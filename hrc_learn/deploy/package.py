@@ -64,7 +64,7 @@ class Field:
     dtype: torch.dtype
     """Type of its elements."""
     batched: bool
-    """False: one value for the whole batch."""
+    """True: one value for each element of the batch; False: one for the whole batch."""
     shape: tuple[int, ...]
     """Shape without the batch axes."""
 

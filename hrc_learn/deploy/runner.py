@@ -124,7 +124,7 @@ class PackageRunner(StepRunner):
 
 @final
 class EagerRunner(StepRunner):
-    """A step without compilation."""
+    """A control step without compilation."""
 
     def __init__(self, controller: Steppable, observation: StepObservation):
         """Prepare the step; later observations must have the fields of this one."""

@@ -1,9 +1,9 @@
 """Rotations as unit quaternions (w, x, y, z), and the rates of their rotation vectors.
 
-q and -q represent the same rotation and give the same result. Every function takes any
-number of leading batch dimensions, follows the dtype and device of its input, and has finite
-first and second derivatives everywhere, also at the identity and at half turns. No function
-branches on data or writes in place, so all can be compiled, exported and vmapped.
+q and -q represent the same rotation and give the same result. Every function (except `mean`)
+takes any number of leading batch dimensions, follows the dtype and device of its input, and has
+finite first and second derivatives everywhere, also at the identity and at half turns. No
+function branches on data or writes in place, so all can be compiled, exported and vmapped.
 
 Inputs must be unit quaternions: `normalize` external data.
 """
@@ -122,9 +122,9 @@ def to_matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
 def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion of a rotation matrix; its sign is arbitrary.
 
-    Builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
-    (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
-    unit quaternion even if R is a rotation only up to rounding.
+    It builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
+    (Markley 2008, "Unit quaternion from rotation matrix"). The result is accurate at every
+    angle, and a unit quaternion even if R is a rotation only up to rounding.
     """
     if torch.compiler.is_compiling():
         return _written_out_from_matrix(R)
