@@ -34,13 +34,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LATE = 1.5
-"""Periods after which an action is late: from here on the nearest frame is the next one."""
+"""Action periods after which an action counts as late: it is then nearer to the next frame."""
 PAUSE = 2.0
-"""Longer without an action is no late one but a pause [s], as between two episodes."""
+"""Time without an action above which there is a pause instead of a late action [s], for example
+between two episodes."""
 TOLERATED = 0.02
 """Fraction of late actions that raises no warning."""
 EPISODE = 1.0
-"""Shorter stretches are no episodes [s], and need not show anything."""
+"""Shortest episode [s]; a shorter sequence of actions need not show any motion."""
 
 
 class Device:
@@ -92,12 +93,12 @@ class Device:
 
 
 class LoopWatch:
-    """Judges recordings of an arm, and warns at the end of each stretch of actions.
+    """Checks recordings of an arm, and warns at the end of each sequence of actions.
 
-    LeRobot stamps frames with their number over the rate, whenever they were recorded: where
-    actions came late, the arm seems to have moved faster than it did. LeRobot reports neither
-    that it records nor the end of an episode, so a stretch ends with a pause, with the robot's
-    next episode, or when it is disconnected.
+    LeRobot stamps each frame with its number divided by the rate, not with the time of its
+    recording: if actions came late, the arm seems to have moved faster than it did. LeRobot
+    does not report when it records, nor when an episode ends. So a sequence ends with a pause,
+    with the next reset of the scene, or when the robot is disconnected.
     """
 
     def __init__(
@@ -113,8 +114,8 @@ class LoopWatch:
 
         Args:
             name: Name of the robot, for the warning.
-            fps: Actions a second that there should be.
-            clock: Seconds.
+            fps: Nominal actions a second.
+            clock: Function that returns the time [s].
             chain: Kinematics of the arm, for checking joint limits; None skips this check.
             in_real_time: True if the arm keeps moving while the loop is late.
         """
@@ -139,7 +140,7 @@ class LoopWatch:
             self._quality.add(now, state.time, q, width, touching)
 
     def end(self) -> None:
-        """Report doubts about the actions since the last end."""
+        """Warn of problems with the actions since the last call."""
         late, actions = self._quality.late(LATE), len(self._quality.arrivals)
         if self._in_real_time and len(late) > TOLERATED * actions:
             logger.warning(
@@ -209,9 +210,9 @@ class ArmRobotConfig(ValuesConfig, RobotConfig):
 class ArmRobot(Device, Robot):
     """Arm commanded by joint positions or by the pose of its end effector.
 
-    Actions of either space are accepted, and values that an action omits are kept, so that
+    Actions of either space are accepted, and the gripper's opening may be omitted. So
     lerobot-rollout can also return the arm to its first position. Motions respect the joint
-    limits only; `send_action` returns what was commanded.
+    limits only; `send_action` returns the commanded values.
 
     With a person (`ArmRobotConfig.person`) actions command the end effector only, while the
     person guides the body (`ComplementaryMotion`).
@@ -328,7 +329,7 @@ class ArmRobot(Device, Robot):
     @property
     @abstractmethod
     def arm(self) -> Arm:
-        """The arm, to be read."""
+        """Driver of the arm, for reading it."""
 
     @abstractmethod
     def _command(
@@ -348,7 +349,7 @@ class ArmRobot(Device, Robot):
 
     @property
     def world(self) -> World | None:
-        """The simulated world that it is in; None for a real one."""
+        """Simulated world of the arm; None for a real arm."""
         return None
 
     @check_if_not_connected
@@ -385,7 +386,7 @@ class ArmRobot(Device, Robot):
         joints: Float[np.ndarray, " joints"],
         width: float,
     ) -> tuple[Float[np.ndarray, " joints"], float]:
-        """Joints and gripper with the person's motion of the body."""
+        """Joint positions and gripper opening, with the person's motion of the body added."""
         from hrc_learn.skills.arm_motion import joints_near
 
         with torch.inference_mode():

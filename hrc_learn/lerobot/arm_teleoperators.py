@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from hrc_learn.teleoperation.page import Page
 
 
-# How far the positions may be ahead of the arm [rad]: one that is blocked is not wound up.
+# Largest lead of commanded positions over the arm [rad]: prevents windup of a blocked arm.
 _SLACK = 0.05
 
 
 class GuidedRobot:
-    """Turns what a person asks for into positions that an arm is sent to, one after another.
+    """Turns the motion that a person requests into successive actions of an arm.
 
     Attributes:
         robot: Guided robot.
-        initial_configuration: Number of the robot's that it started from.
+        initial_configuration: Number of the robot's initial configuration at the start.
     """
 
     def __init__(self, robot: ArmRobot, human: Human):
@@ -58,11 +58,11 @@ class GuidedRobot:
         return self.robot.read_state()
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
-        """Keep the velocity that the arm should have [rad/s]."""
+        """Store the velocity for the next action [rad/s]."""
         self._velocity = joint_velocity
 
     def next(self) -> tuple[dict[str, float], HumanInput]:
-        """The action that comes next, and what was asked for."""
+        """Next action, and the input of the person."""
         with torch.inference_mode():
             step = self._guided.step()
         here = step.state.joint_position
@@ -95,7 +95,7 @@ class ArmTeleoperator(Device, Teleoperator):
         return {}
 
     def send_feedback(self, feedback: dict[str, object]) -> None:
-        """Nothing is felt."""
+        """Do nothing: there is no haptic feedback."""
 
     def _open(self) -> None:
         """Do nothing: the guided robot is found at the first action."""
@@ -104,7 +104,7 @@ class ArmTeleoperator(Device, Teleoperator):
         self._guided = None
 
     def _guided_robot(self, robot: ArmRobot, human: Callable[[], Human]) -> GuidedRobot:
-        """The guided robot, anew whenever everything has been put in place."""
+        """The guided robot, created again after each reset of the scene."""
         guided, now = self._guided, (robot, robot.initial_configurations)
         if guided is None or (guided.robot, guided.initial_configuration) != now:
             guided = self._guided = GuidedRobot(robot, human())
@@ -118,10 +118,9 @@ class ArmExpertConfig(TeleoperatorConfig):
 
 
 class ArmExpert(ArmTeleoperator):
-    """Shows a `mujoco_arm` its scenario from each initial configuration, then keeps still.
+    """Demonstrates the scenario of a `mujoco_arm` from each initial configuration, then rests.
 
-    The same demonstrations as `hrc record placing` records, with the release of the
-    object, and grasping.
+    Demonstrations of placing are those of `hrc record placing`, plus the release of the object.
     """
 
     config_class = ArmExpertConfig
@@ -145,17 +144,17 @@ class ArmPageConfig(TeleoperatorConfig):
     host: str = "127.0.0.1"
     """Address of the page. Anyone that can reach it can move the arm."""
     port: int | None = None
-    """Port to serve at; the first free one from 8080 on if None."""
+    """Port of the page; None: the first free one from 8080 on."""
 
 
 class ArmPage(ArmTeleoperator):
-    """A person guides the end effector, the elbow and the gripper in a browser.
+    """Browser page on which a person guides the end effector, the elbow and the gripper.
 
-    Shows the arm where the robot reports it, simulated or real. "Home" begins the scenario of a
-    `mujoco_arm` anew; what concerns recording is left to LeRobot.
+    It shows the simulated or real arm as the robot reports it. "Home" restarts the scenario of
+    a `mujoco_arm`; LeRobot controls the recording.
 
     Attributes:
-        page: While connected.
+        page: The page, while connected.
     """
 
     config_class = ArmPageConfig
@@ -170,7 +169,7 @@ class ArmPage(ArmTeleoperator):
 
     def _open(self) -> None:
         arm = panda
-        with suppress(DeviceNotConnectedError):  # which LeRobot may connect later
+        with suppress(DeviceNotConnectedError):  # LeRobot may connect the robot later
             arm = the_robot().work_arm
         self._serve(arm)
 

@@ -24,10 +24,10 @@ MARKER = ("marker.u.pos", "marker.v.pos", "marker.seen.pos")
 OBJECT = tuple(f"object.{axis}.pos" for axis in ("x", "y", "z", "wx", "wy", "wz"))
 
 ActionSpace = Literal["joint", "ee"]
-"""Positions of the joints, or of the end effector; the gripper's opening in either case."""
+"""Joint positions, or pose of the end effector; each with the gripper's opening."""
 
 DOWN = quaternion.log(gripper_down()).numpy()
-"""Rotation vector of a gripper that points down, the reference for choosing the signs of others
+"""Rotation vector of a gripper that points down, the default reference for the signs of others
 [rad].
 """
 
@@ -114,8 +114,8 @@ class ArmValues:
 
         Args:
             state: State of the arm.
-            names: Wanted, of those of this class, `HAND` and `GRIPPER`.
-            near: Rotation vector of the end effector before [rad].
+            names: Names of the wanted values: those of this class, `HAND` and `GRIPPER`.
+            near: Previous rotation vector of the end effector [rad].
         """
         q = state.joint_position
         values = dict(zip(self.joints, q.tolist(), strict=True))

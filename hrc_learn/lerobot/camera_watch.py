@@ -1,9 +1,9 @@
-"""Notices in a rollout of any policy that the camera was moved since the demonstrations.
+"""Detection of a camera that was moved since the demonstrations, in rollouts of any policy.
 
-A step of the policy's preprocessor: it compares where the marker of the tool is seen with where
-the demonstrations say it must be (`CameraWatch`), and warns. Where that is wanted, it corrects
-the pixels that the policy sees to what they were if the camera still stood there
-(`CameraCorrection`). Actions are left as they are.
+A step of the policy's preprocessor compares the pixel of the tool's marker with the one that
+the demonstrations predict (`CameraWatch`), and warns if the camera has moved. On request, it
+also corrects the pixels that the policy receives to those that the camera would see from its
+old pose (`CameraCorrection`). Actions are not changed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ CAMERA_WATCH = "hrc_learn_camera_watch"
 @ProcessorStepRegistry.register(CAMERA_WATCH)
 @dataclass
 class CameraWatchStep(ProcessorStep):
-    """Warns once an episode when the camera does not stand where it stood.
+    """Warns once per episode if the camera has moved since the demonstrations.
 
     Belongs at the beginning of the preprocessor, where state and pixel have their units.
     """
@@ -61,10 +61,10 @@ class CameraWatchStep(ProcessorStep):
     object_columns: list[int] | None = None
     """Indices of `PIXELS` in the state, which are corrected too; None: there are none."""
     object_height: float = 0.0
-    """Height of the plane on which the object lies, by `jacobian.object_height` [m]."""
+    """Height of the plane on which the object lies, from `jacobian.object_height` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
-    """Latest detection, of this episode unless it is corrected; None: the camera has not moved.
-    """
+    """Latest detected motion of the camera; None: none. `reset` clears it unless pixels are
+    corrected."""
 
     def __post_init__(self) -> None:
         if not self.fps > 0:
@@ -100,7 +100,7 @@ class CameraWatchStep(ProcessorStep):
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
     def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
-        """Position of the tool, if its marker is visible."""
+        """Pose of the tool if its marker is visible; the watch is updated with the marker."""
         vector = state[self.pose_columns]
         if marker[2] < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
             return None
@@ -108,7 +108,7 @@ class CameraWatchStep(ProcessorStep):
         seen = self._watch.update(self._calls / self.fps, pose, marker[:2])
         if seen is not None:
             if self.correct:
-                logging.warning("%s since the demonstrations: what it sees is corrected.", seen)
+                logging.warning("%s since the demonstrations: its pixels are corrected.", seen)
             elif self.motion is None:
                 logging.warning(
                     "%s since the demonstrations: move it back, or record and fit again.", seen
@@ -145,16 +145,17 @@ def add_camera_watch(
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
         dataset: Training data, with the tool's pose and its marker's pixel in every frame.
         image_size: Width and height of the camera's images [px].
-        correct: True if pixels of the marker, and of an object that was seen before the tool
-            came and is taken where the tool is lowest, are corrected as well.
+        correct: True to correct the pixels of the marker, and of an object if there is one. The
+            object's pixel must be known in the first frame of each episode, and the tool must
+            be lowest where it takes the object.
 
     Returns:
         Reference of the camera in the demonstrations.
 
     Raises:
         FileNotFoundError: The folder holds no preprocessor.
-        ValueError: The dataset lacks a column; names it. Or the object was not taken from
-            where it was seen.
+        ValueError: The dataset lacks a column, which the message names, or the object was not
+            taken from where it was seen.
     """
     path = checkpoint / PREPROCESSOR
     content = read_pipeline(path, without=(CAMERA_WATCH,))

@@ -1,6 +1,6 @@
 """Real arms as LeRobot robots: a Panda at its control box, and an arm over topics of ROS 2.
 
-Run against simulators of the Panda's network protocol and, over real middleware, against our
+Tested with simulators of the Panda's network protocol and, over real ROS 2 middleware, with our
 simulated arm; NOT RUN ON HARDWARE.
 """
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from hrc_learn.skills.arm_motion import PositionServo
 
 
-# From reading the joints to the arm following [s], as `Imperfections.nominal()`. Measured with
-# franky against simulators: 2 ms from a command to the servos; the rest is for the network, the
-# scheduling and what computing a step takes, which no simulator has.
+# Time from reading the joints until the arm follows [s], as in `Imperfections.nominal()`. With
+# franky and simulators, a command took 2 ms to the servos; the rest allows for the network, the
+# scheduling and the computation of a step, which simulators do not include.
 _DELAY = 0.030
 
 
@@ -48,7 +48,7 @@ class DrivenArmConfig(ArmRobotConfig):
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     """Cameras of LeRobot, by name."""
     dynamics: float = 0.3
-    """Fraction of the acceleration of the arm that is used."""
+    """Fraction of the arm's acceleration limits that is used."""
     timeout: float = 0.15
     """Longest time without an action, after which the arm is stopped [s]."""
 
@@ -61,7 +61,9 @@ class DrivenArmConfig(ArmRobotConfig):
                 "person.kind: a script pushes simulated arms only, not a real one."
             )
         if self.person.worker:
-            raise ValueError("person.worker: workers are simulated beside simulated arms only.")
+            raise ValueError(
+                "person.worker: a worker can be simulated near simulated arms only."
+            )
         if not self.timeout > 1.5 / self.fps:
             raise ValueError(
                 f"timeout must be longer than an action and a half at {self.fps:g} fps, but is "
@@ -72,9 +74,9 @@ class DrivenArmConfig(ArmRobotConfig):
 class DrivenArm(ArmRobot):
     """An arm commanded by positions, through a driver that takes velocities.
 
-    Between an action and the arm stand, in this order: the limits of the joints' motion
-    (`MotionFilter`), the safety filter with a cap on the speed of the tool, a watchdog that
-    stops the arm when the loop falls silent, in a process of its own with the driver, and the
+    An action passes four stages on its way to the arm: `MotionFilter`, with the limits of the
+    joints' motion; the safety filter, with a cap on the speed of the tool; a watchdog that
+    stops the arm if the loop falls silent, in a separate process with the driver; and the
     driver, which ends every velocity by itself. Keep the stop button in hand.
 
     Attributes:
@@ -109,7 +111,7 @@ class DrivenArm(ArmRobot):
 
     @abstractmethod
     def _driver(self) -> Callable[[], StoppableArm]:
-        """Function that connects to the arm, which its process calls."""
+        """Function that connects to the arm; the driver's process calls it."""
 
     def _open(self) -> None:
         from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
@@ -189,7 +191,7 @@ class Ros2ArmRobotConfig(DrivenArmConfig):
     """An arm with the topics of stock controllers; `--robot.type=ros2`."""
 
     arm: str = "/robot_description"
-    """Topic of the arm's description, registered name, or FILE:TIP."""
+    """Topic of the arm's description, registered name of the arm, or FILE:TIP."""
     topics: Ros2Config = field(default_factory=Ros2Config)
     """Topics of the arm."""
 
@@ -211,7 +213,7 @@ class Ros2ArmRobot(DrivenArm):
 @CameraConfig.register_subclass("ros2")
 @dataclass(kw_only=True)
 class Ros2CameraConfig(CameraConfig):
-    """Images of a topic; give width and height as it publishes them."""
+    """Camera of an image topic; width and height must be those of the published images."""
 
     topic: str
     """Topic of raw or, if it ends in /compressed, of compressed images."""
@@ -226,7 +228,7 @@ class Ros2CameraConfig(CameraConfig):
 
 
 class Ros2Camera(Camera):
-    """A camera of an image topic."""
+    """Camera that reads an image topic."""
 
     def __init__(self, config: Ros2CameraConfig):
         super().__init__(config)
@@ -246,7 +248,7 @@ class Ros2Camera(Camera):
         """Wait for the first image.
 
         Raises:
-            ConnectionError: None comes, or of another size.
+            ConnectionError: No image comes, or its size is not the configured one.
         """
         from sensor_msgs.msg import CompressedImage, Image
 
@@ -258,7 +260,7 @@ class Ros2Camera(Camera):
         if shape != wanted:
             self.disconnect()
             text = f"camera {topic} publishes {shape[1]}x{shape[0]}"
-            raise ConnectionError(f"{text}, not {self.width}x{self.height}: say so.")
+            raise ConnectionError(f"{text}, not {self.width}x{self.height}: set that size.")
 
     def _take(self, message: Any) -> None:
         from hrc_learn.demos.recording_messages import image_of
@@ -272,7 +274,7 @@ class Ros2Camera(Camera):
         """The next image, RGB.
 
         Raises:
-            ConnectionError: None has come within the timeout.
+            ConnectionError: No image has come within the timeout.
         """
         return self.async_read(1e3 * self.config.timeout)
 
@@ -289,7 +291,7 @@ class Ros2Camera(Camera):
         """The newest image, RGB.
 
         Raises:
-            ConnectionError: It is older than the given age [ms].
+            ConnectionError: The newest image is older than the given age [ms].
         """
         age = time.monotonic() - self._taken_at
         if self._image is None or age > max_age_ms / 1e3:

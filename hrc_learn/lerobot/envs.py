@@ -58,7 +58,7 @@ class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
             self.features_map[f"pixels/{CAMERA}"] = f"{OBS_IMAGES}.{CAMERA}"
 
     def robot_config(self) -> MujocoArmRobotConfig:
-        """Settings of the robot in it."""
+        """Settings of the environment's robot."""
         shared = [f.name for f in (*fields(WorkplaceConfig), *fields(ValuesConfig))]
         return MujocoArmRobotConfig(
             scenario=self.task or "placing",
@@ -86,9 +86,9 @@ _STEADY = 0.3
 
 
 class ArmEnv(gym.Env):
-    """The job is done, and the episode over, once MuJoCo's contacts say so for a while.
+    """Environment whose episodes end once MuJoCo's contacts show that the task stays done.
 
-    The same seed and actions lead to the same end.
+    The same seed and actions lead to the same result.
     """
 
     def __init__(self, config: MujocoArmRobotConfig):
@@ -119,7 +119,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin as a seed has it, or as the next random number."""
+        """Begin the episode of a seed; None: of the next random number."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
@@ -130,7 +130,7 @@ class ArmEnv(gym.Env):
     def step(
         self, action: Float[np.ndarray, " values"]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Send an action, and let 1/fps pass. The reward is one for a job done."""
+        """Send an action, and let 1/fps pass. The reward is 1 once the task is done, else 0."""
         self._robot.send_action(
             dict(zip(self._actions, np.asarray(action).tolist(), strict=True))
         )
@@ -145,7 +145,7 @@ class ArmEnv(gym.Env):
         return self._view.read()
 
     def close(self) -> None:
-        """Let go of the robot."""
+        """Disconnect the robot."""
         if self._robot.is_connected:
             self._robot.disconnect()
 

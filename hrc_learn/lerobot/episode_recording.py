@@ -1,4 +1,4 @@
-"""Episodes in simulated time: of the scripted expert, and of a policy.
+"""Recording of episodes in simulated time, of the scripted expert or a policy.
 
 LeRobot's own commands use the wall clock, and cannot record the person's input.
 """
@@ -66,7 +66,7 @@ def add_frame(
     action: Mapping[str, float],
     task: str,
 ) -> None:
-    """Add an observation and the action sent then to the dataset's buffer."""
+    """Add an observation, and the action sent in response to it, to the dataset's buffer."""
     dataset.add_frame(
         {
             **build_dataset_frame(dataset.features, dict(observation), prefix=OBS_STR),
@@ -81,8 +81,8 @@ def record_expert(
 ) -> Iterator[tuple[int, bool]]:
     """Record demonstrations of the scripted expert, as lerobot-record would.
 
-    Every episode ends with its scenario, however busy the machine is. Failed ones are
-    discarded and repeated from the next seed.
+    Every episode covers its whole scenario, however busy the machine is. A failed episode is
+    discarded, and another one is recorded from the next seed.
 
     Args:
         folder: Folder of the new dataset; must not exist.
@@ -143,7 +143,7 @@ class CheckpointPolicy:
 
         Args:
             folder: `pretrained_model` of a checkpoint.
-            robot: Robot with the observations and actions that the policy knows.
+            robot: Robot with the observations and actions for which the policy was trained.
 
         Raises:
             FileNotFoundError: There is no checkpoint.
@@ -159,7 +159,7 @@ class CheckpointPolicy:
             self._policy.config, pretrained_path=str(folder)
         )
         self._device = torch.device(config.device or "cpu")
-        # As in lerobot-rollout a policy sees nothing of what concerns the person.
+        # As in lerobot-rollout, the policy does not receive the person's values.
         features = observation_features(robot)
         self._features = {key: f for key, f in features.items() if key not in COLUMNS}
         self._actions = tuple(robot.action_features)
@@ -184,7 +184,7 @@ def roll_out(
     """Roll a policy out once in the scenario of a simulated robot.
 
     Args:
-        robot: Connected.
+        robot: Connected robot.
         policy: The policy.
         seed: Seed of the initial configuration, and of the person's pulls.
 

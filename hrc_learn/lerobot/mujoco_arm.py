@@ -116,7 +116,7 @@ class MujocoArmRobotConfig(WorkplaceConfig, ArmRobotConfig):
                 raise ValueError(f"{name} must not be negative.")
 
     def work_arm(self) -> ArmModel:
-        """The arm with our hand on it.
+        """The arm with the two-finger hand of our work cell.
 
         Raises:
             ValueError: There is no such arm, or it cannot do the work.
@@ -130,12 +130,12 @@ CAMERA = "front"
 class MujocoArmRobot(ArmRobot):
     """An arm in our MuJoCo workplace, for lerobot-record, -replay, -teleoperate, -rollout.
 
-    A dataset's robot type says which: `mujoco_panda`, `mujoco_ur5e`, ... The workplace is laid
-    out for the arm's reach. Simulated time passes by 1/fps with every action, whatever the
-    clock says: a loop that is late records the same frames, only later.
+    The robot type in a dataset names the arm: `mujoco_panda`, `mujoco_ur5e`, ... The workplace
+    is laid out for the arm's reach. Every action advances simulated time by 1/fps, whatever the
+    wall clock shows: a loop that is late records the same frames, only later.
 
     Attributes:
-        run: The scenario under way, while connected.
+        run: Present run of the scenario, while connected.
     """
 
     config_class = MujocoArmRobotConfig
@@ -194,7 +194,7 @@ class MujocoArmRobot(ArmRobot):
         self._pull_from(self.run.seed)
 
     def _pull_from(self, seed: int) -> None:
-        """Let a scripted person pull as drawn from a seed."""
+        """Draw the pulls of a scripted person from a seed."""
         if self.complement is not None and self.config.person.kind == "scripted":
             self.complement.human = scripted_person(self.work_arm.chain, seed)
 
@@ -241,7 +241,7 @@ class MujocoArmRobot(ArmRobot):
         return values
 
     def _look_at_marker(self) -> tuple[float, float, float]:
-        """Pixel of the marker, or the last one, and 1 while it is visible, else 0."""
+        """Pixel of the marker, and 1; if it is hidden, its last pixel, and 0."""
         pixel = self.run.tool_pixel()
         u, v = self._marker[:2] if pixel is None else pixel.tolist()
         self._marker = (u, v, float(pixel is not None))
@@ -250,9 +250,9 @@ class MujocoArmRobot(ArmRobot):
     def _begin_anew_in_time(self) -> None:
         """Start the scenario again when the recorder starts its next episode.
 
-        The recorder ends an episode at the first frame that would be late, and saving takes
-        longer than a frame. The threshold allows this much for a last frame, however busy the
-        machine is.
+        The recorder ends an episode at the first frame after its time, and saving takes longer
+        than a frame. The threshold lies one frame after the end, so that a last frame still
+        belongs to its episode, however busy the machine is.
         """
         now, length = time.monotonic(), self.config.episode_time
         if not self.run.commands:

@@ -1,4 +1,4 @@
-"""Person near a LeRobot robot: guides its body while actions command the end effector."""
+"""Person that guides the body of a LeRobot robot while actions command its end effector."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     from hrc_learn.teleoperation import ScriptedForce
 
 PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
-"""No person, a script that pulls the elbow at random moments of a simulation, or the device of
-a real one. Gamepad and keyboard guide the elbow here instead of the end effector."""
+"""No person, a script that pulls the elbow at random moments of a simulation, or the input
+device of a real person. Gamepad and keyboard guide the elbow here, not the end effector."""
 
 
 def nullspace_inputs(chain: SerialChain) -> tuple[str, ...]:
-    """Names of what the person asks of the joints [N m]."""
+    """Names of the person's null-space efforts on the joints [N m]."""
     return tuple(f"{name}.human_torque" for name in chain.joint_names)
 
 
 def offsets(chain: SerialChain) -> tuple[str, ...]:
-    """Names of how far the joints are from where the actions have them [rad]."""
+    """Names of the joints' displacements from the positions that actions command [rad]."""
     return tuple(f"{name}.pushed_aside" for name in chain.joint_names)
 
 
 COLUMNS = {"observation.human_effort": nullspace_inputs, "observation.pushed_aside": offsets}
-"""Columns of their own, with the names of their values, where those are to be had."""
+"""Dataset columns for the person's values, with the functions that name the components."""
 
 
 @dataclass
@@ -55,16 +55,16 @@ class PersonConfig:
     host: str = "127.0.0.1"
     """Address of the page. Anyone that can reach it can move the arm."""
     port: int | None = None
-    """Port to serve it at; the first free one from 8080 on if None."""
+    """Port of the page; None: the first free one from 8080 on."""
     worker: bool = False
-    """Simulate a worker who comes to the table, before whom the arm slows down and waits."""
+    """Simulate a worker at the table, near whom the arm slows down and waits."""
     mode: PersonMode = "ssm"
     """Reaction to the worker: separation monitoring ("ssm"), force limiting ("pfl"), or both
     ("ssm+pfl").
     """
 
     def names(self, chain: SerialChain) -> tuple[str, ...]:
-        """Units of the values observed of a person near an arm."""
+        """Names of the values observed of the person."""
         if not self.record or self.kind == "none":
             return ()
         return (*nullspace_inputs(chain), *offsets(chain))
@@ -74,25 +74,25 @@ def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
     """Pulls of the scripted person, drawn from a seed."""
     from hrc_learn.teleoperation import random_pulls
 
-    # Drawn apart, so that runs with and without pulls are alike but for them.
+    # A separate generator keeps everything but the pulls alike in runs with and without them.
     return random_pulls(np.random.default_rng([seed, 1]))
 
 
 class RobotPage:
-    """Serves a page, and shows a robot on it: a simulated one with all that is around it.
+    """Serves a page that shows a robot; a simulated robot is shown with its surroundings.
 
     Attributes:
-        page: Served until it is closed.
+        page: The page, served until `close`.
     """
 
     def __init__(
         self, arm: Arm, host: str, port: int | None, note: str, *, guides: bool = True
     ):
-        """Serve it.
+        """Serve the page.
 
         Args:
             arm: Arm to show.
-            host: Address to serve at.
+            host: Address of the page.
             port: Port of the page; None: the first free one from 8080 on.
             note: Text shown on the page.
             guides: True if the person also guides the end effector, and not the body only.
@@ -120,12 +120,12 @@ class RobotPage:
         self.page.place(world)
 
     def close(self) -> None:
-        """Serve it no more."""
+        """Stop serving the page."""
         self._served.close()
 
 
 def open_device(config: PersonConfig, arm: Arm) -> tuple[Human, RobotPage | None]:
-    """Input device of a person, and the page that shows them the arm, if it is one.
+    """Input device of a person, and its page if the device is a page.
 
     Args:
         config: Kind of the device, and address of the page.

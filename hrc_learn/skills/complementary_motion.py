@@ -46,7 +46,7 @@ _ROUNDING = 1e-3
 
 
 class ComplementaryMotion:
-    """Joint positions whose end effector follows a policy, and whose null space a person.
+    """Joint positions from a policy for the end effector and a person for the null space.
 
     The policy requests joint positions, its posture. Without a push, they are passed on
     unchanged. While a person pushes the joints aside, the end effector stays where the policy's

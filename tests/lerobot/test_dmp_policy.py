@@ -255,7 +255,7 @@ def test_a_dataset_on_disk_is_fitted_by_its_episodes(tmp_path, caplog):
     torch.testing.assert_close(played(policy, shown[1]), played(like, shown[1]))
     # Of a dataset that is streamed nothing lies on disk.
     DMPPolicy(config, dataset_stats=stats, dataset_meta=SimpleNamespace(root=tmp_path, fps=FPS))
-    assert "training starts from standing still" in caplog.text
+    assert "training starts from a resting arm" in caplog.text
 
 
 def test_tuning_for_other_actions_or_rates_is_refused(tmp_path):
@@ -273,7 +273,7 @@ def test_tuning_for_other_actions_or_rates_is_refused(tmp_path):
     ("changes", "message"),
     [
         ({"fps": None}, "how many actions a second"),
-        ({"input_features": {}}, "something to see"),
+        ({"input_features": {}}, "needs an input"),
         ({"output_features": {}}, "'action' among its outputs"),
         ({"n_action_steps": 11}, "1 to chunk_size"),
         ({"n_obs_steps": 2}, "sees one step"),

@@ -1,4 +1,4 @@
-"""Actions as coordinates in which they move linearly, and what their columns mean."""
+"""Encoding of actions as coordinates without jumps, and the meaning of their columns."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,16 @@ from hrc_learn.dmp import orientation_error
 from hrc_learn.geometry import quaternion
 
 SMALLEST_SPREAD = 1e-3
-"""Components that vary by less are not blown up to a spread of one."""
+"""Smallest divisor: components that vary by less are not amplified to a spread of one."""
 
 
 class ActionEncoding(nn.Module):
     """Actions as coordinates of mean zero and spread one, and back.
 
-    A rotation vector becomes the error e = log(r conj(q)) to a reference r, in which an
-    orientation moves linearly (see `hrc_learn/dmp/orientation_error.py`), r being the mean
-    orientation of the demonstrations. So nothing jumps where a rotation vector does, at half a
-    turn, which is where a gripper that points down is.
+    A rotation vector becomes the error e = log(r conj(q)) to a reference r, the mean
+    orientation of the demonstrations; orientations are interpolated linearly in e (see
+    `hrc_learn/dmp/orientation_error.py`). So coordinates do not jump where a rotation vector
+    does, at half a turn, which is the orientation of a gripper that points down.
     """
 
     mean: Tensor
@@ -28,11 +28,11 @@ class ActionEncoding(nn.Module):
     """Unit quaternions (w, x, y, z), one for each rotation vector."""
 
     def __init__(self, width: int, triples: Sequence[Sequence[int]]):
-        """Identity, until it has learned.
+        """Start with a mean of zero, a spread of one and references without rotation.
 
         Args:
-            width: A, components of an action.
-            triples: Those that make up rotation vectors [rad].
+            width: A, number of components of an action.
+            triples: Indices of the three components of each rotation vector [rad].
         """
         super().__init__()
         self.triples = [list(triple) for triple in triples]
@@ -44,13 +44,13 @@ class ActionEncoding(nn.Module):
     def to_coordinates(
         self, actions: Float[Tensor, "*batch T A"]
     ) -> Float[Tensor, "*batch T A"]:
-        """Coordinates of actions along time."""
+        """Coordinates of successive actions."""
         return (self._unrolled(actions) - self.mean) / self.std
 
     def to_actions(
         self, coordinates: Float[Tensor, "*batch T A"]
     ) -> Float[Tensor, "*batch T A"]:
-        """Actions again; rotation vectors are the ones nearest to the reference's."""
+        """Actions of coordinates; rotation vectors are those nearest to the reference's."""
         actions = coordinates * self.std + self.mean
         for triple, reference in zip(self.triples, self.reference, strict=True):
             q = orientation_error.to_orientation(actions[..., triple], reference)
@@ -65,7 +65,7 @@ class ActionEncoding(nn.Module):
         """Take mean, spread and references from demonstrated actions.
 
         Raises:
-            ValueError: Orientations more than half a turn away from their mean.
+            ValueError: An orientation is more than half a turn away from the mean.
         """
         for k, triple in enumerate(self.triples):
             q = quaternion.exp(torch.cat([e[:, triple] for e in episodes]))
@@ -82,7 +82,7 @@ class ActionEncoding(nn.Module):
         self.whiten(*torch.std_mean(torch.cat(unrolled), dim=0))
 
     def whiten(self, std: Float[Tensor, "A"], mean: Float[Tensor, "A"]) -> None:
-        """Take these for spread and mean of what is to be whitened."""
+        """Set the spread and the mean for whitening."""
         self.mean.copy_(mean)
         self.std.copy_(std.clamp_min(SMALLEST_SPREAD))
 
@@ -99,12 +99,12 @@ def _replaced(values: Tensor, columns: list[int], new: Tensor) -> Tensor:
     return values.index_copy(-1, index, new.to(values))
 
 
-# Which components of action and state belong together, by their names.
+# Components of action and state that belong together, by their names.
 
 ROTATION = ("wx", "wy", "wz")
 """Last part of the names of a rotation vector's components, as LeRobot has them."""
 ENDINGS = ("", ".pos")
-"""Possible endings of names: lerobot-rollout only passes on names with one."""
+"""Possible endings of names; lerobot-rollout drops names without an ending."""
 
 
 def rotation_triples(names: Sequence[str] | None) -> list[list[int]]:
@@ -131,8 +131,8 @@ def matched_columns(
 ) -> list[int]:
     """State columns that measure each component of the action; -1: not measured.
 
-    If neither has names and their widths agree, states are taken for measured actions. A
-    rotation vector is measured whole or not at all.
+    If neither has names and their widths agree, the state counts as the measured action. A
+    rotation vector counts as measured only if all its components are.
 
     Args:
         action_names: Names of the action's components; None: unknown.
@@ -153,13 +153,13 @@ def matched_columns(
 
 TWO_LEVEL = 0.9
 """Fraction of the largest variance possible between minimum and maximum (Bhatia and Davis 2000,
-"A better bound on the variance") from which a column counts as two-level: 1 if it only takes
-its extremes.
+"A better bound on the variance") from which a column counts as two-level. The fraction is 1 for
+a column that only takes its extremes.
 """
 
 
 def two_level_columns(mean: Tensor, std: Tensor, low: Tensor, high: Tensor) -> list[int]:
-    """Columns that are at their least or their largest value, such as a gripper's.
+    """Columns that are mostly at their minimum or maximum, such as a gripper's.
 
     Args:
         mean: Mean of each column, (A).

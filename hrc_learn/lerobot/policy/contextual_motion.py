@@ -1,4 +1,4 @@
-"""Movement primitives as a function of what is seen, and their fit in closed form."""
+"""Movement primitives as a function of the observation, and their fit in closed form."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class Primitives:
     weights: Float[Tensor, "*batch A N"]
     start: Float[Tensor, "*batch A"]
     start_velocity: Float[Tensor, "*batch A"]
-    """Per second."""
+    """[1/s]"""
     goal: Float[Tensor, "*batch A"]
     duration: Float[Tensor, "*batch"]
     """[s]"""
@@ -36,29 +36,29 @@ class Primitives:
 
 
 class ContextualMotion(nn.Module):
-    """Primitives as a function of what is seen.
+    """Primitives as a function of the observation.
 
     x = a + B c + r(features, phase),   x = (weights, y_0', y_0, g) of each coordinate, log tau
 
-    The context c is what was measured at the start of the episode. a and B come from a fit in
-    closed form (see `closed_form.py`), and the network r starts at zero: so the policy works
-    before the first gradient, and learns what is left. Weights count in units of the spring's
-    stiffness, where they are as large as the motion.
+    The context c holds the numbers measured at the start of the episode. a and B come from a
+    fit in closed form (`fit_closed_form`), and the network r starts at zero. So the policy
+    works before any training, and training learns the residual. Weights are in units of the
+    spring's stiffness, in which they are as large as the motion.
     """
 
     centre: Tensor
-    """Context of base."""
+    """Context at which the primitives are `base`."""
     low: Tensor
     high: Tensor
 
     def __init__(
         self, response: Response, width: int, context: int, features: int, hidden: int
     ):
-        """Make one that stands still.
+        """Start with a motion that stands still.
 
         Args:
             response: Response of the primitives.
-            width: A, their coordinates.
+            width: A, number of coordinates.
             context: C, length of the context.
             features: Features of the first and the current observation together.
             hidden: Width of the network.
@@ -90,12 +90,12 @@ class ContextualMotion(nn.Module):
         features: Float[Tensor, "B F"],
         elapsed: Float[Tensor, "B"],
     ) -> Primitives:
-        """Primitives for what is seen.
+        """Primitives for an observation.
 
         Args:
             context: Numbers of the first observation.
             features: Features of the first and the current observation.
-            elapsed: Since the start of the episode [s].
+            elapsed: Time since the start of the episode [s].
         """
         # Linear extrapolation outside the demonstrations is unbounded.
         c = torch.minimum(torch.maximum(context, self.low), self.high) - self.centre
@@ -107,7 +107,7 @@ class ContextualMotion(nn.Module):
         )
 
     def primitives(self, x: Float[Tensor, "*batch K"]) -> Primitives:
-        """Encoding of the coordinates."""
+        """Primitives from x (see the class)."""
         per_coordinate = x[..., :-1].unflatten(-1, (self.width, -1))
         duration = self._duration(x)
         return Primitives(
@@ -130,7 +130,7 @@ FEWEST = 4
 SMALLEST_VARIATION = 0.05
 """Fraction of its spread by which a context value must vary between demonstrations."""
 MARGIN = 0.5
-"""Fraction of the demonstrated range by which contexts may lie outside."""
+"""Fraction of the demonstrated range by which contexts may lie outside it."""
 
 
 @torch.no_grad()
@@ -148,12 +148,12 @@ def fit_closed_form(
     Args:
         motion: Changed in place.
         demonstrations: Coordinates frame by frame.
-        contexts: Whitened context of each.
+        contexts: Whitened context of each demonstration.
         fps: Frames a second.
 
     Returns:
-        Root mean square error of the motions of demonstrations left out, in the spread of the
-        coordinates; NaN for a single demonstration.
+        Root mean square error of the motions of left-out demonstrations, relative to the spread
+        of the coordinates; NaN for a single demonstration.
     """
     x, c, n = _fit_each(motion.response, demonstrations, fps), contexts.double(), len(contexts)
     left_out = (x - x.mean(0)) * n / (n - 1) if n > 1 else x * torch.nan

@@ -1,4 +1,4 @@
-"""The policy `dmp`: one movement primitive an episode; with its checkpoint without training.
+"""The policy `dmp`, one movement primitive per episode, and its checkpoint without training.
 
 LeRobot finds policy and processors in the module of the configuration.
 """
@@ -34,7 +34,7 @@ __all__ = ["DMPConfig", "DMPPolicy", "make_dmp_pre_post_processors", "write_clos
 logger = logging.getLogger(__name__)
 
 EARLIEST = -1_000_000
-"""Offset [frames] at which LeRobot, as it stays within the episode, takes its first frame."""
+"""Offset [frames] for which LeRobot, which stays within the episode, loads the first frame."""
 
 
 @PreTrainedConfig.register_subclass("dmp")
@@ -60,7 +60,7 @@ class DMPConfig(MotionPolicyConfig):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Underway:
-    """Motion of an episode at a state of it, in the coordinates of the primitives."""
+    """State of an episode's motion at one time, in the coordinates of the primitives."""
 
     context: Float[Tensor, "B C"]
     """Numbers of the first observation, whitened."""
@@ -97,19 +97,19 @@ class DMPPolicy(MotionPolicy):
         dataset_meta: Any = None,
         **_: Any,
     ):
-        """Build the policy and, of a dataset, fit it in closed form.
+        """Build the policy and, given a dataset, fit it in closed form.
 
-        A policy that is loaded takes what it was trained with from its checkpoint.
+        A loaded policy takes its statistics and weights from the checkpoint instead.
 
         Args:
             config: Configuration with known features.
-            dataset_stats: Statistics that numbers are whitened by.
-            dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from, and the
-                demonstrations where they lie on disk.
+            dataset_stats: Statistics for whitening the numbers.
+            dataset_meta: `LeRobotDatasetMetadata` with the frame rate and, if the dataset is on
+                disk, the folder of the demonstrations.
 
         Raises:
-            ValueError: Features that the policy cannot work with, a frame rate that is unknown
-                or another one, or demonstrations that cannot be fitted.
+            ValueError: The policy cannot work with the features, the frame rate is unknown or
+                differs from the dataset's, or the demonstrations cannot be fitted.
         """
         super().__init__(config, dataset_meta)
         self.motion = ContextualMotion(
@@ -127,7 +127,7 @@ class DMPPolicy(MotionPolicy):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the motion that is under way: an episode begins."""
+        """Forget the present motion: an episode begins."""
         self._underway: Underway | None = None
         self._action_queue: deque[Tensor] = deque()
 
@@ -148,16 +148,16 @@ class DMPPolicy(MotionPolicy):
     def forward(
         self, batch: dict[str, Any], reduction: str = "mean"
     ) -> tuple[Tensor, dict[str, float]]:
-        """Mean square error of chunks, in the spread of each component of the action.
+        """Mean square error of chunks, relative to the spread of each component of the action.
 
         Actions after the end of an episode do not count. Chunks start from the policy's own
-        motion, as in execution: the noise of a demonstration has no valid velocity.
+        motion, as in execution: a noisy demonstration gives no valid velocity.
 
         Args:
             batch: Batch as LeRobot loads it by the config's delta indices: observations (B, 2,
                 ...), the first of the episode and the current one, `action` (B, chunk, A),
                 `action_is_pad` and `timestamp`.
-            reduction: "none" for one loss each, (B), else their mean.
+            reduction: "none" for the loss of each sample, (B); else their mean.
 
         Returns:
             The loss, and the root mean square error of the actions present.
@@ -180,7 +180,7 @@ class DMPPolicy(MotionPolicy):
         present = ~batch[f"{ACTION}_is_pad"]
         square = difference.square().mean(-1) * present
         rmse = {"rmse": float((square.detach().sum() / present.sum()).sqrt())}
-        # By chunks, not by the actions present: so batches of several processes average alike.
+        # Mean over chunks, not over the actions present: processes then average correctly.
         each = square.mean(-1)
         return (each if reduction == "none" else each.mean()), rmse
 
@@ -188,9 +188,9 @@ class DMPPolicy(MotionPolicy):
     def predict_action_chunk(
         self, batch: dict[str, Any], **_: Any
     ) -> Float[Tensor, "B chunk A"]:
-        """The next chunk, of which `n_action_steps` are taken for executed.
+        """The next chunk; its first `n_action_steps` actions count as executed.
 
-        Until `reset`, each call continues where those of the last one end.
+        Until `reset`, each call continues where the executed actions of the last one end.
 
         Args:
             batch: Observations (B, ...).
@@ -221,7 +221,7 @@ class DMPPolicy(MotionPolicy):
         return self._action_queue.popleft()
 
     def begin(self, observation: Observation) -> Underway:
-        """State at the start of an episode: the arm's, as far as it is measured."""
+        """State at the start of an episode: measured positions where known, else predicted."""
         context, features = self.encoder.numbers(observation), self.encoder(observation)
         start = features.new_zeros(len(features))
         primitives = self._primitives(context, features, features, start)
@@ -247,7 +247,7 @@ class DMPPolicy(MotionPolicy):
     def _continued(
         self, underway: Underway, seen: Float[Tensor, "B F"], time: Float[Tensor, "B T"]
     ) -> tuple[Tensor, Tensor]:
-        """Motion after a state of the episode, by what is seen then."""
+        """Motion after a state of the episode, corrected by the features seen then."""
         clock = underway.elapsed + underway.lead
         primitives = self._primitives(underway.context, underway.features, seen, clock)
         duration = primitives.duration.double()
@@ -272,7 +272,7 @@ class DMPPolicy(MotionPolicy):
 def write_closed_form_policy(
     dataset: Path, folder: Path, *, n_basis: int, episodes: Sequence[int] | None = None
 ) -> dict[str, float]:
-    """Fit the policy to a dataset and write what LeRobot loads, trains on and rolls out.
+    """Fit the policy to a dataset, and write a checkpoint that LeRobot can train or roll out.
 
     Images are ignored, because learning from them takes gradients.
 
@@ -283,7 +283,8 @@ def write_closed_form_policy(
         episodes: Episodes to learn from; None: all.
 
     Returns:
-        Number of demonstrations, and the error of those left out, in the spread of the actions.
+        Number of demonstrations, and the cross-validated error relative to the spread of the
+        actions.
 
     Raises:
         ValueError: The dataset cannot be read or holds nothing to learn a policy from.

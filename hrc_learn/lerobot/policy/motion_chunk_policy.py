@@ -38,7 +38,8 @@ from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfi
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
 MEASURED = 0.5
-"""Spreads by which actions may differ from the state of their name to be what it measures."""
+"""Largest root mean square difference between an action and the state of the same name for
+which the state counts as its measurement, in spreads."""
 UNKNOWN = 0.3
 """Fraction of samples trained without the velocity of the state, as after a reset. It also
 keeps policies from relying on their own past motion regardless of observations.
@@ -48,60 +49,63 @@ VELOCITY_WEIGHT = 0.005
 SCORE_WEIGHT = 0.1
 """Weight of the plan scores relative to the plans: a classification learns faster."""
 SAME_WAY = 3.0
-"""Distance from which plans are distinct, relative to the error of the nearest. The mean of
-nearer plans is closer to the demonstration than any of them; the mean of distinct ones is not a
-valid plan. Three quantisation levels of one normal distribution are 2.8 apart (Max 1960,
-"Quantizing for minimum distortion").
+"""Distance from which plans count as distinct, relative to the error of the nearest plan. The
+mean of closer plans is nearer to the demonstration than any of them; the mean of distinct plans
+is not a valid plan. Three quantisation levels of one normal distribution are 2.8 apart (Max
+1960, "Quantizing for minimum distortion").
 """
 LEAST_ERROR = 1e-3
-"""In spreads: where nothing moves there is none, and plans are the same way all the same."""
+"""Smallest value of that error, in spreads: without motion it is zero, but plans must still
+count as the same."""
 FORGETTING = 0.01
 """Decay of that error's running mean at each training step."""
 
 SMALLEST_TURN = 0.05
-"""Spread of orientations, at least [rad]: a hand that points down in all demonstrations
-trembles by 1e-5, and tilts by more as soon as anything differs from what was shown."""
+"""Smallest spread of orientations [rad]: a hand that points down in all demonstrations varies
+by 1e-5 only, but tilts by more as soon as anything differs from the demonstrations."""
 SLOWEST = 0.3
 """Smallest scale of velocities, relative to the median velocity; slower columns are not
 amplified.
 """
 MOST_CHUNKS = 50_000
-"""That say enough of a linear function; more are spread evenly."""
+"""Largest number of chunks in the regression; of more, evenly spaced ones are used."""
 
 
 @PreTrainedConfig.register_subclass("motion_chunk")
 @dataclass
 class MotionChunkConfig(MotionPolicyConfig):
-    """Chunks of actions, each a motion that goes on from what is being carried out."""
+    """Settings of chunks of actions, each of which continues the executed motion."""
 
     n_basis: int | None = None
-    """Basis functions a coordinate and chunk; None: 10, or two for five actions."""
+    """Basis functions per coordinate and chunk; None: 10, or fewer for short chunks: two for
+    each five actions."""
     hidden_dim: int = 256
     """Width of the network."""
     dropout: float = 0.1
     """Dropout probability of hidden features in training."""
     history: int = 2
-    """Frames over which the velocity of observation.state is seen, where every frame is shown
-    (`select_action`); 0: it is not. Training loads a second frame of everything for it."""
+    """Frames over which the velocity of observation.state is measured, if the policy receives
+    every frame (`select_action`); 0: the velocity is not used. For it, training loads a second
+    frame of all inputs."""
     state_noise: float = 0.0
     """Noise on observation.state in training, relative to its spread. With 0.15, plans return
     to the demonstrations from nearby states. This helps where demonstrations hardly vary, such
     as scripted ones; human variation has the same effect, and noise would blur the intent.
     """
     n_plans: int = 3
-    """Plans for each observation, of which one is carried out: as many ways to go as the
-    demonstrations may show from one place."""
+    """Plans for each observation, of which one is executed: the largest number of distinct ways
+    that the demonstrations may show from one place."""
     two_level_actions: list[int] | None = None
-    """Components of the action that know two levels only, such as a gripper that is open or
-    shut, and jump between them; None: those that the dataset's statistics show to be such."""
+    """Indices of the action's components that jump between two levels, such as a gripper that
+    is open or closed; None: detected from the dataset's statistics."""
     blend_time: float | None = None
-    """About how long a chunk takes from what is carried out to what is planned [s]; None: 0.05
-    s or one action, or less where the basis functions of a chunk are so close to each other
-    that its acceleration is uneven within that time, with which the motion would go on."""
+    """Approximate time from the executed motion to the plan [s]; None: 0.05 s or one action
+    period, the longer, but at most 0.3 of the spacing of basis functions. A plan with close
+    basis functions has an uneven acceleration, which a longer blend would continue."""
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-2
     scheduler_decay_steps: int = 20_000
-    """Steps along which the learning rate falls to nothing; no more than are trained."""
+    """Steps over which the learning rate decays to zero; fewer if training is shorter."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,7 +119,7 @@ class MotionChunkConfig(MotionPolicyConfig):
 
     @property
     def observation_delta_indices(self) -> list[int] | None:
-        """The current observation, and one before."""
+        """The observation `history` frames ago, and the current one."""
         return [-self.history, 0] if self.history else None
 
     @property
@@ -134,12 +138,12 @@ class MotionChunkConfig(MotionPolicyConfig):
 
 
 class MotionChunkPolicy(MotionPolicy):
-    """Chunks that begin as what is being carried out goes on: C2, whatever is predicted.
+    """Policy whose chunks continue the executed motion: C2 for any prediction.
 
-    From each observation, and how fast the state in it changes, a network plans the next second
-    or two. What is carried out is the motion nearest to that plan of those that begin with the
-    position, the velocity and the acceleration that the actions before will have led to. No
-    clock runs: chunks may be asked for at any time, and after `reset` from anywhere.
+    From each observation and the velocity of its state, a network plans the next second or two.
+    Among the motions that start with the position, velocity and acceleration to which the
+    previous actions lead, the one nearest to the plan is executed. There is no clock: chunks
+    can be requested at any time and, after `reset`, from any state.
     """
 
     config_class = MotionChunkConfig  # pyright: ignore[reportAssignmentType]
@@ -147,12 +151,12 @@ class MotionChunkPolicy(MotionPolicy):
     config: MotionChunkConfig
 
     error: Float[Tensor, ""]
-    """Root mean square distance of the nearest plan from what is shown, in spreads."""
+    """Root mean square distance of the nearest plan from the demonstrations, in spreads."""
     levels: Float[Tensor, "2 A"]
-    """Least and largest action, whitened."""
+    """Smallest and largest action, whitened."""
     velocity_spread: Float[Tensor, "F"]
-    """Root mean square of the velocity of demonstrated states, whitened, per second; of none
-    where it is not seen."""
+    """Root mean square velocity of the demonstrated states, whitened [1/s]; empty if velocities
+    are not used."""
 
     def __init__(
         self,
@@ -161,24 +165,24 @@ class MotionChunkPolicy(MotionPolicy):
         dataset_meta: Any = None,
         **_: Any,
     ):
-        """Build the policy and, of a dataset, fit what is linear in it in closed form.
+        """Build the policy and, given a dataset, fit its linear part in closed form.
 
-        A policy that is loaded takes what it was trained with from its checkpoint.
+        A loaded policy takes its statistics and weights from the checkpoint instead.
 
         Args:
             config: Configuration with known features.
-            dataset_stats: Statistics that numbers are whitened by.
-            dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from, and the
-                demonstrations where they lie on disk.
+            dataset_stats: Statistics for whitening the numbers.
+            dataset_meta: `LeRobotDatasetMetadata` with the frame rate and, if the dataset is on
+                disk, the folder of the demonstrations.
 
         Raises:
-            ValueError: Features that the policy cannot work with, a frame rate that is unknown
-                or another one, or statistics with gaps.
+            ValueError: The policy cannot work with the features, the frame rate is unknown or
+                differs from the dataset's, or statistics are missing.
         """
         super().__init__(config, dataset_meta)
         widths, width = self.encoder.widths, len(self.encoding.mean)
         states = config.state_names if OBS_STATE in widths else None
-        # States that turn are seen as orientations too, whose vectors do not jump.
+        # Rotation vectors in the state are encoded like those of actions, so they do not jump.
         self.turning = ActionEncoding(widths.get(OBS_STATE, 0), rotation_triples(states))
         self.register_buffer("error", torch.ones(()))
         self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
@@ -214,11 +218,11 @@ class MotionChunkPolicy(MotionPolicy):
         self.reset()
 
     def supports_rtc(self) -> bool:
-        """Chunks go on from what is left of the one before: without guidance, exactly."""
+        """True: chunks continue the leftover actions exactly, without guidance."""
         return True
 
     def reset(self) -> None:
-        """Forget the motion that is under way: the next begins where the arm is measured."""
+        """Forget the present motion: the next one begins at the measured position."""
         self.motion.reset()
         self._states: deque[Tensor] = deque(maxlen=self.config.history + 1)
         self._action_queue: deque[Tensor] = deque()
@@ -226,19 +230,19 @@ class MotionChunkPolicy(MotionPolicy):
     def forward(
         self, batch: dict[str, Any], reduction: str = "mean"
     ) -> tuple[Tensor, dict[str, float]]:
-        """Error of the nearest plan, position and velocity, and of the scores and levels.
+        """Error of the nearest plan in position and velocity, plus errors of scores and levels.
 
-        Actions before the beginning of an episode and after its end count as none.
+        Actions before the beginning of an episode and after its end do not count.
 
         Args:
             batch: Batch as LeRobot loads it by the config's delta indices: observations (B, 2,
-                ...) of `history` frames ago and of now, or (B, ...) of now alone; `action` (B,
-                chunk + 1, A) and `action_is_pad`.
-            reduction: "none" for one loss each, (B), else their mean.
+                ...), `history` frames ago and now, or (B, ...), now only; `action` (B, chunk +
+                1, A) and `action_is_pad`.
+            reduction: "none" for the loss of each sample, (B); else their mean.
 
         Returns:
-            The loss, and the root mean square error of the nearest plans in the spread of
-            each component of the action.
+            The loss, and the root mean square error of the nearest plans, relative to the
+            spread of each component of the action.
         """
         shown = self.encoding.to_coordinates(batch[ACTION])
         batch, velocity, known = self._now(batch)
@@ -246,7 +250,7 @@ class MotionChunkPolicy(MotionPolicy):
             known = known * (torch.rand_like(known) > UNKNOWN)
         features = self.encoder(batch)
         if self.training and self.config.state_noise:
-            own = self.encoder.widths.get(OBS_STATE, 0)  # come first among the features
+            own = self.encoder.widths.get(OBS_STATE, 0)  # states come first among the features
             noise = self.config.state_noise * torch.randn_like(features[:, :own])
             features = torch.cat([features[:, :own] + noise, features[:, own:]], dim=-1)
         plans = self.network(features, velocity, known)
@@ -278,22 +282,22 @@ class MotionChunkPolicy(MotionPolicy):
         prev_chunk_left_over: Tensor | None = None,
         **_: Any,
     ) -> Float[Tensor, "B chunk A"]:
-        """The next chunk, its first action for the time of the observation.
+        """The next chunk; its first action belongs to the time of the observation.
 
-        It begins as the last one goes on from where that has got to: where the actions that
-        are left over say, exactly; else at the step of it that is nearest to what is planned
-        for the observation. After `reset` it begins where the arm is measured.
+        The chunk continues the last one from its present step. The leftover actions determine
+        this step exactly; without them, it is the step nearest to the plan for the observation.
+        After `reset`, the chunk begins at the measured position.
 
         Args:
             batch: Observations (B, ...).
-            inference_delay: Actions that will be carried out before the chunk is there: its
-                first ones, which are those left over.
-            prev_chunk_left_over: Actions of the last chunk that are still to be carried out,
-                (n, A) or (1, n, A), as LeRobot's real-time chunking gives them.
+            inference_delay: Number of actions that will be executed before the chunk is
+                available: leftover ones, with which the chunk begins.
+            prev_chunk_left_over: Actions of the last chunk that are not executed yet, (n, A) or
+                (1, n, A), as LeRobot's real-time chunking passes them.
 
         Raises:
-            ValueError: Numbers are missing, of another width, or not finite; or a delay that
-                is negative.
+            ValueError: Numbers are missing, of another width, or not finite; or the delay is
+                negative.
         """
         self.eval()
         if inference_delay < 0:
@@ -304,7 +308,7 @@ class MotionChunkPolicy(MotionPolicy):
         if prev_chunk_left_over is not None:
             before = self.motion.left_over(prev_chunk_left_over)
         elif self.motion.chunk is not None:
-            # Where the motion should be for what is seen, if it could begin anywhere.
+            # State that the plan would begin with if it could begin anywhere.
             now = self.decoder.states(self._chosen(plans, None))[:, 0, 0]
             before = self.motion.nearest(now)
         else:
@@ -315,7 +319,7 @@ class MotionChunkPolicy(MotionPolicy):
     def select_action(self, batch: dict[str, Any], **_: Any) -> Float[Tensor, "B A"]:
         """The next action; a new chunk is predicted when the last one is used up."""
         if OBS_STATE in batch:
-            self._states.append(batch[OBS_STATE].clone())  # its memory may be used again
+            self._states.append(batch[OBS_STATE].clone())  # the caller may reuse its memory
         if not self._action_queue:
             self.eval()
             self._require_numbers(batch)
@@ -325,7 +329,7 @@ class MotionChunkPolicy(MotionPolicy):
         return self._action_queue.popleft()
 
     def _turned(self, batch: Observation) -> Observation:
-        """The observation with what turns in its state as an orientation."""
+        """The observation with the rotation vectors in its state encoded without jumps."""
         if not self.turning.triples:
             return batch
         state = batch[OBS_STATE]
@@ -338,7 +342,7 @@ class MotionChunkPolicy(MotionPolicy):
         return moved / (self.config.history * self._step * self.velocity_spread)
 
     def _now(self, batch: Mapping[str, Any]) -> tuple[dict[str, Any], Tensor, Tensor]:
-        """Loaded samples' observations of now, turned, the velocity, and where it is known."""
+        """Encoded present observations of samples, their velocity, and 1 where it is known."""
         now = dict(self._turned(batch))
         velocity = batch[ACTION].new_zeros(len(batch[ACTION]), len(self.velocity_spread))
         known = velocity.new_zeros(len(velocity))
@@ -374,7 +378,7 @@ class MotionChunkPolicy(MotionPolicy):
         return self.network(features, velocity.nan_to_num(), known)
 
     def _chosen(self, plans: Plans, before: MotionChunk | None) -> Float[Tensor, "B D M"]:
-        """One plan: likely, and the way that is being gone; the mean of those of one way."""
+        """Most likely plan, preferably near the present motion; close plans are averaged."""
         scores = plans.scores.log_softmax(-1)
         same = SAME_WAY * self.error.clamp_min(LEAST_ERROR)
         positions = self.decoder.positions(plans.coefficients)
@@ -408,7 +412,7 @@ class MotionChunkPolicy(MotionPolicy):
         return self.encoding.to_actions(coordinates)
 
     def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
-        """Take spreads, levels, and the columns with two levels only, from statistics."""
+        """Take spreads, levels and two-level columns from statistics."""
         super()._whiten(stats, dataset_meta)
         if stats is None:
             return
@@ -424,13 +428,13 @@ class MotionChunkPolicy(MotionPolicy):
 
     @torch.no_grad()
     def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:
-        """Set what is linear in closed form, numbers being whitened already.
+        """Fit the linear part in closed form, once the numbers are whitened.
 
         Args:
             demonstrations: Columns by key, (frames, components).
 
         Raises:
-            ValueError: Orientations more than half a turn away from their mean.
+            ValueError: An orientation is more than half a turn away from the mean.
         """
         actions = [shown[ACTION].to(self.encoding.mean) for shown in demonstrations]
         if self.encoding.triples:
@@ -470,7 +474,7 @@ class MotionChunkPolicy(MotionPolicy):
         self.error.copy_((planned - chunks).square().mean().sqrt())
 
     def _learn_turning(self, states: list[Tensor]) -> None:
-        """Take references of orientations and, for what they make of states, the spread."""
+        """Set reference orientations of states, and mean and spread of the encoded states."""
         turning = self.turning
         turning.learn(states)
         turning.whiten(torch.ones_like(turning.std), torch.zeros_like(turning.mean))
@@ -483,7 +487,7 @@ class MotionChunkPolicy(MotionPolicy):
             std[triple] = std[triple].clamp_min(SMALLEST_TURN)
 
     def _keep_measured(self, states: Tensor, coordinates: Tensor) -> None:
-        """Drop columns of the state whose values are not those that actions set."""
+        """Ignore state columns that differ too much from the actions of the same name."""
         values = states[None, :, self.measured.clamp_min(0)].to(coordinates)
         off = self.encoding.to_coordinates(values)[0] - coordinates
         far = off.square().mean(0).sqrt() > MEASURED

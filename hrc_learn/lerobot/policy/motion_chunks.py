@@ -16,7 +16,7 @@ from hrc_learn.dmp.motion_head import MotionHead
 NOISE = 1e-2
 """Noise of demonstrated actions relative to their spread; motions below it are not learned."""
 BASIS, ACTIONS_EACH = 10, 2.5
-"""Basis functions of a chunk, and the fewest actions for each: plans are no finer than that."""
+"""Largest number of basis functions of a chunk, and fewest actions for each of them."""
 BLEND_TIME = 0.05
 """Longest default blend time [s]; one action where that takes longer."""
 BLEND_SHARE = 0.3
@@ -25,16 +25,16 @@ has an acceleration error of some 20 e / h^2, which displaces the motion by 20 e
 h)^2.
 """
 TINY = 1e-9
-"""Added to what is inverted, so that it can be."""
+"""Relative regularisation that keeps a matrix invertible."""
 
 
 class ChunkDecoder(nn.Module):
-    """Coefficients of a movement primitive a column to the actions of a chunk.
+    """Map from coefficients of movement primitives, one for each column, to a chunk of actions.
 
     A column has M = N + 3 coefficients: start, start velocity, and the N weights and the goal
-    of a `MotionHead`. Actions and their derivatives are linear in them, so demonstrated chunks
-    are projected onto them in closed form, and so is a chunk onto those that begin in a given
-    state.
+    of a `MotionHead`. Actions and their derivatives are linear in the coefficients. Therefore
+    closed forms give the coefficients of a demonstrated chunk, and the change of a chunk that
+    lets it begin in a given state.
     """
 
     maps: Float[Tensor, "4 samples M"]
@@ -56,9 +56,9 @@ class ChunkDecoder(nn.Module):
             chunk_size: Actions of a chunk.
             step: Time between actions [s].
             n_basis: N, weights a column; None: 10, or two for five actions.
-            blend_time: About how long a motion takes to get from where it is to what is
-                planned [s]; None: 0.05 s or one action, or less where basis functions are so
-                close to each other that acceleration is uneven within that time.
+            blend_time: Approximate time from the executed motion to the plan [s]; None: 0.05 s
+                or one action period, the longer, but at most `BLEND_SHARE` of the spacing of
+                basis functions.
         """
         super().__init__()
         n_basis = n_basis or min(BASIS, max(2, int(chunk_size / ACTIONS_EACH)))
@@ -73,7 +73,8 @@ class ChunkDecoder(nn.Module):
         (jerk,) = torch.gradient(acceleration, spacing=step, dim=0)
         position, velocity = motion.position[..., 0].T, motion.velocity[..., 0].T
         maps = torch.stack([position, velocity, acceleration, jerk])
-        # Both follow from the settings; in double precision, as jerk spans many magnitudes.
+        # The maps follow from the settings, so they are not saved. They are in double
+        # precision, as jerk spans many orders of magnitude.
         self.register_buffer("maps", maps, persistent=False)
         normal = position.T @ position + NOISE**2 * unit
         projection = torch.linalg.solve(normal, position.T)
@@ -90,7 +91,7 @@ class ChunkDecoder(nn.Module):
         return self.maps.shape[1]
 
     def project(self, chunks: Float[Tensor, "*batch samples D"]) -> Float[Tensor, "*batch D M"]:
-        """The coefficients whose motion is nearest to demonstrated chunks."""
+        """Coefficients of the motions nearest to demonstrated chunks."""
         return (self.projection @ chunks.double()).mT.to(chunks)
 
     def positions(
@@ -102,7 +103,7 @@ class ChunkDecoder(nn.Module):
     def states(
         self, coefficients: Float[Tensor, "*batch D M"]
     ) -> Float[Tensor, "*batch samples 3 D"]:
-        """Position, velocity and acceleration likewise."""
+        """Position, velocity and acceleration at these actions."""
         x = coefficients.double().mT[..., None, :, :]
         return (self.maps[:3] @ x).transpose(-3, -2)
 
@@ -112,10 +113,10 @@ class ChunkDecoder(nn.Module):
         state: Float[Tensor, "*batch 3 D"],
         index: int = 0,
     ) -> Float[Tensor, "*batch D M"]:
-        """The motion that is in a state at an action, and then soon where it was planned to be.
+        """Coefficients of a motion that passes through a state and then soon joins the plan.
 
-        Of all changes of the coefficients that lead through the state, exactly, it is the one
-        of least  sum_t d(t)^2 + blend_time^6 d'''(t)^2  from that action on.
+        Among all changes d of the motion that lead exactly through the state, this one has the
+        smallest  sum_t d(t)^2 + blend_time^6 d'''(t)^2  from that action on.
 
         Args:
             coefficients: Planned coefficients.
@@ -144,9 +145,10 @@ SPREAD = 1e-3
 DIFFERENCE = 0.02
 """Initial spread of plans, relative to the spread of the coefficients."""
 FARTHEST = 10.0
-"""Spreads beyond which inputs are taken for wrong, and for no more than that."""
+"""Bound of whitened inputs: larger ones are probably wrong, and are clamped."""
 LEFT_OVER = 0.05
-"""Weight of the plans that are not the nearest to what was shown, so that none is forgotten."""
+"""Weight of the plans that are not the nearest to the demonstration, so that all of them learn.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -161,11 +163,11 @@ class Plans:
 
 
 class ChunkNetwork(nn.Module):
-    """Plans as a function of what is seen and, where it is known, of how fast that changes.
+    """Plans as a function of an observation and, if known, of its velocity.
 
-    The plans are a linear function of the numbers seen, which a fit in closed form sets, and a
-    network, which starts with next to nothing. Velocities tell apart what looks alike on the
-    way there and back.
+    The plans are the sum of a linear function of the observed numbers, which is fitted in
+    closed form, and of a network, which starts near zero. Velocities distinguish forward and
+    return motions that look alike.
     """
 
     mean: Float[Tensor, "D M"]
@@ -188,7 +190,7 @@ class ChunkNetwork(nn.Module):
         """Make a network whose plans stand still.
 
         Args:
-            numbers: Number of leading features that suit a linear function.
+            numbers: Number of leading features that enter the linear function.
             features: Number of features of an observation.
             moving: Number of velocities.
             columns: D, number of smooth columns.
@@ -221,12 +223,12 @@ class ChunkNetwork(nn.Module):
         velocity: Float[Tensor, "B V"],
         known: Float[Tensor, "B"],
     ) -> Plans:
-        """Plans for what is seen.
+        """Plans for an observation.
 
         Args:
             features: Features of the observation.
             velocity: Velocities of its values, relative to their spreads.
-            known: 1 where that is known, else 0.
+            known: 1 where the velocity is known, else 0.
         """
         features = features.clamp(-FARTHEST, FARTHEST)
         velocity = velocity.clamp(-FARTHEST, FARTHEST) * known[:, None]
@@ -244,12 +246,12 @@ class ChunkNetwork(nn.Module):
 
     @torch.no_grad()
     def fit(self, numbers: Float[Tensor, "n C"], coefficients: Float[Tensor, "n D M"]) -> None:
-        """Set the linear function by regression of demonstrated chunks on what was seen."""
+        """Fit the linear function by regression of demonstrated chunks on observed numbers."""
         self.mean.copy_(coefficients.mean(0))
         self.spread.copy_(coefficients.std(0).clamp_min(SPREAD))
         whitened = ((coefficients - self.mean) / self.spread).flatten(1)
         if self.numbers:
-            # Not standardized again: what hardly varies would be blown up after all.
+            # Not standardised again, which would amplify numbers that hardly vary.
             fit = fit_ridge(numbers.double(), whitened.double(), RIDGE, standardize=False)
             constant, slopes = fit.coefficients[0], fit.coefficients[1:]
             self.linear.weight.copy_(slopes.T)
@@ -268,7 +270,7 @@ def _block(hidden: int, dropout: float) -> nn.Module:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionChunk:
-    """Actions to come as a motion, of a batch."""
+    """Motion of the coming actions, for a batch."""
 
     states: Float[Tensor, "B samples 3 D"]
     """Position, velocity and acceleration of the smooth columns."""
@@ -284,10 +286,10 @@ class ContinuedMotion:
     """
 
     chunk: MotionChunk | None
-    """The last one; None: nothing is under way."""
+    """Last chunk; None: there is no present motion."""
 
     def __init__(self, decoder: ChunkDecoder, compose: Callable[[Tensor, Tensor], Tensor]):
-        """Begin with nothing under way.
+        """Begin without a present motion.
 
         Args:
             decoder: Decoder of coefficients to the samples of a chunk.
@@ -299,7 +301,7 @@ class ContinuedMotion:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the motion that is under way."""
+        """Forget the present motion."""
         self.chunk = None
 
     def after(self, steps: int | Int[Tensor, "B"]) -> MotionChunk | None:
@@ -328,14 +330,14 @@ class ContinuedMotion:
         return self.after(off.square().sum(-1).argmin(1) + 1)
 
     def left_over(self, actions: Float[Tensor, "*one n A"]) -> MotionChunk | None:
-        """Continuation of the last chunk from the first of its actions that are left over.
+        """Remainder of the last chunk from the first of its leftover actions.
 
-        None for actions of another source, which have no known velocity.
+        None if the actions are not from the last chunk, as their velocity is unknown.
         """
         if self.chunk is None:
             return None
         actions = actions.reshape(-1, actions.shape[-1])
-        # LeRobot fills short ones up with zeros.
+        # LeRobot pads short chunks with zeros.
         there = actions.any(-1).nonzero().flatten()
         if not len(there):
             return self.after(self.decoder.samples)
@@ -361,8 +363,8 @@ class ContinuedMotion:
             planned: Coefficients of the smooth columns.
             stepped: Values of the columns that jump.
             before: Remainder of the previous chunk; None: the motion begins.
-            beginning: State to begin in then; None: as planned.
-            delay: Actions of `before` that will be carried out before this chunk is there.
+            beginning: State to begin in if `before` is None; None: the planned one.
+            delay: Number of actions of `before` to execute before this chunk is available.
         """
         if before is None:
             delay = 0

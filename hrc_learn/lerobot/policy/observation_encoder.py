@@ -1,4 +1,4 @@
-"""Observations as vectors of features: whitened numbers, and places in images."""
+"""Observations as vectors of features: whitened numbers, and keypoints of images."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -13,14 +13,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-# Convolutions that policies see with, by name; none downloads weights.
+# Convolutional backbones by name; none downloads weights.
 
 GROUPS = 8
-"""Channels in a group of group normalisation; batches of few demonstrations are too small for
-batch statistics.
+"""Number of groups of group normalisation, which is used because batches of few demonstrations
+are too small for batch statistics.
 """
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-"""Mean and spread of red, green and blue that torchvision's weights were trained with."""
+"""Mean and spread of red, green and blue with which torchvision's weights were trained."""
 
 
 def make_backbone(
@@ -73,18 +73,18 @@ def _resnet(name: str, channels: int, pretrained: bool) -> tuple[nn.Module, int]
         raise ValueError(f"vision_weights are for images of 3 channels, these have {channels}")
     if channels != 3:
         resnet.conv1 = nn.Conv2d(channels, 64, kernel_size=7, stride=2, padding=3, bias=False)
-    # All but pooling and classes, by torchvision's names; the last stage halves the resolution
-    # once more.
+    # All layers before pooling and classification, with torchvision's names; the last stage
+    # halves the resolution once more.
     parts = OrderedDict(list(resnet.named_children())[:-2])
     return nn.Sequential(parts), resnet.fc.in_features
 
 
 def load_backbone(backbone: nn.Module, path: Path) -> None:
-    """Load weights of a ResNet, by torchvision's names, from a file.
+    """Load weights of a ResNet, with torchvision's names, from a file.
 
     Args:
-        backbone: Name of the backbone, as in `make_backbone`, pretrained.
-        path: A state dict as safetensors.
+        backbone: Backbone that `make_backbone` returned with pretrained=True.
+        path: State dict in a safetensors file.
 
     Raises:
         ValueError: There is no such file, or it holds no weights of this ResNet.
@@ -95,8 +95,8 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
         weights = load_file(path)
     except SafetensorError as error:
         raise ValueError(
-            f"vision_weights: {path} is no safetensors file ({error}); of what torchvision "
-            "downloads make one by safetensors.torch.save_file(torch.load(PTH), FILE)"
+            f"vision_weights: {path} is no safetensors file ({error}); convert a file of "
+            "torchvision by safetensors.torch.save_file(torch.load(PTH), FILE)"
         ) from error
     try:
         missing = backbone.load_state_dict(weights, strict=False).missing_keys
@@ -109,17 +109,17 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
         )
 
 
-# What a policy makes of an observation: whitened numbers, and places in images.
+# Features of an observation: whitened numbers, and keypoints of images.
 
 SMALLEST_SPREAD = 1e-6
-"""Components that vary by less have never changed."""
+"""Spread below which a component counts as constant."""
 SMALLEST_SCALE = 0.01
 """Smallest scale of a feature's values, relative to their median spread. A joint that is held
-still trembles by a thousandth of the motion of others, differently at states never
-demonstrated; amplified, this moved an ALOHA arm away from its cube.
+at rest still varies by a thousandth of the motion of others, and differently in states that
+were not demonstrated; amplified, this moved an ALOHA arm away from its cube.
 """
 type Observation = Mapping[str, Any]
-"""Tensors by key; LeRobot's evaluation adds other things."""
+"""Tensors by key; LeRobot's evaluation adds other entries."""
 
 
 class ObservationEncoder(nn.Module):
@@ -137,13 +137,13 @@ class ObservationEncoder(nn.Module):
         n_keypoints: int,
         pretrained: bool = False,
     ):
-        """Put it together, with a spread of one for all numbers.
+        """Build the encoder, with a spread of one for all numbers.
 
         Args:
-            widths: Features of numbers: key, and number of components.
-            images: Features of images: key, and number of channels.
+            widths: Number of components of each feature of numbers, by key.
+            images: Number of channels of each image feature, by key.
             backbone: See `make_backbone`.
-            n_keypoints: Places looked for in each image.
+            n_keypoints: Number of keypoints in each image.
             pretrained: See `make_backbone`.
 
         Raises:
@@ -153,7 +153,7 @@ class ObservationEncoder(nn.Module):
         self.widths = dict(widths)
         self.register_buffer("mean", torch.zeros(sum(widths.values())))
         self.register_buffer("std", torch.ones(sum(widths.values())))
-        # Names of modules may hold no dots, keys of features do.
+        # Names of modules must not contain dots, but keys of features do.
         self.cameras = nn.ModuleDict(
             {
                 _module_name(key): KeypointEncoder(backbone, channels, n_keypoints, pretrained)
@@ -174,7 +174,7 @@ class ObservationEncoder(nn.Module):
         self.std.copy_(torch.cat(spreads))
 
     def load_vision(self, path: Path) -> None:
-        """Begin with the weights of a file in the backbones of all cameras.
+        """Load the weights of a file into the backbones of all cameras.
 
         Raises:
             ValueError: Same as `load_backbone`.
@@ -184,7 +184,7 @@ class ObservationEncoder(nn.Module):
             load_backbone(camera.backbone, path)
 
     def numbers(self, observation: Observation) -> Float[Tensor, "*batch C"]:
-        """The numbers alone, whitened."""
+        """Whitened numbers of an observation, without its images."""
         if not self.widths:
             batch = observation[self.images[0]].shape[:-3] if observation else ()
             return self.mean.new_zeros(*batch, 0)
@@ -207,7 +207,7 @@ def divisors(std: Float[Tensor, "n"], fraction: float = SMALLEST_SCALE) -> Float
 
 
 class KeypointEncoder(nn.Module):
-    """Places in an image, each the centre of a softmax over a feature map.
+    """Keypoints of an image, each the mean position under a spatial softmax of a feature map.
 
     (Levine et al. 2016, "End-to-end training of deep visuomotor policies", section 5)
     """
@@ -221,7 +221,7 @@ class KeypointEncoder(nn.Module):
         self.maps = nn.Conv2d(width, n_keypoints, kernel_size=1)
 
     def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B two_K"]:
-        """Coordinates (u right, v down) of each place, -1 to 1."""
+        """Coordinates of the keypoints, -1 to 1: u (right) of all, then v (down) of all."""
         if self.pretrained:
             mean, std = (image.new_tensor(x)[:, None, None] for x in IMAGENET)
             image = (image - mean) / std

@@ -32,27 +32,27 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class MotionPolicyConfig(PreTrainedConfig):
-    """Settings of any policy that plans motions, and its names from the dataset."""
+    """Settings of any policy that plans motions, with the names from its dataset."""
 
     chunk_size: int = 50
     """Actions predicted at once."""
     n_action_steps: int = 25
-    """Actions carried out before the next chunk is predicted."""
+    """Actions executed before the next chunk is predicted."""
     vision_backbone: str = "small"
     """Image backbone: "small", four convolutions, or a ResNet of torchvision such as
     "resnet18"; no weights are downloaded.
     """
     vision_weights: str | None = None
-    """File of weights for such a ResNet to begin with, safetensors by torchvision's names;
-    None: it begins with random ones, or has been given its weights."""
+    """Safetensors file of initial weights for such a ResNet, with torchvision's names; None:
+    random weights, or those of the checkpoint."""
     vision_pretrained: bool = False
     """True if the ResNet started from torchvision's weights; set by `vision_weights`."""
     n_keypoints: int = 32
-    """Places in each image that the network looks for."""
+    """Number of keypoints that the network finds in each image."""
     fit_episodes: list[int] | None = None
-    """Episodes to start from in closed form; None: all. Leave out here what is held out."""
+    """Episodes for the fit in closed form; None: all. Exclude held-out episodes here."""
     fps: float | None = None
-    """Actions a second; that of the dataset, unless given."""
+    """Actions a second; None: those of the dataset."""
     state_names: list[str] | None = None
     """Components of observation.state, from the dataset."""
     action_feature_names: list[str] | None = None
@@ -64,7 +64,7 @@ class MotionPolicyConfig(PreTrainedConfig):
             ("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
         )
     )
-    """Identity: the policy normalises internally, where start and actions have one space."""
+    """Identity: the policy normalises internally, with the same scale for start and actions."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,17 +77,17 @@ class MotionPolicyConfig(PreTrainedConfig):
             raise ValueError(
                 f"the policy {self.type!r} sees one step, got n_obs_steps={self.n_obs_steps}"
             )
-        # LeRobot overwrites the field before it hands over the dataset.
+        # LeRobot overwrites these fields before it passes the dataset.
         self._trained_for = self.action_feature_names
         self._trained_on = self.state_names
 
     @property
     def reward_delta_indices(self) -> None:
-        """Rewards play no part."""
+        """Rewards are not used."""
         return None
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """AdamW, as the network starts from what is already close."""
+        """AdamW; training starts close to a solution, the fit in closed form."""
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
@@ -95,10 +95,10 @@ class MotionPolicyConfig(PreTrainedConfig):
         return None
 
     def validate_features(self) -> None:
-        """See whether the policy can work with its inputs and outputs.
+        """Check that the policy can work with its inputs and outputs.
 
         Raises:
-            ValueError: There is no action, or nothing to see.
+            ValueError: There is no action, or no input.
         """
         if self.action_feature is None:
             raise ValueError(
@@ -106,7 +106,7 @@ class MotionPolicyConfig(PreTrainedConfig):
             )
         if not self.input_features:
             raise ValueError(
-                f"the policy {self.type!r} needs something to see: observation.state, "
+                f"the policy {self.type!r} needs an input: observation.state, "
                 "observation.environment_state or images"
             )
 
@@ -114,8 +114,8 @@ class MotionPolicyConfig(PreTrainedConfig):
         """Take the names of components from a dataset; LeRobot calls this.
 
         Raises:
-            ValueError: The policy was trained for other actions, or on other states or these
-                in another order.
+            ValueError: The policy was trained for other actions, or on other states or another
+                order of them.
         """
         self.action_feature_names = _names(features, "action")
         self.state_names = _names(features, "observation.state")
@@ -143,7 +143,7 @@ class MotionPolicy(PreTrainedPolicy):
 
     config: Any
     measured: Int[Tensor, "A"]
-    """Columns of the state that hold the action's components; -1: none does."""
+    """State columns that measure the action's components; -1: not measured."""
 
     def __init__(self, config: MotionPolicyConfig, dataset_meta: Any = None):
         """Make the encoders of observations and actions.
@@ -154,7 +154,7 @@ class MotionPolicy(PreTrainedPolicy):
 
         Raises:
             ValueError: The policy cannot work with the features, or the frame rate is unknown
-                or another one.
+                or differs from the dataset's.
         """
         super().__init__(config)
         config.validate_features()
@@ -180,12 +180,12 @@ class MotionPolicy(PreTrainedPolicy):
         self.register_buffer("measured", torch.tensor(columns))
 
     def get_optim_params(self) -> Any:
-        """All parameters alike."""
+        """All parameters, in one group."""
         return self.parameters()
 
     @abstractmethod
     def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:
-        """Start from demonstrations in closed form, once their statistics are known.
+        """Fit demonstrations in closed form, once their statistics are known.
 
         Args:
             demonstrations: Columns by key, (frames, components).
@@ -235,12 +235,12 @@ class MotionPolicy(PreTrainedPolicy):
         self.encoding.whiten(std, mean)
 
     def _fit_dataset(self, dataset_meta: Any) -> None:
-        """Start from the demonstrations of a dataset that lies on disk."""
+        """Fit the demonstrations of a dataset, if they are on disk."""
         if dataset_meta is None:
             return
         root = Path(dataset_meta.root)
         if not (root / "data").is_dir():
-            logger.warning("no demonstrations in %s: training starts from standing still", root)
+            logger.warning("no demonstrations in %s: training starts from a resting arm", root)
             return
         keys = (ACTION, *self.encoder.widths)
         self.fit(read_episodes(root, keys, self.config.fit_episodes))
@@ -258,7 +258,7 @@ class MotionPolicy(PreTrainedPolicy):
 
 
 def frame_rate(config: MotionPolicyConfig, dataset_meta: Any) -> float:
-    """Actions a second, of the settings or the dataset.
+    """Actions a second, from the settings or the dataset.
 
     Raises:
         ValueError: Neither is known, or they do not agree.
@@ -274,7 +274,7 @@ def frame_rate(config: MotionPolicyConfig, dataset_meta: Any) -> float:
     if shown not in (None, trained):
         raise ValueError(
             f"the policy is for {trained:g} actions a second, the dataset has {shown:g}: "
-            "resample it, or train a policy of its own"
+            "resample it, or train another policy on it"
         )
     return trained
 
@@ -298,7 +298,7 @@ def _require_statistics(
 
 
 MOST = 256
-"""Demonstrations that say enough of a motion to start from; more are spread evenly."""
+"""Largest number of demonstrations that are read; of more, evenly spaced ones are chosen."""
 
 
 def read_episodes(
@@ -309,10 +309,11 @@ def read_episodes(
     Args:
         root: Folder of a LeRobot dataset.
         keys: Columns wanted.
-        episodes: Indices; None: all. Of more than 256, that many are read.
+        episodes: Indices; None: all. Of more than 256 episodes, 256 are read.
 
     Raises:
-        DatasetError: A `ValueError` that says what of the dataset cannot be read.
+        DatasetError: A part of the dataset cannot be read; the message names it. This is a
+            `ValueError`.
     """
     folder = open_folder(root)
     chosen = select_episodes(folder, episodes)

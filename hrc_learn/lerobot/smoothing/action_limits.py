@@ -34,10 +34,10 @@ type Range = tuple[float | None, float | None]
 
 @dataclass(frozen=True, kw_only=True)
 class ActionLimits:
-    """Limits of every value of an action, in its unit, and where it is measured.
+    """Limits of every value of an action, in its unit, and the state column that measures it.
 
     Raises:
-        ValueError: The lists differ in length, or a range is empty. `load` checks all else.
+        ValueError: The lists differ in length, or a range is empty. `load` checks the rest.
     """
 
     names: list[str]
@@ -88,11 +88,11 @@ class ActionLimits:
     def within(
         self, ranges: Mapping[str, Range], velocities: Mapping[str, float] | None = None
     ) -> ActionLimits:
-        """The same with other limits for the values that are named.
+        """The same limits, with some replaced by name.
 
         Args:
             ranges: Lowest and highest positions.
-            velocities: Highest velocities, where lower than those of today [1/s].
+            velocities: Highest velocities, which apply if lower than the present ones [1/s].
         """
         pairs = [
             ranges.get(name, (low, high))
@@ -107,7 +107,7 @@ class ActionLimits:
         )
 
     def save(self, path: Path) -> None:
-        """Write them as JSON; the file is whole or as it was."""
+        """Write a JSON file, atomically."""
         write_json(path, self)
 
     @classmethod
@@ -175,8 +175,8 @@ def _require_names(limits: ActionLimits, found: set[str], file: Path) -> None:
 def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
     """Limits within which the policy moves at most as abruptly as its demonstrators did.
 
-    Limits are the 99.9th percentiles of differences of the actions within episodes, without
-    limits of position.
+    Limits are the 99.9th percentiles of differences of the actions within episodes. Positions
+    are not limited.
 
     Args:
         dataset: LeRobot dataset that the policy was trained on.
@@ -184,7 +184,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
 
     Raises:
         FileNotFoundError: There is no dataset.
-        ValueError: It cannot be read, or its actions are constant.
+        ValueError: It cannot be read, or its actions are constant or without acceleration.
     """
     folder = open_folder(dataset)
     features, fps = folder.features, folder.fps
@@ -194,7 +194,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
     episodes = [np.asarray(x[ACTION], float) for _, x in read_frames(folder, entries, [ACTION])]
     limits = [scale * _largest(episodes, order, fps) for order in (1, 2, 3)]
     if not all((limit > 0).any() for limit in limits):
-        raise ValueError(f"the actions of {dataset} hold still: there is no motion to go by.")
+        raise ValueError(f"the actions of {dataset} hold still or never change their velocity.")
     velocity, acceleration, jerk = (
         np.maximum(limit, _STILL * limit.max()).tolist() for limit in limits
     )
@@ -217,8 +217,8 @@ def urdf_limits(
 ) -> tuple[dict[str, Range], dict[str, float]]:
     """Ranges and velocities of the joints of a URDF, named as LeRobot names their actions.
 
-    A URDF has no limits of acceleration or jerk: those are the demonstrators'. Joints that turn
-    for ever have no range; values of zero, which many exporters write, are no limits.
+    A URDF has no limits of acceleration or jerk: the demonstrated ones remain. Continuous
+    joints have no range. Zeros, which many exporters write, do not count as limits.
 
     Args:
         urdf: File.

@@ -31,7 +31,7 @@ PREPROCESSOR = "policy_preprocessor.json"
 POSTPROCESSOR = "policy_postprocessor.json"
 
 _JUMP = 5.0
-"""A robot that moves this many times faster than its limit was put there: an episode began."""
+"""Multiple of the velocity limit above which the robot was put elsewhere: an episode began."""
 _SAME = 1e-6
 """Changes below this are rounding."""
 
@@ -39,10 +39,10 @@ _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
 class Changes:
-    """Counts and the largest changes, over many actions.
+    """Number of changed actions, and the largest changes.
 
     Attributes:
-        steps: Actions handed out.
+        steps: Number of returned actions.
         changed: Number of actions that were changed.
         largest: Largest change of each value, in its unit.
     """
@@ -81,11 +81,12 @@ class WatchStateStep(ProcessorStep):
     state: Tensor | None = field(default=None, init=False, repr=False)
     """Newest state of the robot, (batch, values); None before the first observation."""
     previous: Tensor | None = field(default=None, init=False, repr=False)
-    """State before that one, also of before a reset."""
+    """State before `state`; it may be older than the last reset."""
 
-    # LeRobot builds a policy's processors from two files, first the one with this step, and
-    # gives neither to the other. So the next step to be built that smooths takes the newest,
-    # if it still exists, once: steps that are built for another robot later do not.
+    # LeRobot builds a policy's two processors from two files, first the one with this step, and
+    # passes neither to the other. So the next `SmoothActionsStep` that is built takes the
+    # newest of these steps, if it still exists. Each is taken only once, so that steps built
+    # later for another robot do not get it.
     _newest: ClassVar[weakref.ref[Any] | None] = None
 
     def __post_init__(self) -> None:
@@ -120,19 +121,20 @@ class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
 
     Belongs at the end of the postprocessor, where actions have their units. Takes one action at
-    a time, (batch, values), as lerobot-rollout and lerobot-eval hand them on, or whole chunks
-    (batch, steps, values). A motion begins with the measured position and velocity, and anew
-    where the robot is put; a chunk begins where the robot is on the one before. A value whose
-    measurement is not finite keeps its motion, and before the first finite one it is held.
+    a time, (batch, values), as lerobot-rollout and lerobot-eval pass them on, or whole chunks
+    (batch, steps, values). A motion starts with the measured position and velocity, and
+    restarts when the robot is put elsewhere. A chunk starts at the point of the previous chunk
+    that is nearest to the robot. A value continues its motion while its measurement is not
+    finite, and is held until its first finite measurement.
 
     Attributes:
         limits: Limits of the actions.
-        watch: Step that reports the robot's state, built before; None: there is none.
+        watch: Step that reports the robot's state, built earlier; None: there is none.
         changes: Report of changes since the last reset.
     """
 
     def __init__(self, **limits: Any):
-        """Begin before the first action.
+        """Set the limits; the motion starts with the first action.
 
         Args:
             limits: Fields of `ActionLimits`, as checkpoints keep them.
@@ -166,7 +168,7 @@ class SmoothActionsStep(ProcessorStep):
             made.append(state.position)
         self._state, chunk = state, np.stack(made, axis=-2)
         self.changes.add(np.nan_to_num(chunk - asked))
-        # An acceleration takes three actions; with fewer the next chunk goes on from the state.
+        # An acceleration needs three actions; after fewer, the state itself is continued.
         self._chunk = chunk if whole and len(made) > 2 else None
         smooth = torch.from_numpy(chunk).to(action)
         return {**transition, TransitionKey.ACTION: smooth if whole else smooth.squeeze(-2)}  # pyright: ignore[reportReturnType]
@@ -208,9 +210,9 @@ class SmoothActionsStep(ProcessorStep):
         return state, held
 
     def _measured(self, batch: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Measured position, NaN where there is none, and velocity, (batch, values) each.
+        """Measured positions (NaN: not measured) and velocities, (batch, values) each.
 
-        The velocity is zero unless two states in a row lead to one within the limits.
+        Velocities are zero unless those between two successive states are within the limits.
         """
         watch = self.watch
         state = None if watch is None else watch.state
@@ -276,7 +278,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
 
     Raises:
         FileNotFoundError: The folder holds no processors.
-        ValueError: They cannot be read, or the limits are not those of the policy's actions.
+        ValueError: A processor cannot be read, or the limits do not fit the policy's actions.
     """
     _require_width(checkpoint, limits)
     before, after = (read_pipeline(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
@@ -284,7 +286,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     smooth = {"registry_name": SMOOTH, "config": asdict(limits)}
     before["steps"].insert(0, watch)  # before a step that renames or normalises the state
     after["steps"].append(smooth)
-    # Without the one that watches, the other still works: so it comes first.
+    # The watch comes first: it has no effect should the second file never be written.
     write_json(checkpoint / PREPROCESSOR, before)
     write_json(checkpoint / POSTPROCESSOR, after)
 
@@ -308,11 +310,11 @@ def remove_smoothing(checkpoint: Path) -> None:
 
 
 def read_pipeline(path: Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[str, Any]:
-    """A pipeline's settings without the steps of these names.
+    """Settings of a processor pipeline without the steps of these names.
 
     Raises:
-        FileNotFoundError: It is not there.
-        ValueError: It cannot be read.
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be read.
     """
     if not path.is_file():
         raise FileNotFoundError(

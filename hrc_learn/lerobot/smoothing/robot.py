@@ -1,4 +1,4 @@
-"""LeRobot robot wrapper: a smooth path through the actions at the rate of the motors."""
+"""LeRobot robot wrapper that sends setpoints on a smooth path between actions."""
 
 from __future__ import annotations
 
@@ -23,35 +23,36 @@ logger = logging.getLogger(__name__)
 
 SMOOTH_ROBOT = "smooth"
 _LATE = 2.0
-"""Periods of the motors after which a setpoint counts as late."""
+"""Setpoint periods after which a setpoint counts as late."""
 _WAIT = 0.5
-"""Actions for which the next one is waited for before the motion comes to rest."""
+"""Action periods to wait for a late action before the motion comes to rest."""
 _FOLLOW = 0.1
-"""Fraction of an action's lateness by which the times of later actions move; it suppresses
-jitter of the loop, but follows its drift.
+"""Fraction of an action's lateness by which later actions are postponed: jitter of the loop is
+suppressed, but its drift is followed.
 """
 
 
 LARGEST_DEGREE = 3
 _LATEST = 1.5
-"""Frames for which the curve is continued when no action comes; then it comes to rest."""
+"""Action periods after an action at which the curve stops if no other action comes."""
 
 
 class ActionUpsampler:
     """Setpoints between actions, on a B-spline, within limits.
 
-    The last d + 1 actions are the control points of a uniform B-spline of degree d: 0 holds the
-    newest, 1 is a line from the one before it, 2 and 3 have continuous velocity and
-    acceleration. The derivatives of such a curve lie between the differences of its control
-    points, so actions that keep the limits at their own rate lead to setpoints that keep them
-    at any. A `MotionFilter` at the rate of the setpoints keeps them whatever the actions are.
+    The last d + 1 actions are the control points of a uniform B-spline of degree d. Degree 0
+    holds the newest action, 1 interpolates linearly, 2 has continuous velocity, and 3
+    continuous acceleration too. The derivatives of the curve lie between the differences of its
+    control points, so if the actions keep the limits at their own rate, the setpoints keep them
+    at any rate. For other actions, a `MotionFilter` at the setpoint rate keeps the limits.
 
-    A curve of degree d is (d + 1)/2 actions late. A smaller latency puts each control point
-    ahead, along the difference of the last two actions, which makes their noise larger.
+    A curve of degree d lags behind the actions by (d + 1)/2 action periods. A smaller latency
+    extrapolates each control point along the difference of the last two actions, which
+    amplifies their noise.
 
     Attributes:
         latency: Latency of the curve behind the actions [s].
-        position: Setpoint handed out last.
+        position: Last setpoint.
     """
 
     def __init__(
@@ -62,13 +63,13 @@ class ActionUpsampler:
         degree: int = LARGEST_DEGREE,
         latency: float | None = None,
     ):
-        """Begin with `reset`.
+        """Prepare the curve; the motion starts with `reset`.
 
         Args:
             limits: Limits of the actions, with their rate.
             rate: Setpoints a second; at least as many as actions.
             degree: Degree of the curve, 0 to 3.
-            latency: Latency of the curve, in actions; None: (degree + 1)/2, the largest.
+            latency: Latency of the curve in action periods; None: (degree + 1)/2, the largest.
 
         Raises:
             ValueError: An argument is out of its range.
@@ -102,7 +103,7 @@ class ActionUpsampler:
         position: Float[np.ndarray, "*batch D"],
         velocity: Float[np.ndarray, "*batch D"] | float = 0.0,
     ) -> None:
-        """Start from the present motion; several robots move at once if there are.
+        """Start from the present motion of one robot or of a batch of robots.
 
         Args:
             position: Position.
@@ -119,10 +120,10 @@ class ActionUpsampler:
     def push(self, action: Float[np.ndarray, "*batch D"]) -> None:
         """Take the next action; the phase of `setpoint` counts from now on.
 
-        Values that are not finite are taken for those before.
+        Values that are not finite are replaced by the previous ones.
 
         Raises:
-            ValueError: It has another number of values than the limits.
+            ValueError: The action has another number of values than the limits.
             RuntimeError: There was no `reset`.
         """
         if self._points is None:
@@ -134,15 +135,15 @@ class ActionUpsampler:
         self._newest = action
 
     def repeat(self) -> None:
-        """Take the newest action once more: with no other ones, the motion comes to rest."""
+        """Take the newest action again; without other actions, the motion comes to rest."""
         self.push(self._newest)
 
     def setpoint(self, phase: float) -> Float[np.ndarray, "*batch D"]:
         """The next setpoint, 1/rate after the last.
 
         Args:
-            phase: Time since the newest action, in actions. Beyond one, where the next action
-                is late, the curve goes on for half an action.
+            phase: Time since the newest action, in action periods. If the next action is late
+                (phase > 1), the curve continues for half a period.
         """
         assert self._points is not None  # reset() comes before push()
         weights = _weights(self.degree, min(phase, _LATEST))
@@ -152,14 +153,14 @@ class ActionUpsampler:
     def frame(self, action: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "n *batch D"]:
         """All setpoints until the next action is due.
 
-        Where the rates do not divide, their number changes from one action to the next.
+        If the setpoint rate is no multiple of the action rate, their number varies.
 
         Raises:
             ValueError: Same as `push`.
         """
         self.push(action)
         made, step = [], self.limits.fps / self.rate
-        # Rounding must not make one more of them, just before the next action.
+        # Rounding must not add a setpoint just before the next action.
         while self._phase < 1 - 1e-9:
             made.append(self.setpoint(self._phase))
             self._phase += step
@@ -194,17 +195,18 @@ class SmoothRobotConfig(RobotConfig):
     of: str = ""
     """Type of the wrapped robot, as in --robot.type."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Its settings, as YAML: what else would be given as --robot.NAME=VALUE."""
+    """Settings of the wrapped robot, as YAML; without the wrapper, they would be given as
+    --robot.NAME=VALUE."""
     limits: Path | None = None
     """File of limits, as `hrc smooth --limits` writes it."""
     rate: float = 250.0
-    """Setpoints a second that the robot is sent."""
+    """Setpoints sent to the robot per second."""
     degree: int = 3
-    """Degree of the curve through the actions: 0 holds each, 1 is LeRobot's interpolation, 2
-    and 3 have continuous velocity and acceleration.
+    """Degree of the curve between the actions: 0 holds each action, 1 is LeRobot's
+    interpolation, 2 has continuous velocity, and 3 continuous acceleration too.
     """
     latency: float | None = None
-    """Latency of the curve, in actions; at most (degree + 1)/2, the default."""
+    """Latency of the curve, in action periods; at most (degree + 1)/2, the default."""
     clock: Literal["wall", "actions"] = "wall"
     """"wall": a thread sends setpoints in real time. "actions": all setpoints of an action are
     sent at once, for a simulated robot whose time advances with them.
@@ -212,18 +214,19 @@ class SmoothRobotConfig(RobotConfig):
 
 
 class SmoothRobot(Robot):
-    """Moves another robot from action to action on a smooth path within limits.
+    """Moves a wrapped robot from action to action on a smooth path within limits.
 
-    It has that robot's observations and actions, so that every program of LeRobot, with every
-    way of inference, uses it as that robot. Setpoints are what is sent to the motors; an action
-    is where they are about `latency` later. Where actions stop coming the motion comes to rest
-    at the last one. The path begins, at `connect` and after each `begin`, where the robot is.
+    It has the observations and actions of the wrapped robot, so every LeRobot program and
+    inference mode can use it in place of that robot. The motors receive setpoints, which reach
+    an action about `latency` after it. If actions stop coming, the motion comes to rest at the
+    last one. At `connect` and `begin`, the path starts at the robot's present position.
 
     Attributes:
         inner: The wrapped robot.
         upsampler: Upsampler of the actions.
-        late: Setpoints that were sent more than a period late, as when a camera held the robot.
-        sent: Setpoints in all.
+        late: Number of setpoints that were sent more than a period late, for example because a
+            camera kept the robot busy.
+        sent: Number of all setpoints.
     """
 
     config_class = SmoothRobotConfig
@@ -278,7 +281,7 @@ class SmoothRobot(Robot):
 
     @property
     def cameras(self) -> Any:
-        """Configuration of the wrapped robot."""
+        """Cameras of the wrapped robot, by name."""
         return getattr(self.inner, "cameras", {})
 
     @property
@@ -306,10 +309,10 @@ class SmoothRobot(Robot):
             self._thread.start()
 
     def begin(self) -> None:
-        """Restart the path from the robot's motion, as after moving it by hand.
+        """Restart the path at the robot's present position, as after moving it by hand.
 
         Raises:
-            ValueError: The robot does not report where a value of its actions is.
+            ValueError: The robot does not report its position for a value of its actions.
         """
         self._readings.clear()
         self._observed()
@@ -342,15 +345,15 @@ class SmoothRobot(Robot):
         if now - last > 1 / limits.fps or not np.isfinite(here).all():
             return  # the robot has been at rest since it was connected, as far as is known
         velocity = (here - before) / (last - then) if last > then else np.zeros_like(here)
-        # A robot that is put elsewhere between two readings is no faster for it.
+        # A robot that was put elsewhere between two readings did not move that fast.
         slow = bool((np.abs(velocity) <= limits.velocity).all())
         self.upsampler.reset(here, velocity if slow else 0.0)
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Go on to an action.
+        """Continue the motion to an action.
 
         Args:
-            action: Values that it does not name stay where they were sent.
+            action: Action; values that it does not name keep their last target.
 
         Returns:
             The setpoint sent last.
@@ -362,7 +365,7 @@ class SmoothRobot(Robot):
         if not self.is_connected:
             raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
         with self._bus:
-            # NaN is taken for the value before.
+            # NaN is replaced by the previous value.
             values = np.array([float(action.get(name, np.nan)) for name in self._names])
             if self.config.clock == "wall":
                 self._actions.append(values)
@@ -409,13 +412,13 @@ class SmoothRobot(Robot):
                 return
             if now - due > (_LATE - 1) * period:
                 self.late += 1
-                due = now  # what was missed is not sent in a burst
+                due = now  # missed setpoints are not sent in a burst
             due += period
 
     def _phase(self, now: float) -> float:
-        """Time since the newest action of the path, in actions, which it takes when it is due.
+        """Time since the newest action of the path, in action periods; takes actions when due.
 
-        The first is due when it comes, the next ones an action's time later each.
+        The first action is due when it comes, each further one an action period later.
         """
         fps = self.upsampler.limits.fps
         if self._started is None:
