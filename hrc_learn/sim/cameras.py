@@ -1,5 +1,5 @@
-"""The workplace as a camera sees it: rendered by OpenGL without a screen or drawn without
-OpenGL, and what disturbs a camera in use: it is moved, refocused, or a marker is occluded.
+"""Cameras of the workplace, rendered by OpenGL without a screen or drawn without OpenGL, and
+disturbances: a camera that is moved or refocused, and a marker that is occluded.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RenderingUnavailableError(RuntimeError):
 
 
 def _add_line(scene: mujoco.MjvScene, line: Line) -> None:
-    """Draw a line into a scene that has room for it."""
+    """Add a line to a scene, unless the scene is full."""
     if scene.ngeom == scene.maxgeom:
         return
     kind = mujoco.mjtGeom.mjGEOM_ARROW if line.head else mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -54,12 +54,12 @@ class OffscreenRenderer:
         """Open an OpenGL context.
 
         Args:
-            world: As it is whenever it is rendered, or a run that is shown again.
+            world: World, which is rendered in its current state, or recording of a run.
             width: Width of the images [px].
             height: Height of the images [px].
 
         Raises:
-            RenderingUnavailableError: If there is no EGL (on Linux) or no OpenGL to be had.
+            RenderingUnavailableError: If EGL (on Linux) or OpenGL is not available.
         """
         self._gl = _open_context(width, height)
         self._size = (width, height)
@@ -83,7 +83,7 @@ class OffscreenRenderer:
 
         Args:
             camera: Camera to render.
-            lines: Lines drawn in addition to what is in the world.
+            lines: Lines to draw in addition to the world.
         """
         width, height = self._size
         self._gl.make_current()
@@ -113,8 +113,8 @@ class OffscreenRenderer:
 
 
 def _free(gl, context: mujoco.MjrContext) -> None:
-    # OpenGL frees by number, and another renderer that is current has the same numbers: its
-    # images would be black from then on.
+    # OpenGL frees objects of the current context by number. If the context of another renderer
+    # were current, its objects would be freed and its images black from then on.
     gl.make_current()
     context.free()
     gl.free()
@@ -144,7 +144,7 @@ def _set_view(view: mujoco.MjvGLCamera, camera: CameraModel) -> None:
     view.up = -R[:, 1]
     near = view.frustum_near
     (fx, fy), (cx, cy) = camera.focal, camera.principal
-    # Pixel centres lie at whole numbers, so the image's edges lie half a pixel outside.
+    # Pixel centres lie at whole numbers, so the image's edges lie half a pixel further out.
     view.frustum_center = near * ((camera.width - 1) / 2 - cx) / fx
     view.frustum_width = near * camera.width / fx / 2
     view.frustum_top = near * (cy + 0.5) / fy
@@ -153,7 +153,7 @@ def _set_view(view: mujoco.MjvGLCamera, camera: CameraModel) -> None:
 
 
 class EGLCamera:
-    """The workplace seen through a lens, noise and all."""
+    """Camera that renders the workplace with lens distortion, blur and noise."""
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class EGLCamera:
 
 
 def hidden_markers(world: World, model: CameraModel, markers: list[Marker]) -> set[int]:
-    """Ids of markers of which a corner or the centre is occluded now, by casting rays."""
+    """Ids of markers with an occluded corner or centre, found by casting rays."""
     eye, poses = model.pose[:3, 3].copy(), world.marker_poses()
     geom, normal = np.zeros(1, dtype=np.int32), np.zeros(3)
     hidden = set()
@@ -196,7 +196,7 @@ def hidden_markers(world: World, model: CameraModel, markers: list[Marker]) -> s
             length = np.linalg.norm(point - eye)
             ray = (point - eye) / length
             hit = mujoco.mj_ray(world.model, world.data, eye, ray, None, 1, -1, geom, normal)
-            # The marker's own plate is hit at its full distance, give or take its thickness.
+            # A ray to a visible point hits the plate itself, up to the plate's thickness.
             if 0 <= hit < length - 5e-3:
                 hidden.add(marker.id)
                 break
@@ -217,7 +217,7 @@ def open_camera(
         world: World to render.
         kind: "egl" renders everything; "synthetic" draws the markers only and needs no
             OpenGL; "auto" renders where that is possible.
-        model: Another camera than the world's own.
+        model: Camera to use instead of the world's own.
         rng: Source of the image noise.
         noise: Blur and noise of the sensor.
 
@@ -244,20 +244,20 @@ def open_camera(
     )
 
 
-# Height of the board above the marker, towards the camera: clear of the gripper [m].
+# Distance of the board from the marker, towards the camera and clear of the gripper [m].
 _BOARD_HEIGHT = 0.10
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraChange:
-    """Size of one change of a camera's pose."""
+    """Size of one change of a camera's pose and focus."""
 
     distance: float = 0.10
     """Translation in a random direction [m]."""
     angle: float = np.deg2rad(10.0)
     """Rotation about a random axis [rad]."""
     focus: float = 1.0
-    """Factor on its focal length."""
+    """Factor on the focal length."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=["focus"], not_negative=["distance", "angle"])
@@ -269,16 +269,16 @@ class CameraChange:
         rng: np.random.Generator,
         attempts: int = 10_000,
     ) -> CameraModel:
-        """A changed camera that still sees what it is there for.
+        """A changed camera that still sees the watched points.
 
         Args:
-            model: The camera as it is.
+            model: The camera before the change.
             watched: Points that stay in its view [m].
             rng: Source of the directions.
-            attempts: Directions tried.
+            attempts: Largest number of random directions to try.
 
         Raises:
-            ValueError: If the points are out of view whatever the direction.
+            ValueError: If no attempt keeps the points in view.
         """
         (fx, fy), s = model.focal, self.focus
         for _ in range(attempts):
@@ -296,7 +296,7 @@ class CameraChange:
 
 
 class ChangingCamera:
-    """Implements the `Camera` protocol by one camera after the other.
+    """Implements the `Camera` protocol with a camera that can be replaced at any time.
 
     Attributes:
         history: Start time and true model of each camera so far.
@@ -307,7 +307,7 @@ class ChangingCamera:
 
         Args:
             model: Model of the first camera.
-            opened: Opens a camera.
+            opened: Function that opens a camera.
         """
         self._open = opened
         self._camera = opened(model)
@@ -315,11 +315,11 @@ class ChangingCamera:
 
     @property
     def model(self) -> CameraModel:
-        """The true camera now."""
+        """True model of the current camera."""
         return self.history[-1][1]
 
     def change(self, time: float, model: CameraModel) -> None:
-        """See through another camera from a time on [s]."""
+        """Use another camera from a time on [s]."""
         self._camera = self._open(model)
         self.history.append((time, model))
 
@@ -349,13 +349,13 @@ class OcclusionInterval:
 
 
 class ScriptedOcclusion:
-    """Holds a board between the camera and a marker, wherever that moves."""
+    """Holds a board between the camera and a marker, wherever the marker moves."""
 
     def __init__(self, world: World, intervals: Sequence[OcclusionInterval]):
         self._world, self._intervals = world, tuple(intervals)
 
     def update(self) -> None:
-        """Move the board to where it belongs now."""
+        """Move the board in front of a marker that is occluded now, or out of the scene."""
         world, place = self._world, np.array(NOWHERE)
         for interval in self._intervals:
             if 0 <= world.time - interval.start < interval.duration:

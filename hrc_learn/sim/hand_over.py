@@ -1,8 +1,7 @@
-"""A worker who lays an object on the bench, takes it up again, and holds it out to the robot.
+"""Handover: a worker lays an object on the bench, picks it up, and holds it out to the robot.
 
-A controller that tracks the hand has to tell these movements apart: only the third one is an
-offer. Once the gripper has come to the offered object, the worker brings it on into the
-gripper.
+A controller that tracks the hand has to distinguish these movements: only the third one is an
+offer. Once the gripper has reached the offered object, the worker moves it into the gripper.
 """
 
 from __future__ import annotations
@@ -27,22 +26,24 @@ from hrc_learn.sim.worker_visit import (
 )
 
 RIGHT = 1
-"""Hand that holds the object, as numbered in the worker's capsules."""
+"""Number of the hand that holds the object (0 left, 1 right)."""
 HELD_OUT = np.array([0.0, -0.09, -0.03])
 """Offset from the grip of the hand to the middle of an object held by its near end, in the base
-frame [m]; the worker faces -y. A hand's capsule is thicker than its fingers.
+frame [m]; the worker faces -y. It is large, as a hand's capsule is thicker than fingers.
 """
 BENCH, BACK, HAND_OVER = "to the bench", "back", "hand over"
 """Kinds of hand movements."""
 
 UNHURRIED = HumanSpeeds(reaching=0.9)
-"""Hand speeds during handovers: half the largest ones, so that a handover takes about a second.
+"""Speeds during handovers: hands move at about half their largest speed, so that a handover
+takes about a second.
 """
 
-# Offset from the bench's edge and height at which the object is held out [m]: a forearm over
-# it, at the height of the elbow.
+# Ranges of distance from the bench's edge and of height above the bench at which the object is
+# held out [m]: a forearm's length over the bench, at the height of the elbow.
 _OVER_BENCH, _HEIGHT = (0.26, 0.42), (0.24, 0.36)
-# Offset to the right of the worker [m], and x between which an arm reaches it well.
+# Range of the object's x relative to the worker, whose right is -x, and range of x that an arm
+# reaches well [m].
 _ASIDE, _WITHIN = (-0.22, 0.04), (0.08, 0.42)
 # Largest lean while holding an object out [rad]; places tried until one is within reach.
 _LEANS, _TRIED = 0.45, 200
@@ -77,7 +78,7 @@ class HandOver:
     """Speeds of the worker."""
 
     def starting(self, time: float) -> HandOver:
-        """The same, later by a time [s]."""
+        """The same handover, delayed by a time [s]."""
         visit = replace(self.visit, time=self.visit.time + time)
         return replace(
             self,
@@ -94,7 +95,7 @@ class HandOver:
         return self.visit.worker.grip(ends, RIGHT) + HELD_OUT
 
     def brought_to(self, place: Float[np.ndarray, "3"], now: float) -> HandOver:
-        """Bring the object to a place from this time on, as far as the arm reaches [m, s]."""
+        """Move the object to a place [m] from a time on [s], as far as the arm reaches."""
         visit, last = self.visit, self._last()
         target = in_worker_frame(visit.worker, last.place, last.heading, place - HELD_OUT)
         lean = visit.worker.lean_to(target, RIGHT)
@@ -106,7 +107,7 @@ class HandOver:
         return self._continued(script)
 
     def left(self, now: float) -> HandOver:
-        """Release the object and walk away from this time on [s]."""
+        """Release the object and walk away, from a time on [s]."""
         visit, last = self.visit, self._last()
         worker = visit.worker
         script = PoseWriter(last, now, self.speeds, worker.config.stature)
@@ -122,7 +123,7 @@ class HandOver:
         return WorkerPose(row[:2], float(row[2]), float(row[3]), row[4:].reshape(2, 3))
 
     def _continued(self, script: PoseWriter) -> HandOver:
-        """The same, with what is written from a moment after the last pose on."""
+        """The same handover, continued by the poses of a script."""
         visit = self.visit
         longer = replace(
             visit,
@@ -135,7 +136,7 @@ class HandOver:
 def random_hand_over(
     worker: Worker, rng: np.random.Generator, *, bench: Box, thickness: float
 ) -> HandOver:
-    """Draw a worker's walk to the far side of the bench, with an object for the robot.
+    """Draw a handover: a worker walks to the bench's far side with an object for the robot.
 
     Args:
         worker: Body of the worker.
@@ -150,19 +151,19 @@ def random_hand_over(
     script = BenchScript(worker, rng, bench, (0.15, 0.45), sway=0.1)
     place, target, lean = _held_out(worker, rng, script)
     script.enter(rng.uniform(1.0, 3.0), pace, RIGHT)
-    # Down on the bench, near its edge, to the worker's right.
+    # The object is laid down near the edge of the bench, to the worker's right.
     x, y = script.stand[0] + rng.uniform(-0.25, 0.0), script.edge - rng.uniform(0.10, 0.16)
     laid_at = script.own(np.array([x, y, script.top + thickness]) - HELD_OUT)
     reaches: list[Reach] = []
 
     def note(kind: str) -> None:
-        """Note the movement that was written last."""
+        """Record the last movement of the script."""
         reaches.append(Reach(kind, script.times[-2], script.times[-1]))
 
     script.go(heading=script.facing, hands=script.ready)
     note(BACK)
     handled: list[float] = []
-    for _ in range(2):  # lay it down, then take it up again
+    for _ in range(2):  # lay the object down, then pick it up
         script.wait(rng.uniform(0.6, 1.5))
         script.reach(laid_at, RIGHT)
         note(BENCH)

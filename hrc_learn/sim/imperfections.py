@@ -19,13 +19,12 @@ from hrc_learn.vision import ImageNoise
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
-# Heights are drawn for as many objects, so that further draws do not depend on their number.
+# Heights are always drawn for this many objects: later draws do not depend on the real number.
 _MOST_OBJECTS = 8
-# Constant lag of the simulated servos [s]: with it a path is kept to
-# 0.4 mm, without to 1.5 mm.
+# Constant lag of the simulated servos [s]: compensation reduces path errors from 1.5 to 0.4 mm.
 _SIMULATED_SERVOS = 0.01
-# From a control step to the arm braking as hard as it does [s]; and what may stand out from the
-# capsules of a person and an arm, with the error of its calibration [m].
+# Time from a control step to full braking of the arm [s]; distance by which person and arm may
+# protrude from their capsules, with the arm's calibration error [m].
 _RAMP, _BEYOND_CAPSULES = 0.02, 0.05
 _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
@@ -35,7 +34,7 @@ class Imperfections:
     """Sizes of the errors of a run, by default those of an ordinary laboratory.
 
     docs/concepts/experiments.md gives the sources. Standard deviations belong to normal
-    distributions. Ranges are uniform, to both sides.
+    distributions. A range is the largest error of a uniform distribution around zero.
     """
 
     encoder_noise: float = 1e-4
@@ -57,19 +56,19 @@ class Imperfections:
     gravity_error: float = 0.02
     """Range of the error of the arm's own gravity compensation, a fraction of its weight."""
     payload: float = 0.5
-    """Largest mass at the hand of which the arm does not know [kg]."""
+    """Largest unknown mass at the hand [kg]."""
     torque_noise: float = 0.2
     """Standard deviation of an estimated external joint torque [N m]."""
     torque_lag: float = 0.010
     """Time constant of the low-pass filter of that estimate [s]."""
     base_error: float = 1e-3
-    """Range of the position of the base along each axis [m]."""
+    """Range of the base's position error along each axis [m]."""
     base_turn: float = 1e-3
-    """Range of the turn of the base about the vertical [rad]."""
+    """Range of the base's rotation error about the vertical [rad]."""
     tool_error: float = 1e-3
-    """Range of the tool centre point along each axis [m]."""
+    """Range of the tool centre point's error along each axis [m]."""
     tool_turn: float = 3e-3
-    """Range of the turn of the tool about each axis [rad]."""
+    """Range of the tool's rotation error about each axis [rad]."""
     image_delay: float = 0.080
     """Delay between exposure and detected markers [s]."""
     image_loss: float = 0.20
@@ -79,16 +78,16 @@ class Imperfections:
     image_blur: float = 0.5
     """Standard deviation of the blur, beyond the camera's own [px]."""
     table_height: float = 0.02
-    """Range of the height of the table's top [m]."""
+    """Range of the height error of the table's top [m]."""
     object_height: float = 0.005
-    """Range of the height of each object [m]."""
+    """Range of the height error of each object [m]."""
     object_yaw: float = math.pi
     """Range of the yaw of objects on the table [rad]."""
     teaching_error: float = 5e-4
-    """Range of a place to which a person leads the arm, along each axis [m]."""
+    """Range of the error, along each axis, when a person guides the arm to a place [m]."""
 
     person_noise: float = 0.01
-    """Standard deviation of where a person is seen, along each axis [m]."""
+    """Standard deviation of a person's observed position along each axis [m]."""
     person_delay: float = 0.080
     """Delay between exposure and the estimated body pose of a person [s]."""
     person_loss: float = 0.20
@@ -111,7 +110,7 @@ class Imperfections:
         return cls()
 
     def scaled(self, factor: float) -> Imperfections:
-        """All of them so many times as large, fractions up to 0.9, the yaw up to any.
+        """All imperfections times a factor; fractions are limited to 0.9, the yaw to pi.
 
         Raises:
             ValueError: If the factor is negative.
@@ -155,8 +154,8 @@ class Imperfections:
         Args:
             rng: Random generator, also for the noise during the run.
             joints: Number of joints of the arm.
-            size: Size of the hand relative to the Franka hand. Heights of table and objects
-                vary in proportion, and an unknown load with the weight of what it lifts.
+            size: Size of the hand relative to the Franka hand. Height errors of table and
+                objects grow in proportion, and an unknown load with the cube, as weights do.
         """
 
         def uniform(size: int | None = None):
@@ -186,7 +185,7 @@ class DrawnImperfections:
     encoder_offset: Float[np.ndarray, " joints"]
     """Encoder offsets: reading minus true position [rad]."""
     gravity_error: float
-    """Fraction of the arm's weight that is compensated too much."""
+    """Excess of the gravity compensation, as a fraction of the arm's weight."""
     payload: float
     """Unknown mass at the hand [kg]."""
     base_shift: Float[np.ndarray, "3"]
@@ -196,24 +195,24 @@ class DrawnImperfections:
     tool_shift: Float[np.ndarray, "3"]
     """True minus assumed position of the tool, in the gripper's frame [m]."""
     tool_turn: Float[np.ndarray, "3"]
-    """Rotation vector in the hand's frame [rad]."""
+    """True minus assumed turn of the tool: rotation vector in the hand's frame [rad]."""
     table_height: float
-    """Height of the table's top above where it is believed to be [m]."""
+    """True minus assumed height of the table's top [m]."""
     object_heights: Float[np.ndarray, " objects"]
     """True minus assumed height of each object [m]."""
 
     def apply(self, spec: mujoco.MjSpec) -> None:
-        """Give a scene's description the errors of the arm: calibration, friction, weights."""
+        """Add the errors of the arm to a scene description: calibration, friction, weights."""
         base, hand = spec.body("link0"), spec.body("hand")
         base.pos = base.pos + self.base_shift
         base.quat = _turned(base.quat, np.array([0.0, 0.0, self.base_turn]))
-        # The hand's own frame: first along its axes, then turned about them.
+        # The hand is shifted along the axes of its own frame, then turned about them.
         shift = np.zeros(3)
         mujoco.mju_rotVecQuat(shift, self.tool_shift, hand.quat)
         hand.pos = hand.pos + shift
         hand.quat = _turned(hand.quat, self.tool_turn)
         if self.payload > 0:
-            # At the palm; a small sphere's inertia, which matters less than its mass.
+            # At the palm, as a small sphere: the inertia matters less than the mass.
             load = hand.add_body(name="payload", pos=(0.0, 0.0, 0.03))
             load.add_geom(
                 name="payload",
@@ -228,7 +227,7 @@ class DrawnImperfections:
             if joint.type != mujoco.mjtJoint.mjJNT_HINGE:  # fingers slide, objects are free
                 continue
             joint.frictionloss = self.sizes.joint_friction
-            # MuJoCo's usual 0.02 s make friction push a joint on that its servo brakes harder.
+            # With MuJoCo's default of 0.02 s, friction would drive a joint that is braked hard.
             joint.solref_friction = (2 * spec.option.timestep, 1.0)
             joint.parent.gravcomp = 1.0 + self.gravity_error
 
@@ -245,9 +244,9 @@ class DrawnImperfections:
 
 
 class CommandChannel:
-    """Delays commands on their way to an arm; each takes its own time, none overtakes another.
+    """Delays commands on their way to an arm: each by its own delay, but in their order.
 
-    The arm then follows with its servos' lag and its driver's limits of acceleration.
+    The arm then follows with its servos' lag and its driver's acceleration limits.
     """
 
     def __init__(self, drawn: DrawnImperfections, acceleration: Float[np.ndarray, " joints"]):
@@ -278,7 +277,7 @@ class CommandChannel:
         self._pending.append((due, np.array(joint_velocity, dtype=float)))
 
     def advance(self, time: float, dt: float) -> Float[np.ndarray, " joints"]:
-        """Joint velocity that the servos follow in a step of dt from a time on [rad/s]."""
+        """Joint velocity that the servos follow in a step of `dt` from `time` on [rad/s]."""
         # Clocks add up steps of rounded length: a nanosecond early still counts as due.
         while self._pending and self._pending[0][0] <= time + 1e-9:
             self._wanted = self._pending.popleft()[1]

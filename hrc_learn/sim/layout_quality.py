@@ -1,9 +1,9 @@
 """Quality of a layout for an arm, from kinematics alone.
 
 The arm follows the paths of the job without physics. The smallest margin to joint limits,
-singularities and furniture is the quality of the posture it starts from. Above the table the
-camera must also see the marker on the gripper, within half a turn of the gripper: a parallel
-gripper grasps the same after half a turn.
+singularities and furniture is the quality of the starting posture. Above the table, the camera
+must also see the marker on the gripper, for all turns of the gripper within half a turn: after
+half a turn, a parallel gripper grasps in the same way.
 """
 
 import math
@@ -25,14 +25,15 @@ from hrc_learn.vision import CameraModel
 type Clearances = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Distance of an arm from the furniture and from itself at joint positions [m]."""
 
-# Values of quality 1: distance from limits [rad], smallest singular value [m/rad], distance
-# from furniture and from itself [m], speed of joints by their limits.
+# Values that give quality 1: distance from joint limits [rad], smallest singular value [m/rad],
+# distances of the arm from furniture and from itself [m]. Largest joint speed without loss of
+# quality, as a fraction of its limit.
 _MARGIN, _SINGULAR, _CLEAR, _APART, _SPEED = 0.25, 0.08, 0.04, 0.01, 0.8
-# Tracking error beyond which a pose is not reached, the larger of metres and radians.
+# Tracking error from which on a pose counts as not reached: distance [m] and angle [rad].
 _LOST = 5e-3
 # Samples of a path to a shelf, of one across the table, and of half a turn above it.
 _STEPS, _ACROSS, _HALF_TURN = 60, 8, 24
-_DURATION = 14.0  # which the way to a shelf takes [s]
+_DURATION = 14.0  # duration of the motion to a shelf [s]
 
 
 def clearance_quality(
@@ -70,7 +71,7 @@ def path_quality(
     level_at: float,
     start: Float[Tensor, "postures joints"],
 ) -> Float[Tensor, " postures"]:
-    """Smallest quality along a path to a shelf, the gripper tilted by the expert's rule.
+    """Smallest quality along a path to a shelf, with the tilt of `coarse_orientation`.
 
     Args:
         robot: The arm.
@@ -90,7 +91,7 @@ def path_quality(
     path = Pose(position, coarse_orientation(position, level_at))
     q, error = follow_poses(robot, path, start)
     least = _quality(robot, clearances, q, error).amin(0)
-    # A minimum-jerk motion is 1.875 times as fast as on average.
+    # The peak speed of a minimum-jerk motion is 1.875 times its mean speed.
     speed = (q[1:] - q[:-1]).abs() * 1.875 * _STEPS / _DURATION
     load = (speed / robot.limits.velocity).amax(-1).amax(0)
     return torch.where(load > _SPEED, least * (_SPEED / load), least)
@@ -98,7 +99,7 @@ def path_quality(
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedTurns:
-    """Half turn of the gripper above the table, and the side of the marker."""
+    """Turns that the gripper may take above the table, and the marker's side of the hand."""
 
     plate: Plate
     """Plate that carries the marker."""
@@ -119,7 +120,7 @@ def marked_turns(
     reach: tuple[float, float],
     hover: Float[Tensor, " joints"],
 ) -> MarkedTurns:
-    """Best side of the marker and best half turn of the gripper above a table.
+    """Best side of the hand for the marker, and best half turn of the gripper above a table.
 
     Args:
         robot: The arm.
@@ -138,7 +139,7 @@ def marked_turns(
         for first in range(_HALF_TURN + 1):
             window = slice(first, first + _HALF_TURN + 1)
             seen, least = float(good[window].mean()), float(reached[window].amin())
-            # Among windows of equal quality, to 1 %, the one in the middle.
+            # Views count first, to 1 %, then quality, less the distance from the middle.
             off_middle = abs(first - _HALF_TURN / 2) / _HALF_TURN
             score = (round(seen, 2), least - off_middle)
             if best is None or score > best[0]:
@@ -179,7 +180,7 @@ def _turned_above_table(
 
 
 def _other_side(plate: Plate) -> Plate:
-    """The same plate on the other side of the hand, turned by half a turn about its axis."""
+    """The same plate on the other side of the hand: half a turn about the hand's axis."""
     x, y, z = plate.position
     half = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     turned = quaternion.multiply(half, torch.tensor(plate.orientation, dtype=torch.float64))

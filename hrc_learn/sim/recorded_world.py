@@ -1,7 +1,7 @@
-"""A world as it is recorded and drawn: poses of all bodies, and the arm with its meshes.
+"""Recording and drawing of a world: poses of all bodies, and the arm with its meshes.
 
-The physics knows the arm by its capsules: meshes would cost time in each step and change the
-contacts. Pictures are rendered from a second model that takes over the state of the first.
+The physics uses capsules of the arm: meshes would cost time in each step and change the
+contacts. Pictures are rendered from a second model, which copies the state of the first.
 """
 
 from collections.abc import Callable, Collection
@@ -24,7 +24,7 @@ from hrc_learn.sim.world import World
 
 
 class MovingBodies:
-    """The links of the arm, its fingers, the objects, and what people put in the way."""
+    """Links and fingers of the arm, objects, and obstacles and bodies of people."""
 
     def __init__(self, world: World):
         self._world = world
@@ -46,7 +46,7 @@ class MovingBodies:
         positions: Float[np.ndarray, "time bodies 3"],
         orientations: Float[np.ndarray, "time bodies 4"],
     ) -> tuple[Body, ...]:
-        """The bodies as they are to be drawn, along poses collected over time."""
+        """The bodies with shapes to draw, along recorded poses."""
         bodies = []
         for i, name in enumerate(self.names):
             capsules, boxes = _shapes(self._world.model, self._indices[i])
@@ -77,9 +77,9 @@ def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tupl
             start, end = _triple(centre - half), _triple(centre + half)
             capsules.append(Capsule(start=start, end=end, radius=float(size[0]), colour=colour))
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            # All boxes of ours are turned by multiples of a quarter turn.
+            # All our boxes are turned by multiples of a quarter turn.
             half_size, name = _triple(np.abs(R @ size)), model.geom(g).name
-            # Meshes of the arm show all but the markers on it.
+            # Boxes with a name are drawn in addition to meshes, which lack the marker plates.
             name = name if name.endswith("_plate") else ""
             box = Box(centre=_triple(centre), half_size=half_size, colour=colour, name=name)
             boxes.append(box)
@@ -98,7 +98,7 @@ class NearestPair(NamedTuple):
     """Nearest pair of points of worker and robot."""
 
     distance: float
-    """Between their surfaces; negative is how deep they overlap [m]."""
+    """Distance between the surfaces; negative is the depth of the overlap [m]."""
     points: Float[np.ndarray, "2 3"]
     """Nearest point on the robot or its load, and on the worker [m]."""
     arm_geom: str
@@ -107,7 +107,7 @@ class NearestPair(NamedTuple):
 
 
 class WorkerDistance:
-    """Finds the smallest distance between the worker and all of the robot in a world."""
+    """Finds the smallest distance between the worker and the robot in a world."""
 
     def __init__(self, world: World):
         """Find the geoms.
@@ -131,8 +131,8 @@ class WorkerDistance:
         model, data = self._world.model, self._world.data
         loads = [model.geom(name).id for name in held]
         geoms = np.concatenate([self._arm, np.array(loads, dtype=int)])
-        # Distances of spheres around the geoms are lower bounds. Pairs are measured in their
-        # order, until the bound exceeds what was found: a dozen of four hundred.
+        # Distances of spheres around the geoms are lower bounds. Pairs are measured in order of
+        # these bounds, until a bound exceeds the smallest distance: a dozen of four hundred.
         centres = data.geom_xpos[geoms][:, None] - data.geom_xpos[self._worker]
         radii = model.geom_rbound[geoms][:, None] + model.geom_rbound[self._worker]
         bounds = (np.linalg.norm(centres, axis=-1) - radii).ravel()
@@ -150,14 +150,14 @@ class WorkerDistance:
 
 
 class MotionLog:
-    """Remembers where everything that moves was at each step, and how near the worker was."""
+    """Records the poses of all moving bodies at each step, and the worker's distance."""
 
     def __init__(self, world: World, advance: Callable[[float], None] | None = None):
-        """Begin.
+        """Begin with an empty log.
 
         Args:
             world: The world.
-            advance: Lets a time pass in it [s]; None: its own physics does.
+            advance: Function that lets a time pass in the world [s]; None: `World.advance`.
         """
         self._world = world
         self._let_pass = advance or world.advance
@@ -171,7 +171,7 @@ class MotionLog:
         return len(self._poses)
 
     def advance(self, duration: float) -> None:
-        """Note where everything is, then let the world go on [s]."""
+        """Record all poses, then let a time pass in the world [s]."""
         if self._distance is not None:
             self._held.append(self._world.held())
             self._nearest.append(self._distance.now(self._held[-1]))
@@ -179,7 +179,7 @@ class MotionLog:
         self._let_pass(duration)
 
     def bodies(self, steps: int | None = None) -> tuple[Body, ...]:
-        """Everything that moved, as it is to be drawn.
+        """All moving bodies with shapes to draw, along their recorded poses.
 
         Args:
             steps: The first steps only.
@@ -214,7 +214,7 @@ class DrawnWorld:
 
     Attributes:
         model: Model to render.
-        data: As the world was at the last `update`.
+        data: State of the world at the last `update`.
     """
 
     def __init__(self, world: World):
@@ -223,7 +223,7 @@ class DrawnWorld:
         for body in spec.bodies:
             if meshes := arm_meshes(world.arm.robot, body.name):
                 for geom in body.geoms:
-                    # Plates and the pictures on them are no part of the meshes.
+                    # The meshes do not include the plates and the pictures on them.
                     if "marker" not in geom.name:
                         geom.group = _HIDDEN
                 for mesh in meshes:
@@ -233,7 +233,7 @@ class DrawnWorld:
         self.update()
 
     def update(self) -> None:
-        """Take over where everything is."""
+        """Copy the poses of all bodies from the world."""
         data, now = self.data, self._world.data
         data.qpos[:], data.time = now.qpos, now.time
         data.mocap_pos[:], data.mocap_quat[:] = now.mocap_pos, now.mocap_quat
@@ -242,14 +242,14 @@ class DrawnWorld:
 
 
 class RecordedWorld:
-    """A run as its recording shows it, to be rendered at any of its steps.
+    """A recorded run, which can be rendered at any of its steps.
 
-    It needs no more than the recording: a run of any task, in simulation or not, can be looked
-    at without the world that it ran in.
+    It needs the recording only: runs of any task, simulated or not, can be shown without the
+    world in which they took place.
 
     Attributes:
-        model: Model to render. Its bodies have no joints; each is put where it was.
-        data: As the run was at the last `show`.
+        model: Model to render. Its bodies have no joints; `show` places each of them.
+        data: State of the run at the last `show`.
     """
 
     def __init__(self, recording: RunRecording):
@@ -273,20 +273,20 @@ class RecordedWorld:
         self.show(0)
 
     def show(self, step: int) -> None:
-        """Put everything where it was at a step."""
+        """Place all bodies where they were at a step."""
         for number, body in enumerate(self._bodies):
             self.data.mocap_pos[number] = body.position[step]
             self.data.mocap_quat[number] = body.orientation[step]
         self.update()
 
     def update(self) -> None:
-        """Make ready to be rendered."""
+        """Compute the poses for rendering."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
 
 def add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: MeshFile) -> None:
-    """Add a shape that is seen, touches nothing and weighs nothing to a body."""
+    """Add a mesh to a body for display only: it has no contacts and no mass."""
     for part in read_mesh(mesh.path):
         placed = part.placed(mesh)
         name = f"mesh{len(spec.meshes)}"

@@ -42,7 +42,7 @@ OCCLUDER_COLOUR = (0.55, 0.36, 0.30, 1.0)
 WORKER_BODIES = tuple(f"worker_{part}" for part in PARTS)
 """Names of the bodies, and of the capsules, that a worker is made of."""
 WORKER_ITEM = "worker_item"
-"""Name of what the worker puts on the table: seen, but nothing can touch it."""
+"""Name of the object that the worker puts on the table; it is visible but has no contacts."""
 NOWHERE = (0.0, 0.0, -5.0)
 """Position of objects that are not in the scene: far below the floor [m]."""
 
@@ -148,14 +148,14 @@ _BEYOND = 0.04  # distance of the plate's middle from the links above the hand [
 
 
 def marked_plate(size: float = 1.0, thickness: float = 0.0) -> Plate:
-    """The plate on the hand, by which the camera finds it.
+    """The marker plate on the hand.
 
     Args:
         size: Size of the hand relative to the Franka hand.
         thickness: Radius of the links above the hand, beyond which the plate sticks out [m].
     """
-    # It sticks out sideways, clear of the forearm as seen from above, and is mounted off the
-    # middle: it is as wide as objects are, and must not be the first to meet a board.
+    # The plate sticks out sideways, so that the forearm does not hide it from above. It is as
+    # wide as objects and mounted off the middle, so that it does not touch boards first.
     return Plate(
         marker=Marker(HAND_MARKER, 0.048 * size),
         position=(-0.008 * size, max(0.145 * size, thickness + _BEYOND), 0.02 * size),
@@ -169,18 +169,18 @@ def _marked_arm() -> ArmModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class UnmarkedLook:
-    """Things, light and prints of a scene without markers, drawn from a seed.
+    """Clutter, light and prints of a scene without markers, drawn from a seed.
 
-    The physics stays that of the marked scene without its plates: clutter is seen, and touches
-    nothing. Frames of markers stay as sites, true places to measure against.
+    The physics stays that of the marked scene without its plates: clutter is visible but has no
+    contacts. Frames of markers stay as sites, as ground truth for measurements.
     """
 
     seed: int = 0
     """Seed of clutter and light; the same object has the same print in every scene."""
     clutter: int = 10
-    """Papers and tools that lie about."""
+    """Number of small items on the rim of the table."""
     distractors: int = 2
-    """Cartons like the object with another print."""
+    """Number of cartons like the object with another print."""
     shadows: bool = True
     """True: a lamp casts shadows."""
 
@@ -259,13 +259,13 @@ class SceneConfig:
 def unmarked(
     scene: SceneConfig, look: UnmarkedLook, place: Float[np.ndarray, "3"] | None = None
 ) -> SceneConfig:
-    """The scene without any marker, with a look in their place.
+    """The scene without markers, with another look.
 
     Args:
         scene: Scene with markers.
         look: Look of the scene.
-        place: Place on the tool that stands for it, in the tool's frame [m]: measures refer to
-            it. None: where the marker was.
+        place: Point on the tool that replaces the marker in measurements, in the tool's frame
+            [m]; None: the marker's place.
     """
     arm, plate = scene.arm, scene.arm.marker
     if plate is not None:
@@ -314,8 +314,8 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
 
 
 def add_surroundings(spec: mujoco.MjSpec) -> None:
-    """Add light, floor, pedestal and sky, and say how finely they are drawn."""
-    spec.visual.quality.offsamples = 0  # four times cheaper without a GPU
+    """Add light, floor, pedestal and sky, and set the quality of rendering."""
+    spec.visual.quality.offsamples = 0  # four times faster without a GPU
     spec.visual.quality.shadowsize = 0
     spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
     spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
@@ -353,7 +353,7 @@ def _add_box(spec: mujoco.MjSpec, box: Box):
 def _add_object(spec: mujoco.MjSpec, item: ObjectConfig, printed: bool) -> None:
     body = spec.worldbody.add_body(name=item.name, pos=(0.22, 0.5, item.half_size[2]))
     body.add_freejoint(name=item.name)
-    friction = (1.0, 0.02, 0.001)  # sliding, about the normal [m], rolling [m]
+    friction = (1.0, 0.02, 0.001)  # sliding, torsional [m], rolling [m]
     add_box(
         body, item.name, item.half_size, item.colour, mass=item.mass, friction=friction, **FIRM
     )
@@ -371,8 +371,8 @@ _FEELS_WORKER = 2
 
 
 def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig, ...]) -> None:
-    """Add a worker with contacts that exert no force: the worker does not yield, and a body
-    moved by hand would push with any force.
+    """Add a worker whose contacts exert no force: bodies with a prescribed motion do not yield
+    and would push with any force.
     """
     for mover in ("link0", *(item.name for item in objects)):
         for geom in spec.body(mover).find_all(mujoco.mjtObj.mjOBJ_GEOM):
@@ -390,7 +390,7 @@ def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig
             rgba=colour,
             contype=_FEELS_WORKER,
             conaffinity=0,
-            # Contacts are found as ever, but exert a force from a depth of 1 m on only.
+            # Contacts are detected as usual, but exert a force only from a depth of 1 m on.
             margin=-1.0,
             gap=1.0,
         )

@@ -20,18 +20,18 @@ from hrc_learn.protocols import Touch
 
 FASTEST = 1e3
 """Largest plausible speed of a coordinate [m/s or rad/s]: the arm's joints reach 2.6 rad/s, and
-a fall takes 100 s to reach it. MuJoCo itself objects at 1e10 only."""
+a falling object reaches it after 100 s. MuJoCo itself warns at 1e10 only."""
 
 _INDEXED = {
     int(mujoco.mjtWarning.mjWARN_BADQPOS): "qpos",
     int(mujoco.mjtWarning.mjWARN_BADQVEL): "qvel",
     int(mujoco.mjtWarning.mjWARN_BADQACC): "qacc",
 }
-"""Array that the place of a warning indexes, by the kind of the warning."""
+"""Array to which the index in a warning belongs, by the kind of the warning."""
 
 
 def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
-    """Mask over geoms: those of the named bodies and of all that hangs on them."""
+    """Mask of the geoms of the named bodies and of all bodies that they carry."""
     roots = {model.body(name).id for name in bodies}
     member = np.zeros(model.nbody, dtype=bool)
     for body in range(model.nbody):  # parents come before children
@@ -40,7 +40,7 @@ def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
 
 
 class ContactMonitor:
-    """Remembers every touch between two groups of geoms.
+    """Records every touch between two groups of geoms.
 
     Attributes:
         touches: Finished and running touches, in order of their start.
@@ -51,13 +51,13 @@ class ContactMonitor:
 
         Args:
             model: The model.
-            movers: Bodies that move, with all that hangs on them.
-            obstacles: Bodies they should not meet.
+            movers: Bodies that move, with all bodies that they carry.
+            obstacles: Bodies that they should not touch.
         """
         self._model = model
         mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
         self._mover, self._obstacle = mover, obstacle
-        # One look-up a contact: most steps end there, five times a control step.
+        # With one look-up for each contact, most steps need no further work.
         self._matters = np.outer(mover, obstacle) | np.outer(obstacle, mover)
         self.touches: list[Touch] = []
         self._running: dict[tuple[int, int], int] = {}
@@ -91,7 +91,7 @@ class ContactMonitor:
         self._running = running
 
     def pause(self) -> None:
-        """Take note of a step in which nothing that it watches touches."""
+        """Record a step without watched contacts."""
         self._running = {}
 
     def _current(self, data: mujoco.MjData) -> dict[tuple[int, int], float]:
@@ -112,7 +112,7 @@ class PhysicsError(RuntimeError):
 
     Attributes:
         time: Simulated time of the detection [s].
-        body: Body where it began; empty if unknown.
+        body: Body where the error began; empty if unknown.
     """
 
     def __init__(self, reason: str, time: float, body: str = ""):
@@ -121,7 +121,7 @@ class PhysicsError(RuntimeError):
         self.reason, self.time, self.body = reason, time, body
 
     def __reduce__(self):
-        # Trials run in other processes, and an exception is pickled by its message otherwise.
+        # Trials run in other processes. By default, pickling would keep the message only.
         return type(self), (self.reason, self.time, self.body)
 
 
@@ -166,13 +166,13 @@ class PhysicsWatch:
             PhysicsError: A value is not finite, MuJoCo warned, or time went backwards.
         """
         data = self._data
-        # Such a force spoils the accelerations of all bodies in the same step.
+        # A force that is not finite spoils the accelerations of all bodies in the same step.
         if len(bad := np.flatnonzero(~np.isfinite(data.xfrc_applied).all(-1))):
             body = self._model.body(int(bad[0])).name
             raise self._error("a force on it is not finite", body)
         if len(new := np.flatnonzero(data.warning.number != self._warnings)):
             kind = int(new[0])
-            # The body where it began: by the end of the step it may be everywhere.
+            # Name the body where the error began: by the end of the step it may have spread.
             place = int(data.warning.lastinfo[kind])
             body = self._body(place, _INDEXED[kind]) if kind in _INDEXED else ""
             raise self._error(f"MuJoCo warns: {mujoco.mju_warningText(kind, place)}", body)

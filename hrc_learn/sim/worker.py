@@ -1,4 +1,4 @@
-"""A worker: a body of capsules with the sizes of people, put into postures, and its tracker.
+"""A simulated worker: a body of capsules with human proportions, and its body tracker.
 
 The worker's frame lies on the floor under the pelvis: x forward, y to the left, z up. Arms and
 legs follow from hands and feet by the inverse kinematics of two links.
@@ -26,7 +26,7 @@ _THIGH, _SHANK, _ANKLE_HEIGHT, _FOOT = 0.245, 0.246, 0.039, 0.152
 _HIP_HEIGHT, _SHOULDER_HEIGHT, _CHIN_HEIGHT = 0.530, 0.818, 0.870
 _TRUNK = _SHOULDER_HEIGHT - _HIP_HEIGHT
 
-# Breadths and circumferences of men of 1.756 m, rounded, as fractions of it: Gordon et al.
+# Breadths and circumferences of men of 1.756 m, rounded, as fractions of this: Gordon et al.
 # (2014), "2012 anthropometric survey of U.S. Army personnel", NATICK/TR-15/007.
 _MEASURED = 1.756
 _TABLES = read_toml(Path(__file__).with_name("worker_parts.toml"))
@@ -48,31 +48,31 @@ PARTS = tuple(name for name, _, _ in _PARTS)
 REGIONS = tuple(_TABLES["regions"].get(kind, kind) for _, kind, _ in _PARTS)
 """Body regions of the capsules."""
 COLOURS: tuple[Colour, ...] = tuple(tuple(_TABLES["colours"][c]) for _, _, c in _PARTS)
-"""Radii of the capsules [m]."""
+"""Colours of the capsules (RGBA)."""
 # Numbers of the parts that come in pairs, left and right.
 _PAIRS = {
     kind: [PARTS.index(f"{kind}_{side}") for side in ("left", "right")]
     for kind in ("upper_arm", "forearm", "hand", "thigh", "shank", "foot")
 }
-# On which side of the body the parts of a pair are, along y.
+# Sign of y of the left and the right part of a pair.
 _SIDES = np.array([[1.0], [-1.0]])
 
-# Largest extension of an arm or leg: the bend of a straight one is undefined.
+# Largest extension of an arm or leg: the direction in which a straight one bends is undefined.
 _STRETCHED = 0.995
-# To which side elbows and knees point, in the worker's frame; the sign of y is the side's.
+# Directions in which left elbows and knees point, in the worker's frame; right ones have -y.
 _ELBOW, _KNEE = (-0.8, 0.2, -0.7), (1.0, 0.1, 0.0)
-# Of both arms and both legs, the left ones first: that, and lengths of their two links.
+# For both arms and both legs, left ones first: these directions, and lengths of the two links.
 _BENT_TO = np.array([(x, side * y, z) for x, y, z in (_ELBOW, _KNEE) for side in (1, -1)])
 _FIRST = np.array([[_UPPER_ARM], [_UPPER_ARM], [_THIGH], [_THIGH]])
 _SECOND = np.array([[_FOREARM], [_FOREARM], [_SHANK], [_SHANK]])
 # Position of the grip, as a fraction of the hand's length.
 _GRIP = 0.9
-# Backward shift of the pelvis per lean, for balance, as a fraction of the stature.
+# Backward shift of the pelvis for balance, as a fraction of the stature times sin(lean).
 _BALANCE = 0.06
-# Reduction of the head's lean relative to the trunk: people look up while they lean.
+# Lean of the head as a fraction of the trunk's: people look up while they lean.
 _HEAD_LEANS = 0.7
-_LIFT = 0.04  # of a foot in its swing, fraction of stature
-# Time over which velocities are averaged, noise against lag [s]: three images.
+_LIFT = 0.04  # height of a foot in its swing, as a fraction of the stature
+# Time over which velocities are averaged [s], a compromise of noise and lag: three images.
 _SPAN = 0.1
 IMAGE_RATE = 30.0
 """Images a second of an ordinary depth camera."""
@@ -89,7 +89,7 @@ class WorkerConfig:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> WorkerConfig:
-        """A woman or a man, of the 5th to the 95th percentile of the stature."""
+        """A random woman or man between the 5th and the 95th percentile of the stature."""
         low, high = STATURES["women" if rng.uniform() < 0.5 else "men"]
         # 5 and 95 % lie 1.645 deviations from the mean of a normal distribution.
         while True:
@@ -109,7 +109,7 @@ class Posture:
     lean: Float[np.ndarray, "*time"]
     """Forward lean of the trunk [rad]."""
     stride: Float[np.ndarray, "*time"]
-    """Distance of the left foot before the pelvis, and of the right foot behind it [m]."""
+    """Distance of the left foot in front of the pelvis, and of the right foot behind it [m]."""
     swing: Float[np.ndarray, "*time"]
     """Lifted foot and its relative height: 1 the left one, -1 the right one, 0 none."""
     hands: Float[np.ndarray, "*time 2 3"]
@@ -119,10 +119,10 @@ class Posture:
 
 
 class Worker:
-    """A body.
+    """Body of a worker.
 
     Attributes:
-        config: Stature and build of the worker.
+        config: Stature of the worker and height of the floor.
         radius: Radius of each capsule [m], in the order of `PARTS`.
     """
 
@@ -171,7 +171,7 @@ class Worker:
         _put(own, "pelvis", pelvis + _PELVIS_HALF * h * left, pelvis - _PELVIS_HALF * h * left)
         shoulders = neck + _SHOULDER_HALF * h * left, neck - _SHOULDER_HALF * h * left
         _put(own, "shoulders", *shoulders)
-        # The round top of the chest ends a little above the shoulders' joints.
+        # The round top of the chest ends a little above the shoulder joints.
         low, top = pelvis + 0.05 * h * up, neck + (0.015 - _RADII["chest"]) * h * up
         aside = _CHEST_HALF * h * left
         _put(own, "chest_left", low + aside, top + aside)
@@ -180,7 +180,7 @@ class Worker:
         head_up = _vector(np.sin(head), 0.0, np.cos(head))
         chin = neck + (_CHIN_HEIGHT - _SHOULDER_HEIGHT) * h * head_up
         _put(own, "neck", neck, chin)
-        # The face is before the spine.
+        # The face is in front of the spine.
         low = chin + 0.02 * h * forward + _RADII["head"] * h * head_up
         high = low + (1 - _CHIN_HEIGHT - 2 * _RADII["head"]) * h * head_up
         _put(own, "head", low, high)
@@ -222,8 +222,8 @@ class Worker:
         return pelvis, _vector(np.sin(lean), 0.0, np.cos(lean))
 
     def _hip_height(self, stride: float | np.ndarray) -> float | np.ndarray:
-        """Height of the pelvis over straight legs whose feet are this far before or behind it
-        [m].
+        """Height of the pelvis on straight legs whose feet are a stride in front of or behind
+        it [m].
         """
         leg = _STRETCHED * (_THIGH + _SHANK) * self._size
         reach = np.minimum(np.abs(stride), 0.8 * leg)
@@ -317,8 +317,8 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 class WorkerSensor:
     """Implements the `PersonTracker` protocol: a body tracker on an RGB-D camera.
 
-    Each end of a capsule has noise of its own in each image. Velocities come from these
-    positions alone, so they have noise as well, and lag behind by half of 0.1 s.
+    Each end of a capsule has independent noise in each image. Velocities come from these
+    positions alone, so they are noisy as well, and lag behind by half of 0.1 s.
     """
 
     def __init__(
@@ -329,7 +329,7 @@ class WorkerSensor:
         sizes: Imperfections,
         rng: np.random.Generator,
     ):
-        """Begin to watch now.
+        """Begin to track at the current time.
 
         Args:
             ends_at: True ends of the axes of all capsules at a time [s], in the base frame [m].
@@ -356,7 +356,7 @@ class WorkerSensor:
         return self._newest
 
     def _take(self, time: float) -> None:
-        """One image."""
+        """Take one image."""
         self._taken += 1
         ends = self._ends_at(time)
         noise = self._sizes.person_noise * self._rng.standard_normal(ends.shape)

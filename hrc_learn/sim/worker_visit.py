@@ -17,17 +17,17 @@ from jaxtyping import Float
 from hrc_learn.geometry import Box
 from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
 
-# Half of the step by which velocities are taken [s]: they err by 0.1 mm/s at most.
+# Half the step of central differences for velocities [s], whose error is 0.1 mm/s at most.
 _HALF_STEP = 1e-4
-# Step of a person who walks, fraction of the stature: two in a stride of 0.8 of it.
+# Length of a walking step, as a fraction of the stature; two steps make a stride.
 STEP = 0.40
 HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
-"""Height of a hand that puts down or takes what stands on the bench [m]."""
-# Distance of markers to the sides of the arm's working point [m].
+"""Height above the bench of a hand that puts down or takes an object [m]."""
+# Range of the distance of markers from the arm's working point, to either side [m].
 _BESIDE_GRIPPER = (0.11, 0.22)
-# Places for a marker that are tried: of ten one may be within reach where an arm hinders.
+# Number of places tried for a marker: near an arm, only one in ten may be within reach.
 _MARKERS_TRIED = 200
-# A minimum-jerk motion is at its fastest this many times as fast as on average.
+# Peak speed of a minimum-jerk motion relative to its mean speed.
 _PEAK = 1.875
 # Distance of the head of a leaning person from the hip, as a fraction of the stature.
 _HEAD_FROM_HIP = 0.47
@@ -35,7 +35,7 @@ _HEAD_FROM_HIP = 0.47
 
 @dataclass(frozen=True, kw_only=True)
 class HumanSpeeds:
-    """Largest speeds of a worker; ISO 13855 assumes these for people who approach a machine."""
+    """Largest speeds of a worker; walking and reaching are the approach speeds of ISO 13855."""
 
     walking: float = 1.6
     """Walking speed [m/s]."""
@@ -46,7 +46,7 @@ class HumanSpeeds:
 
     def drawn(self, rng: np.random.Generator) -> HumanSpeeds:
         """Speeds of one visit: 50 to 95 % of these."""
-        # The body sways up and down besides, and elbows may be faster than the hands.
+        # A margin remains: the body also sways up and down, and elbows may outrun hands.
         return HumanSpeeds(
             walking=rng.uniform(0.6, 0.9) * self.walking,
             reaching=rng.uniform(0.5, 0.85) * self.reaching,
@@ -96,7 +96,7 @@ class WorkerVisit:
     markers: Float[np.ndarray, "markers 3"]
     """Points that the worker reaches for [m]."""
     reaches: Float[np.ndarray, "markers 2"]
-    """Interval in which a hand is at each of them [s]."""
+    """Interval in which a hand is at each marker [s]."""
 
     @property
     def begin(self) -> float:
@@ -110,13 +110,13 @@ class WorkerVisit:
 
     @cached_property
     def _movements(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Change from each pose to the next, how far it leads [m], and in how many steps."""
+        """Change from each pose to the next, distance walked [m], and number of steps."""
         change = np.diff(self.poses, axis=0)
         length = np.linalg.norm(change[:, :2], axis=-1)
         return change, length, np.maximum(np.round(length / self.step), 1.0)
 
     def turned(self, angle: float) -> WorkerVisit:
-        """The same visit, all of it turned about the vertical through the base [rad]."""
+        """The same visit, turned by an angle about the vertical through the base [rad]."""
         poses = turned_about_base(self.poses, angle)
         poses[:, 2] += angle
         return replace(self, poses=poses, markers=turned_about_base(self.markers, angle))
@@ -146,7 +146,7 @@ class WorkerVisit:
             heading=np.asarray(row[..., 2]),
             lean=np.asarray(row[..., 3]),
             stride=np.asarray(stride),
-            # Squared: a knee that begins to bend would jump.
+            # Squared, so that a knee does not jump when it begins to bend.
             swing=np.asarray(np.maximum(walks, turns) * np.cos(phase) * np.abs(np.cos(phase))),
             hands=hands,
         )
@@ -180,7 +180,7 @@ class WorkerVisit:
         """Position of the object for the bench: in the hand, then where it was put down [m].
 
         Args:
-            time: Times [s].
+            time: Time [s].
             ends: `ends_at` that time, if known.
         """
         if time >= self.released:
@@ -218,7 +218,7 @@ class PoseWriter:
         self._add(self.now, duration)
 
     def go(self, **changes) -> None:
-        """Change some of the pose at the fastest that all speeds allow."""
+        """Change parts of the pose as fast as all speed limits allow."""
         following = self.now._replace(**changes)
         limits = self._speeds
         walked = np.linalg.norm(following.place - self.now.place) / limits.walking
@@ -252,14 +252,14 @@ class BenchScript(PoseWriter):
         across: tuple[float, float],
         sway: float,
     ):
-        """Draw stand, entrance and exit; `enter` begins.
+        """Draw the places to stand, to enter and to leave; `enter` begins the script.
 
         Args:
             worker: Body of the worker.
             rng: Random generator.
             bench: The table, whose far side (+y) is free.
-            across: Least and greatest x of the stand [m].
-            sway: Largest angle of the stand from facing the bench [rad].
+            across: Least and greatest x of the place to stand [m].
+            sway: Largest angle by which the worker there turns from facing the bench [rad].
         """
         self._worker, h = worker, worker.config.stature
         self.top = bench.centre[2] + bench.half_size[2]
@@ -288,7 +288,7 @@ class BenchScript(PoseWriter):
         return in_worker_frame(self._worker, self.stand, self.facing, point)
 
     def hands(self, target: np.ndarray, side: int) -> np.ndarray:
-        """Hands with one of them at a point, all in the worker's frame [m]."""
+        """Positions of both hands, one of them at a point, in the worker's frame [m]."""
         hands = self.ready.copy()
         hands[side] = target
         return hands
@@ -348,7 +348,7 @@ def random_visit(
     reaches: tuple[int, int] = (2, 4),
     is_clear: Callable[[Float[np.ndarray, "*time parts 2 3"]], bool] = lambda ends: True,
 ) -> WorkerVisit:
-    """Draw a visit to the side of the bench that is opposite to the robot.
+    """Draw a visit to the side of the bench opposite the robot.
 
     Args:
         worker: Body of the worker.
@@ -358,18 +358,18 @@ def random_visit(
         begin: Earliest and latest time of entering [s].
         reaches: Smallest and largest number of markers to reach for.
         is_clear: Predicate on postures that is true if they touch nothing at the bench; the
-            worker reaches only for what such postures reach.
+            worker reaches only for points that clear postures reach.
 
     Raises:
         ValueError: No marker under the arm is within reach.
     """
     pace = HumanSpeeds().drawn(rng)
     side = int(rng.uniform() < 0.8)  # most people are right-handed
-    # A little to one side of what is under the arm.
+    # The worker stands near the point under the arm, to either side of it.
     script = BenchScript(worker, rng, bench, (under[0] - 0.18, under[0] + 0.18), sway=0.15)
     script.enter(rng.uniform(*begin), pace, side)
     script.go(heading=script.facing)
-    # Down on the bench, near its edge, and away from what is under the arm.
+    # The object is put down near the edge of the bench, away from the point under the arm.
     x, y = script.stand[0] + rng.uniform(-0.2, 0.2), script.edge - rng.uniform(0.10, 0.16)
     spot = np.array([x, y, script.top + HAND_OVER_BENCH])
     script.reach(script.own(spot + np.array([0.0, 0.0, 0.12])), side)
@@ -432,5 +432,5 @@ def direction(vector: np.ndarray) -> float:
 
 
 def nearest_turn(angle: float, other: float) -> float:
-    """The same direction, half a turn from another one at most."""
+    """The same direction as an angle within half a turn of another angle [rad]."""
     return other + (angle - other + np.pi) % (2 * np.pi) - np.pi

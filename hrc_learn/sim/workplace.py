@@ -31,36 +31,37 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
     return torch.tensor(values, dtype=torch.float64)
 
 
-# Upper arm forward: the branch in which joint 1 keeps clear of its limits on both sides.
+# Posture with the upper arm forward: in this branch, joint 1 stays away from both its limits.
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 
-# Distances of table and cabinet from the base, relative to the usual ones, and where the
-# cabinet stands besides: further along the base's x axis, and higher [m].
+# Distances of table and cabinet from the base, relative to the usual ones.
 _SCALES = (1.0, 0.85, 0.7, 0.55)
 # An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint,
-# and some others have wrists that turn little out of it. Their cabinet stands straight beside
-# that axis, so many times as far away as the table, and home is on the way there, at these
-# fractions of that distance. With its wrist right above the tool such an arm works lower over
-# the table, and its marker is seen from the far side.
+# and the wrists of some other arms turn little out of it. Their cabinet stands straight to the
+# side of this axis, at these multiples of the scaled distance, and home lies on the way there,
+# at these fractions of the cabinet's distance. As the wrist is right above the tool, such an
+# arm works lower over the table, and the camera sees its marker from the far side.
 _BESIDE, _ON_THE_WAY = (1.4, 1.6, 1.2), (0.55, 0.65)
 _HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
 _SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (0.95, True))
-# All lengths below are those of a cell for the Franka hand; a smaller hand makes them smaller.
-# Distance from the middle of the table to reach in view of the camera [m]: with a margin to
-# spare, then no further than objects are put.
+# All lengths below are for the Franka hand; they scale with the size of the hand.
+# Distances around the middle of the table that the arm must reach in view of the camera [m]:
+# first with a margin, then only as far as objects are placed.
 _REACHES = (0.14, 0.1)
+# Shifts of the cabinet, along the base's x axis and upwards [m].
 _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
-# Short arms with thick wrists reach down to shelves beside them.
+# The same shift upwards for short arms with thick wrists, which reach down to their shelves.
 _DOWN = -0.3
 # Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
-# Quality with which a layout is taken without looking at others.
+# Quality from which on a layout is taken without evaluating others.
 _ENOUGH = 0.3
 _UNSEEN = 10.0  # loss of quality per fraction of poses without a view of the marker
-# Postures at home that are looked at; of the best, and of those above the table, so many.
+# Postures considered, at home and above the table; number of the best home postures that are
+# combined with twice as many of the best above the table.
 _POSTURES, _TRIED = 16, 6
-# Fraction of the way back to the front at which the expert is over the board.
+# Point where the path descends to the board, as a fraction of the way from goal to front.
 _INSIDE = 0.3
 
 # Half the hand's thickness, and what is left under it for errors of base and encoders [m].
@@ -69,20 +70,21 @@ _HAND_HALF, _OVER_BOARD = 0.030, 0.006
 
 @dataclass(frozen=True, kw_only=True)
 class Workplace:
-    """Poses of the task in a scene. All in the base frame, gripper closing along x."""
+    """Poses of the task in a scene, in the base frame, for a gripper that closes along x."""
 
     scene: SceneConfig = field(default_factory=SceneConfig)
     home_position: tuple[float, float, float] = (0.60, 0.0, 0.35)
-    """End effector between table and cabinet, where a placing motion starts [m]."""
+    """Position of the end effector where a placing motion starts, between table and cabinet
+    [m]."""
     home_q7: float = -1.0
     """Joint 7 of Franka's arms at home [rad]: the elbow leans to the left, away from the
     cabinet."""
     home_posture: tuple[float, ...] = ()
-    """Joint positions of other arms near which they are at home [rad]."""
+    """Joint positions near which other arms are at home [rad]."""
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     table_reach: tuple[float, float] = (0.14, 0.14)
-    """Largest distance of object edges from there, along x and y [m]."""
+    """Largest distance of object edges from this middle, along x and y [m]."""
     hover_height: float = 0.17
     """Height of the tool centre point during visual servoing [m]."""
     hover_orientation: tuple[float, float, float, float] = tuple(gripper_down().tolist())
@@ -90,15 +92,15 @@ class Workplace:
     hover_q7: float = -0.1
     """Joint 7 of Franka's arms above the table [rad]."""
     hover_posture: tuple[float, ...] = ()
-    """Joint positions of other arms near which they are above the table [rad]."""
+    """Joint positions near which other arms are above the table [rad]."""
     fingertip: float = 0.012
     """Length of the fingers beyond the tool centre point, in the middle of the pads [m]."""
     palm: float = 0.0374
     """Distance of the palm behind the tool centre point [m]."""
     hover_turns: tuple[float, float] = (np.deg2rad(-60.0), np.deg2rad(120.0))
-    """Least and greatest turn of the end effector about the vertical there [rad]: half a turn,
-    in which the forearm does not come between its marker and the camera. It begins to at -80
-    degrees, by `marker_seen`; an arm that has yielded may stand less well."""
+    """Least and greatest turn of the end effector about the vertical above the table [rad]:
+    half a turn in which the forearm does not hide the marker. By `marker_seen`, it hides it
+    from -80 degrees on; the margin is for elbows that people have pushed aside."""
     shelf_x: float = 0.40
     """Position along the boards where objects are placed [m]."""
     shelf_depth: float = 0.10
@@ -112,7 +114,7 @@ class Workplace:
 
     @classmethod
     def of(cls, robot: Arm) -> "Workplace":
-        """The same place with another arm in it, laid out for its reach.
+        """The workplace of an arm, laid out for its reach.
 
         Args:
             robot: The arm.
@@ -137,7 +139,7 @@ class Workplace:
         return HAND_MARKER
 
     def home(self) -> Pose:
-        """End effector at home, pointing down where that is in front of the base."""
+        """Pose of the end effector at home; it points down if home is in front of the base."""
         position = _vector(*self.home_position)
         return Pose(position, coarse_orientation(position, self.level_at))
 
@@ -152,7 +154,7 @@ class Workplace:
                 [rad].
 
         Raises:
-            UnreachableError: If no joint positions reach it.
+            UnreachableError: If no joint positions reach this pose.
         """
         home = self.home()
         if offset is not None:
@@ -162,14 +164,15 @@ class Workplace:
         return self.robot.inverse(home, near=_vector(*self.home_posture))
 
     def hover(self) -> Pose:
-        """End effector above the middle of the table."""
+        """Pose of the end effector above the middle of the table."""
         position = _vector(*self.table_centre, self.hover_height)
         return Pose(position, _vector(*self.hover_orientation))
 
     def approached(self, approach: Approach | None) -> "Workplace":
-        """The same with the demonstrated orientation above the table; None: as it is.
+        """The same workplace with the demonstrated orientation above the table, if any.
 
-        An arm of fewer than six joints points straight down, as it can all over the table.
+        An arm of fewer than six joints keeps pointing straight down: that it can do all over
+        the table.
         """
         if approach is None or self.robot.task == "nearest pose":
             return self
@@ -197,7 +200,7 @@ class Workplace:
         return _vector(*self.table_centre, highest / 2), half
 
     def arm_clearance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
-        """Distance of the arm from the furniture, its hand apart, and from itself [m].
+        """Smaller one of the two `arm_clearances` [m].
 
         Args:
             q: Joint position [rad].
@@ -207,7 +210,8 @@ class Workplace:
     def arm_clearances(
         self, q: Float[Tensor, "*batch joints"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Distance of the arm from the furniture, its hand apart, and that from itself [m].
+        """Distance of the arm without its hand from the furniture, and of the arm from itself
+        [m].
 
         Args:
             q: Joint position [rad].
@@ -220,9 +224,9 @@ class Workplace:
 
     @cached_property
     def _furniture(self) -> Constant:
-        """Centre and half edges of the boxes that stand around [m]."""
+        """Centre and half edges of the furniture's boxes [m]."""
         boxes = [(*box.centre, *box.half_size) for box in self.scene.boxes()]
-        # Once kept, it must serve autograd as well.
+        # The cached tensor must work with autograd as well.
         with torch.inference_mode(False):
             return Constant(torch.tensor(boxes, dtype=torch.float64))
 
@@ -234,15 +238,15 @@ class Workplace:
         Args:
             reach: Largest distances from the middle, along x and y [m]; z is not used.
             rng: Source of position and yaw.
-            yaw: Largest turn, either way [rad]; by default as people lay things down along
-                the table's edges.
+            yaw: Largest turn, either way [rad]; the default is for people who align objects
+                with the table's edges.
         """
         turn = rng.uniform(-yaw, yaw)
         position = np.array(self.table_centre) + rng.uniform(-1, 1, 2) * reach[:2]
         return pose_on_table(position, turn, self.scene.objects[0].half_size[2])
 
     def scaled(self, lengths: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Lengths meant for the Franka hand, at the size of this hand [m]."""
+        """Lengths for the Franka hand, scaled to the size of this hand [m]."""
         x, y, z = (self.robot.hand_size * length for length in lengths)
         return x, y, z
 
@@ -252,7 +256,7 @@ class Workplace:
         return tuple(sorted(shelves, key=shelves.__getitem__))
 
     def shelf(self, name: str, half_size: tuple[float, float, float] | None = None) -> Pose:
-        """End effector where it releases an object on a shelf, level and into the cabinet.
+        """Pose in which the end effector releases an object on a shelf: level, towards -y.
 
         Args:
             name: Name of the shelf.
@@ -281,7 +285,7 @@ class Workplace:
         return Pose(position, coarse_orientation(position, self.level_at))
 
     def lowering(self, half_size: tuple[float, float, float]) -> float:
-        """Distance by which an object can be lowered until the gripper would be near the board
+        """Distance by which an object can be lowered before the gripper comes near the board
         [m].
 
         Args:
@@ -296,7 +300,7 @@ class Workplace:
         Args:
             name: Name of the shelf.
             lift: Height over the edge, for the Franka hand [m]. The gripper is not quite level
-                there yet: what it carries hangs a little lower.
+                there yet, so the object that it carries hangs a little lower.
         """
         goal = self.shelf(name).position
         front = goal.clone()
@@ -326,13 +330,13 @@ class CellLayout:
     quality: float
     """Smallest margin along the paths, from 0 (failure) to 1 (ample)."""
     seen: float
-    """Fraction of poses above the table, within its turns, that are reached with the marker in
-    view.
+    """Fraction of poses above the table, within `hover_turns`, that are reached with the marker
+    in view.
     """
 
     @property
     def rank(self) -> float:
-        """Quality, less what views of the marker are missing."""
+        """Quality, lowered if the marker is out of view in too many poses."""
         return _worth(self)
 
 
@@ -341,10 +345,10 @@ type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
 
 @cache
 def layout_for(robot: Arm) -> CellLayout:
-    """The best layout for an arm, the usual one if that is good enough.
+    """The first layout that is good enough for an arm, or else the best one.
 
     Raises:
-        UnreachableError: In no layout the arm reaches the table and all shelves.
+        UnreachableError: No layout lets the arm reach the table and all shelves.
     """
     best: CellLayout | None = None
     for places, above in _candidates(robot):
@@ -394,12 +398,12 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
     Args:
         robot: The arm.
         scale: Distance of the table, relative to the usual one.
-        beside: Put the cabinet straight beside the axis of the first joint.
+        beside: Put the cabinet straight to the side of the axis of the first joint.
     """
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
     if beside:
-        # The longest way to the shelves first: a short motion drowns in the tremor of a hand.
+        # The longest way to the shelves first: tremor of a hand dominates a short motion.
         for home, far, higher in product(_ON_THE_WAY, _BESIDE, (*_HIGHER, _DOWN)):
             yield _beside(_placed(usual, scale, 0.0, higher, _DEPTHS[-1], far), home)
         return
@@ -410,7 +414,7 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
 
 
 def _beside(place: Workplace, home: float) -> Workplace:
-    """The workplace with cabinet and home in the plane of the tool of an arm turned right.
+    """The workplace with cabinet and home in the tool's plane of an arm turned to the right.
 
     Args:
         place: Workplace with the cabinet to the right.
@@ -457,7 +461,7 @@ def _placed(
         front=depth - level_at,
         shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
         top=size * cabinet.top + higher,
-        # The door tests null-space motion of the elbow, which no pose leaves to six joints.
+        # The door tests null-space motion of the elbow, which six joints do not have.
         door_reach=scale * cabinet.door_reach * (usual.arm.robot.null_space != "none"),
     )
     (x, y, z), (a, b, c) = table.centre, table.half_size
@@ -512,7 +516,7 @@ def _above_table(workplace: Workplace) -> _Above:
 
 
 def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
-    """A workplace with the postures in which the arm does best there; None: it fails."""
+    """A workplace with the arm's best postures for it; None if the arm fails there."""
     robot, scene = workplace.robot, workplace.scene
     try:
         at_home = robot.postures(workplace.home())[:_POSTURES]
@@ -529,7 +533,7 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
     best: CellLayout | None = None
     for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
         home, quality = at_home[k], float(to_shelves[k])
-        # Among those that are good enough, the one nearest to home.
+        # Among postures above the table that are good enough, the nearest to home is taken.
         nearest = sorted(above, key=lambda pair: float((pair[0] - home).abs().max()))
         for hover, marked in nearest if quality > 0 else ():
             between = torch.lerp(home, hover, torch.linspace(0, 1, 25).double()[:, None])

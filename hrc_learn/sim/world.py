@@ -26,24 +26,24 @@ from hrc_learn.sim.step_checks import ContactMonitor, PhysicsWatch
 _PADS = ("finger_left_pad", "finger_right_pad")
 # A tenth of a millimetre apart still counts as touching [m].
 _TOUCHING = 1e-4
-# Cosine of the angle between the normal of a contact and that of a flat face: of 3 degrees.
+# Cosine of the largest angle between the normals of a contact and of a flat face: 3 degrees.
 _FLAT = math.cos(math.radians(3.0))
 # Orientation of an object in the tool's frame: its x lies along the fingers' line of closing,
 # its top towards the gripper.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-# Touches that are looked through for those of a moment; more begin in no control step.
+# Number of latest touches that `touched_since` searches; no control step begins more.
 _REMEMBERED = 64
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 
 
 class World:
-    """A workplace that can be reset, advanced in time, looked at and asked about contacts.
+    """A simulated workplace that can be reset, advanced in time and queried for contacts.
 
     Attributes:
         config: Scene.
         arm: The arm and its gripper.
         cabinet_contacts: Touches of the arm or its hand with the cabinet or an obstacle.
-        object_contacts: Touches of objects with them.
+        object_contacts: Touches of objects with the cabinet or an obstacle.
         table_contacts: Touches of the arm or its hand with the table.
         self_contacts: Touches of the arm with itself.
         worker_contacts: Touches of the arm, and of objects, with the worker.
@@ -52,7 +52,7 @@ class World:
     def __init__(
         self, config: SceneConfig | None = None, imperfections: DrawnImperfections | None = None
     ):
-        """Build it.
+        """Build the world.
 
         Args:
             config: Nominal scene.
@@ -89,7 +89,7 @@ class World:
         self._item = self.model.body(WORKER_ITEM).mocapid[0] if workers else None
 
     def describe(self) -> mujoco.MjSpec:
-        """A description of all that is in it, as it truly is; `compile()` makes the model."""
+        """Description of the true scene, errors included; `compile()` makes the model."""
         spec = build_scene(self.config)
         self.imperfections.apply(spec)
         return spec
@@ -149,7 +149,7 @@ class World:
         return tuple(dict.fromkeys(met))
 
     def advance(self, duration: float) -> None:
-        """Run the physics for a while, the arm following its last command [s].
+        """Run the physics for a duration [s], while the arm follows its last command.
 
         Raises:
             PhysicsError: The simulation diverged, or was reset without `reset`.
@@ -160,11 +160,11 @@ class World:
             self._watch.after_step()
             self._look_at_contacts()
         self._watch.check()
-        # A step leaves the poses of bodies as they were before it: bring them up to date.
+        # After a step, the poses of bodies are still those before it: bring them up to date.
         mujoco.mj_kinematics(self.model, self.data)
 
     def _look_at_contacts(self) -> None:
-        """Contacts of one step that a monitor watches; mostly none."""
+        """Pass the contacts of one step to the monitors; mostly, none is watched."""
         geoms = self.data.contact.geom
         watched = self._watched[geoms[:, 0], geoms[:, 1]].any()
         for monitor in self._monitors:
@@ -174,7 +174,7 @@ class World:
                 monitor.pause()
 
     def hold(self, name: str, joint_position: Float[np.ndarray, " joints"]) -> None:
-        """Reset with an object between the fingers, the grip settled.
+        """Reset with an object between the fingers, and let the grip settle.
 
         Args:
             name: The object.
@@ -194,12 +194,12 @@ class World:
 
         Args:
             state: State of that arm.
-            carried: The object that goes along, at its present pose in the gripper.
+            carried: Object that moves along, at its present pose in the gripper.
         """
         in_hand = None
         if carried is not None:
             in_hand = np.linalg.inv(self.arm.tcp_pose()) @ self.object_pose(carried)
-        # An arm without a gripper tells no width.
+        # An arm without a gripper reports NaN as its width.
         self.arm.place(state.joint_position, float(np.nan_to_num(state.gripper_width)))
         self.data.time = state.time
         mujoco.mj_kinematics(self.model, self.data)
@@ -279,8 +279,8 @@ class World:
         return tuple(item.name for item in self.config.objects if self.holds(item.name))
 
     def holds_flat(self, name: str) -> bool:
-        """True if the pads press on opposite faces of an object, normal to its x axis: not on
-        its edges, nor across it.
+        """True if the pads press on the two faces of an object that are normal to its x axis,
+        not on edges or other faces.
         """
         item, axis = self.model.geom(name).id, self.object_pose(name)[:3, 0]
         pads = {self.model.geom(pad).id: set() for pad in _PADS}
@@ -301,9 +301,9 @@ class World:
         return board in partners and partners <= {box.name for box in self.config.boxes()}
 
     def _touched(self, name: str) -> set[int]:
-        """Numbers of the geoms that touch an object's."""
+        """Numbers of the geoms that touch the geom of an object."""
         target, contact = self.model.geom(name).id, self.data.contact
-        # Contacts without a force are those with the worker.
+        # Excluded contacts, which exert no force, are those with the worker.
         touching = (contact.dist < _TOUCHING) & (contact.exclude == 0)
         touching &= (contact.geom == target).any(axis=-1)
         return {*contact.geom[touching].ravel().tolist()} - {target}
@@ -382,7 +382,7 @@ def _put(
 
 
 def _as_it_is(believed: SceneConfig, errors: DrawnImperfections) -> SceneConfig:
-    """The scene with the table and the objects as high as they are."""
+    """The scene with the true heights of table and objects."""
     x, y, z = believed.table.centre
     table = replace(believed.table, centre=(x, y, z + errors.table_height))
     objects = []

@@ -1,6 +1,6 @@
 """A fixed camera: intrinsics, lens distortion, pose; projection and its derivatives.
 
-Distortion is that of Brown (1966) in OpenCV's parameter order, which works on normalised image
+Distortion follows Brown (1966), in OpenCV's parameter order, and applies to normalised image
 points, (x / z, y / z) in the camera frame. The controller never sees a `CameraModel`, which
 belongs to simulation and evaluation.
 """
@@ -23,7 +23,7 @@ NONE: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraModel:
-    """Pinhole with Brown distortion, at rest in the base frame.
+    """Pinhole camera with Brown distortion, at rest in the base frame.
 
     Camera axes are OpenCV's: x right, y down, z along the view. Pixel (0, 0) is the
     *centre* of the top left pixel, so the middle of the image is ((W-1)/2, (H-1)/2).
@@ -89,7 +89,7 @@ class CameraModel:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def to_camera(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Base frame to camera frame [m]."""
+        """Transform points from the base frame to the camera frame [m]."""
         return (points - self.pose[:3, 3]) @ self.pose[:3, :3]
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
@@ -99,8 +99,8 @@ class CameraModel:
             points: Positions in the base frame [m].
 
         Returns:
-            (u right, v down) [px]. Points outside the image get the pixel they would have;
-            `in_view` tells which ones the image holds.
+            (u right, v down) [px]. Points outside the image get the pixel that they would have;
+            `in_view` finds the points inside.
         """
         p = self.to_camera(points)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -122,10 +122,10 @@ class CameraModel:
     def to_normalised(
         self, pixels: Float[np.ndarray, "*batch 2"]
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Normalised (x/z, y/z) points seen at the given pixels: the lens undone."""
+        """Normalised (x/z, y/z) points seen at the given pixels, without lens distortion."""
         import cv2
 
-        if not pixels.size:  # OpenCV refuses them
+        if not pixels.size:  # OpenCV refuses empty arrays
             return pixels
         # Ten steps of the fixed point are enough for common lenses, thirty for wide ones.
         steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
@@ -146,7 +146,7 @@ class CameraModel:
 
     @cached_property
     def view_radius(self) -> float:
-        """Largest |(x/z, y/z)| that the image holds, with 1 % to spare."""
+        """Largest |(x/z, y/z)| inside the image, plus 1 %."""
         return 1.01 * float(np.linalg.norm(self.to_normalised(self.border()), axis=-1).max())
 
     def border(self) -> Float[np.ndarray, "n 2"]:
@@ -162,14 +162,14 @@ class CameraModel:
         point: Float[np.ndarray, "*batch 3"],
         origin: Float[np.ndarray, "*batch 3"] | None = None,
     ) -> Float[np.ndarray, "*batch 2 6"]:
-        """True image Jacobian of a point that rides on a moving body.
+        """True image Jacobian of a point that is fixed to a moving body.
 
             d(u, v)/dt = J_s (v_origin, omega),    v_point = v_origin + omega x (point - origin)
 
         Args:
             point: The point in the base frame [m].
-            origin: Where the body's linear velocity is measured, in the base frame [m];
-                None measures it at the point itself, which then does not feel rotation.
+            origin: Point of the body to which the linear velocity refers, in the base frame
+                [m]; None: `point` itself, which then does not move with the rotation.
 
         Returns:
             J_s: derivative with respect to the twist (linear, angular) in the base frame
@@ -180,7 +180,7 @@ class CameraModel:
         p, still, lens = self.to_camera(point), np.zeros(3), np.array(self.distortion)
         if not p.size:  # OpenCV returns nothing
             return np.zeros((*p.shape[:-1], 2, 6))
-        # The derivative over a shift of all points is that over each point.
+        # The derivative by a common shift of all points equals that by each point.
         _, slope = cv2.projectPoints(p.reshape(-1, 3), still, still, self.matrix, lens)
         slope = np.asarray(slope[:, 3:6], dtype=float).reshape(*p.shape[:-1], 2, 3)
         J_point = slope @ self.pose[:3, :3].T

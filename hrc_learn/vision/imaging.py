@@ -1,8 +1,8 @@
-"""Images as a real camera takes them, with lens distortion, blur and sensor noise; and a camera
-without OpenGL, which draws markers by exact ray casting into a static background.
+"""Realistic images, with lens distortion, blur and sensor noise, and a camera without OpenGL.
 
-It renders what matters to visual servoing, in a fraction of a renderer's time: sweeps and
-machines without OpenGL use it in place of the simulator's camera.
+The camera draws markers by exact ray casting into a static background, all that visual servoing
+needs, in a fraction of a renderer's time. Sweeps and machines without OpenGL use it in place of
+the simulator's camera.
 """
 
 import zlib
@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, UInt8
 from hrc_learn.vision.camera_model import NONE, CameraModel, Coefficients
 from hrc_learn.vision.markers import PLATE_MODULES, Marker, marker_texture
 
-# Samples of noise drawn for an image, of which rows are random windows (see `_noise`).
+# Number of noise samples drawn for an image; rows are random windows of them (see `_noise`).
 _POOL = 1 << 16
 
 
@@ -67,8 +67,8 @@ class ImageNoise:
 class Lens:
     """Turns the image of an ideal pinhole, which renderers make, into that of a camera.
 
-    Where the lens sees more than a pinhole of the same size (barrel distortion), the pinhole
-    has to be wider: render `pinhole`, then `apply` the lens.
+    Render `pinhole`, then `apply` the lens. With barrel distortion, a lens sees more than a
+    pinhole of the same size, so `pinhole` is wider.
 
     Attributes:
         model: The camera to imitate.
@@ -107,7 +107,7 @@ def pixel_rays(model: CameraModel) -> Float32[np.ndarray, "h w 2"]:
     return _rays((model.height, model.width), model.focal, model.principal, model.distortion)
 
 
-# Cameras of a study differ in their pose alone, and the rays of one take half a second.
+# Cameras of a study differ only in pose, and computing the rays takes half a second.
 @lru_cache(maxsize=4)
 def _rays(
     shape: tuple[int, int],
@@ -124,7 +124,7 @@ MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 """Returns the pose of each marker now, by its id: p_base = pose @ p_marker."""
 
 
-# Texture resolutions, one octave apart: bilinear sampling aliases beyond a factor of two.
+# Texture resolutions [px per module], one octave apart: bilinear sampling aliases beyond that.
 _MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
 # Grey levels of a lit print: white is not 255, black not 0.
 _PAPER, _INK = 235.0, 25.0
@@ -159,7 +159,7 @@ class SyntheticCamera:
             poses: Called at each frame; ids it leaves out are not drawn.
             rng: Source of the noise.
             noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
-            hidden: Called at each frame; ids that are occluded now.
+            hidden: Called at each frame; returns the ids that are occluded.
 
         Raises:
             ValueError: Two markers have the same id.
@@ -187,7 +187,7 @@ class SyntheticCamera:
         return image
 
     def _visible(self) -> list[tuple[Marker, Float[np.ndarray, "4 4"]]]:
-        """Markers that the camera sees the front of, with their poses, farthest first."""
+        """Markers whose front is in view, with their poses, farthest first."""
         hidden = self._hidden()
         eye = self.model.pose[:3, 3]
         seen = []
@@ -220,7 +220,7 @@ class SyntheticCamera:
         return roi
 
     def _around(self, pixels: Float[np.ndarray, "corners 2"]) -> tuple[slice, slice]:
-        """Part of the image about some pixels, with room for the blur."""
+        """Part of the image around some pixels, with a margin for the blur."""
         low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - self._margin, 0)
         high = np.maximum(np.ceil(pixels.max(axis=0)).astype(int) + self._margin + 1, 0)
         return np.s_[low[1] : high[1], low[0] : high[0]]  # slices end at the image's edge
@@ -269,7 +269,7 @@ def table_top(width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
 def carton(
     name: str, colour: tuple[float, float, float, float]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Print of a carton: words, stripes, a badge and a table of small print, by its name."""
+    """Print of a carton, which depends on its name: stripes, a badge and words."""
     import cv2
 
     rng = np.random.default_rng(zlib.crc32(name.encode()))
@@ -293,7 +293,7 @@ def carton(
 
 
 def wood_grain(rng: np.random.Generator) -> UInt8[np.ndarray, "side side 3"]:
-    """Grain along x: noise, drawn out, on the table's colour."""
+    """Wood grain along x: stretched noise on a wood colour."""
     import cv2
 
     noise = rng.standard_normal((_WOOD, _WOOD)).astype(np.float32)
@@ -303,7 +303,7 @@ def wood_grain(rng: np.random.Generator) -> UInt8[np.ndarray, "side side 3"]:
 
 
 def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
-    """Opacity-weighted grey, and opacity, of a plate at every resolution; clear border."""
+    """Opacity-weighted grey and opacity of a plate with a transparent border, by resolution."""
     octaves = []
     for module in _MODULE_PIXELS:
         white = marker_texture(id, module * PLATE_MODULES) / 255.0
@@ -314,7 +314,7 @@ def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
 
 
 def _octave(plate_pixels: Float[np.ndarray, "4 2"]) -> int:
-    """Texture resolution nearest to that of the image, so that edges are one pixel soft."""
+    """Index of the texture resolution nearest to that of the image: edges are a pixel soft."""
     edges = np.linalg.norm(plate_pixels - np.roll(plate_pixels, 1, axis=0), axis=1)
     octave = np.log2(max(edges.mean() / PLATE_MODULES, 1.0))
     return min(int(np.rint(octave)), len(_MODULE_PIXELS) - 1)

@@ -1,9 +1,10 @@
-"""Tool and objects found in images without markers, by features of reference views (Lowe 2004).
+"""Detection of tool and objects without markers, by SIFT features of reference views (Lowe
+2004).
 
-A tool is a cloud of points fixed to a link of the arm. Its pixel is that of one place on the
-link, by perspective-n-point from all points that match. An object is a set of views; a match
-with one of them, as a similarity, gives its pixel and its direction. Every finding has a
-covariance, and None means that the image does not tell.
+A tool is a cloud of points fixed to a link of the arm; its pixel is that of one place on the
+link, computed by perspective-n-point from all matching points. An object is a set of views; a
+similarity between one view and the image gives its pixel and direction. Every finding has a
+covariance; None means that nothing was found.
 """
 
 from __future__ import annotations
@@ -17,29 +18,30 @@ from jaxtyping import Bool, Float, Int, UInt8
 from hrc_learn.vision.markers import as_grey
 
 ASIDE = 0.06
-"""Reach of an object about where it is expected, as a fraction of the image's width."""
+"""Largest distance of an object from where it is expected, as a fraction of image width."""
 RATIO = 0.8
 """Largest ratio of the distances to the best and to the second best descriptor."""
 # Points of a tool closer than this are views of one point [m].
 _SAME_POINT = 0.006
-# Largest error of a match [px] in an image of 1440x1080, in proportion for others.
+# Largest error of a match [px] in an image of 1440x1080, and its width, to scale for others.
 _REACH, _WIDTH = 5.0, 1440
 # Fewest points that agree on a tool, and on an object.
 FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
-# Samples of matches: among clutter one in ten may be right, and a sample has four.
+# RANSAC samples of four matches each: in clutter, only one match in ten may be right.
 _TRIALS = 5000
 # Least standard deviation of a feature's place [px].
 _LEAST_NOISE = 0.15
 # Range of an object's size relative to its view.
 _SCALES = (0.5, 2.0)
-# Margin about the last finding within which the next is looked for first [px of `_WIDTH`].
+# Margin around the last finding that is searched first [px in an image of `_WIDTH`].
 _MARGIN = 70
-# Images from one search at full resolution for what stays unseen to the next.
+# Number of images between full-resolution searches for items that stay unseen.
 _CLOSE_LOOK_EVERY = 5
-# Width of images beyond which half the resolution shows enough [px].
+# Width of images for which half the resolution shows enough, if exceeded [px].
 _LARGE = 960
 
-# Grey levels by which a pixel differs from the usual one, and reach about such pixels [px].
+# Change of grey level from which on a pixel counts as changed, and width by which such areas
+# are dilated [px].
 _CHANGED, _GROWN = 14, 9
 
 Grey = UInt8[np.ndarray, "height width"]
@@ -54,7 +56,7 @@ class Features:
     descriptors: UInt8[np.ndarray, "n 128"]
 
     def chosen(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> Features:
-        """Some of them."""
+        """A selection of the features."""
         return Features(pixels=self.pixels[which], descriptors=self.descriptors[which])
 
     @classmethod
@@ -73,7 +75,7 @@ class Features:
 
         left, top, right, bottom = box or (0, 0, image.shape[1], image.shape[0])
         part = np.ascontiguousarray(image[top:bottom, left:right])
-        # White arms have little contrast: half of what SIFT asks for by default.
+        # White arms have little contrast, so the threshold is half of SIFT's default.
         found, descriptors = cv2.SIFT_create(0, 3, 0.02).detectAndCompute(as_grey(part), None)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue, reportArgumentType]
         if descriptors is None:
             return cls(pixels=np.zeros((0, 2)), descriptors=np.zeros((0, 128), np.uint8))
@@ -114,7 +116,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Tool:
-    """Points on a link, and the place whose pixel stands for the tool."""
+    """Points on a link, and the place whose pixel is reported for the tool."""
 
     points: Float[np.ndarray, "n 3"]
     """Points in the frame of the link [m]."""
@@ -125,7 +127,7 @@ class Tool:
     """Focal length [px], principal point (u, v) [px] and radial coefficient of the camera."""
 
     def find(self, seen: Features, width: int) -> Finding | None:
-        """Pixel of the place among an image's features; None: not found.
+        """Find the tool among an image's features; None: not found.
 
         Args:
             seen: Features of the image.
@@ -174,7 +176,7 @@ class Tool:
         """Indices of features, and of the points that they match better than any other."""
         if min(len(seen.pixels), len(self.points)) < FEWEST_POINTS:
             return np.zeros(0, int), np.zeros(0, int)
-        # Other views of the same point are no rivals of the best.
+        # Other views of the same point do not compete with the best match.
         index, distance = nearest(seen.descriptors, self.descriptors, 6)
         apart = np.linalg.norm(self.points[index] - self.points[index[:, :1]], axis=-1)
         rival = np.where(apart > _SAME_POINT, distance, distance[:, -1:]).min(axis=1)
@@ -186,13 +188,13 @@ class Tool:
 
 @dataclass(frozen=True, kw_only=True)
 class Object:
-    """Views of an object, each with its features about the object's middle."""
+    """Views of an object, each with its features around the object's middle."""
 
     views: tuple[Features, ...]
-    """Features relative to the middle, in its direction, at the size of the first view [px]."""
+    """Pixels relative to the middle, turned to its direction, at the first view's size."""
 
     def find(self, seen: Features, width: int) -> Finding | None:
-        """Pixel and direction among an image's features; None: not found."""
+        """Find the object among an image's features; None: not found."""
         found = [match_view(view, seen, width) for view in self.views]
         return max((f for f in found if f), key=lambda f: len(f.points), default=None)
 
@@ -269,7 +271,7 @@ def _propagated(
     """Covariance of a pixel that depends on unknowns found by least squares."""
     freedom = max(error.size - slope.shape[1], 1)
     variance = max((error**2).sum() / freedom, _LEAST_NOISE**2)
-    # Columns of one size make the inverse exact enough.
+    # With columns of equal norm, the inverse is accurate enough.
     size = np.linalg.norm(slope, axis=0) + 1e-12
     inverse = np.linalg.pinv((slope / size).T @ (slope / size))
     scaled = by_unknowns / size
@@ -278,7 +280,7 @@ def _propagated(
 
 @dataclass(frozen=True, kw_only=True)
 class Landmarks:
-    """Everything that is found without markers in the images of one camera."""
+    """Tool and objects to find without markers in the images of one camera."""
 
     tool: Tool
     objects: Mapping[str, Object] = field(default_factory=dict)
@@ -288,10 +290,10 @@ class Landmarks:
 
 
 class LandmarkDetector:
-    """Finds landmarks in a stream of images, first about the place of the last finding.
+    """Finds landmarks in a stream of images, first near the place of the last finding.
 
-    What was not there is looked for in whole images of half resolution, and now and then of
-    full resolution; the place is always refined at full resolution.
+    Items not found there are searched for in the whole image, at half resolution and now and
+    then at full resolution; places are always refined at full resolution.
     """
 
     def __init__(self, landmarks: Landmarks):
@@ -305,7 +307,7 @@ class LandmarkDetector:
         """Findings by name, `tool` or that of an object; what is not found is left out.
 
         Raises:
-            ValueError: The image has another size than those that were learned from.
+            ValueError: The image differs in size from the images of the demonstrations.
         """
         size = (image.shape[1], image.shape[0])
         if size != self.landmarks.image_size:
@@ -332,7 +334,7 @@ class LandmarkDetector:
 
 
 def _refined(item: Tool | Object, image: np.ndarray, near: Finding | None) -> Finding | None:
-    """The item at full resolution about an earlier or coarser finding; None: not found."""
+    """Find an item at full resolution near an earlier or coarser finding; None: not found."""
     if near is None:
         return None
     height, width = image.shape[:2]
@@ -374,12 +376,12 @@ def draw_finding(image: UInt8[np.ndarray, "height width 3"], finding: Finding) -
 def changed_features(
     image: Grey, usual: Grey, near: Float[np.ndarray, "points 2"] | None = None
 ) -> Features:
-    """Features about pixels that differ from the usual image.
+    """Features near pixels that differ from the usual image.
 
     Args:
         image: Grey image.
-        usual: What is usually seen there.
-        near: Points of a line near which features count [px]; None: everywhere.
+        usual: Usual image of the same scene.
+        near: Points of a polyline; only features near it count [px]. None: all count.
     """
     import cv2
 

@@ -1,6 +1,6 @@
 """ArUco markers of the 4x4_50 dictionary: flat plates with a quiet zone, and their detection.
 
-Marker frame: origin in the middle, x right, y up, z out of the plate towards whoever reads it.
+Marker frame: origin in the middle, x right, y up, z out of the plate towards the viewer.
 """
 
 import warnings
@@ -72,7 +72,7 @@ def marker_texture(id: int, pixels: int) -> UInt8[np.ndarray, "pixels pixels"]:
 
     Args:
         id: Number in the 4x4_50 dictionary.
-        pixels: Edge of the picture. A multiple of 8, so that every module is whole pixels.
+        pixels: Edge of the picture [px], a multiple of 8: a whole number for each module.
 
     Raises:
         ValueError: If `pixels` is not a positive multiple of 8.
@@ -90,7 +90,7 @@ def marker_texture(id: int, pixels: int) -> UInt8[np.ndarray, "pixels pixels"]:
 
 
 _CLOSE_LOOK_EVERY = 5
-"""Images from one search at full resolution for a marker that stays unseen to the next."""
+"""Number of images between full-resolution searches for markers that stay unseen."""
 
 Corners = Float[np.ndarray, "4 2"]
 """Pixels of top left, top right, bottom right, bottom left corner of the upright marker."""
@@ -99,11 +99,11 @@ Corners = Float[np.ndarray, "4 2"]
 class MarkerDetector:
     """Finds given markers in a stream of images.
 
-    A marker is looked for round its last position first, where that fails in the whole image
-    at half resolution, and only then at full resolution; corners are always refined at full
-    resolution. That takes a fraction of the time of a plain search and is no less accurate.
-    While a marker stays unseen, full resolution is tried on every few images only. An id that
-    two markers carry is not reported, with a warning, unless one lies round its last position.
+    A marker is searched for near its last position, then in the whole image at half resolution,
+    and only then at full resolution; corners are always refined at full resolution. This takes
+    a fraction of the time of a plain search and is no less accurate. While a marker stays
+    unseen, full resolution is tried on every few images only. If two markers in an image have
+    the same id, neither is reported, with a warning, unless just one is near the last position.
     """
 
     def __init__(self, ids: Iterable[int]):
@@ -116,7 +116,7 @@ class MarkerDetector:
 
         self.ids = frozenset(ids)
         parameters = cv2.aruco.DetectorParameters()
-        # One threshold window of 13 px finds what the default ladder of three finds.
+        # One threshold window of 13 px finds as much as the three default windows.
         parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
         # Lines fitted to the contour keep the rough corners within reach of the refinement.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
@@ -163,8 +163,8 @@ class MarkerDetector:
         half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         found: dict[int, Corners] = {}
         for id, corners in self._search(half, ids).items():
-            # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one. It only
-            # says where to look: its corners may be pixels off.
+            # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one. These
+            # corners only show where to search: they may be pixels off.
             found |= self._search_near(grey, id, 2.0 * corners + 0.5)
         if missing := self._worth_a_close_look(ids, found):
             rough = self._search(grey, missing)
@@ -172,7 +172,7 @@ class MarkerDetector:
         return found
 
     def _worth_a_close_look(self, ids: frozenset[int], found: Iterable[int]) -> frozenset[int]:
-        """Markers still missing if a full search is due: hidden, or too tilted for half."""
+        """Missing markers if a full-resolution search is due; else none."""
         missing = ids.difference(found)
         self._in_vain = {id: self._in_vain.get(id, -1) + 1 for id in missing}
         due = any(count % _CLOSE_LOOK_EVERY == 0 for count in self._in_vain.values())
@@ -191,9 +191,9 @@ class MarkerDetector:
 
 
 def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
-    """Image of a marker's middle: where the diagonals cross.
+    """Image of a marker's middle: the intersection of its diagonals.
 
-    The mean of the corners is not it: perspective draws the farther half smaller.
+    The mean of the corners differs, as perspective shrinks the farther half.
     """
     a, b, c, d = corners
     across, between, ca = d - b, b - a, c - a
@@ -213,8 +213,8 @@ def angle(corners: Float[np.ndarray, "4 2"]) -> float:
 def _refine(grey: np.ndarray, corners: Corners) -> Corners:
     """Corners moved to the saddle points of the grey levels.
 
-    The window reaches as far as the rough corners may be off, but stays clear of the next
-    corner, a module away, and of what may cover the rim of the plate.
+    The window covers the error of the rough corners, but not the next corner, a module away,
+    nor anything that covers the rim of the plate.
     """
     import cv2
 
