@@ -253,7 +253,7 @@ def test_joints_of_state_and_action(state, action, names, joints, commands):
     [
         (
             "c d",
-            "is of the joints c, d, the rest of a, b: left among the extra columns. Leader",
+            "has the joints c, d, the rest has a, b: left among the extra columns. Leader",
         ),
         ("c d e", "Name them alike, or map one of them (--mapping command_position KEY[0:7])"),
     ],

@@ -189,7 +189,7 @@ def test_fingers_do_not_speak_for_the_unit_of_an_arm():
 
 def test_names_of_old_hobby_arms():
     old = [f"main_{name}" for name in HOBBY]
-    text = "values usually reach 99, names are of the time before -100..100"
+    text = "values usually reach 99, the names are older than -100..100"
     expected = Guess("deg", 0.85, text, "%")
     assert evidence.guess_joints(sizes(99, 50, 30), np.ones(3, bool), old, "") == expected
     guess = evidence.guess_joints(sizes(99, 50, 30), np.ones(3, bool), ["main_a", "b", "c"], "")

@@ -1,7 +1,7 @@
 """Columns of a dataset that hold each quantity: declared, found by name, or given.
 
 Nothing is taken for a quantity by its position alone. The caller's mapping comes first, then
-the contract or sidecar kept with the dataset, then the naming conventions of `quantities`.
+the contract or sidecar kept with the dataset, then the naming conventions of `naming`.
 """
 
 import re
@@ -49,7 +49,7 @@ class ColumnSelection:
     labels: tuple[str, ...]
     """Joint names, or component names for quantities without joints."""
     numbered: bool = False
-    """True if the dataset gives no names, so that the labels only count."""
+    """True if the dataset gives no names, so that the labels are only numbered."""
     units: tuple[str, ...] = ()
     """Unit in the name of each column, "" for none; () if no name states one."""
     assumed: str = ""
@@ -132,13 +132,13 @@ def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str
     else:
         advice = f". Name them alike, or map one of them (--mapping {role} KEY[0:7])"
     return (
-        f"is of the joints {', '.join(joints)}, the rest of {', '.join(names)}: "
+        f"has the joints {', '.join(joints)}, the rest has {', '.join(names)}: "
         f"left among the extra columns{advice}"
     )
 
 
 def replaced_roles(mapping: MappingSpec) -> set[str]:
-    """Roles that a caller's mapping replaces: one encoding of an orientation replaces all."""
+    """Roles that a caller's mapping replaces: one encoding of orientations replaces all."""
     return {*mapping} | ({*ORIENTATION_ROLES} if {*mapping} & {*ORIENTATION_ROLES} else set())
 
 
@@ -148,7 +148,7 @@ def parse_mapping(
     """Columns that a mapping names.
 
     Raises:
-        DatasetError: A role or a column does not exist, or a role has too many or too few.
+        DatasetError: A role or column does not exist, or a role's number of columns is wrong.
     """
     selections = {}
     for role, columns in mapping.items():
@@ -189,8 +189,8 @@ def column_places(
 ) -> list[tuple[str, int]]:
     """Feature and component of each column that a text stands for.
 
-    It may be a feature ("key", or the end of its path), a part of one ("key[2:5]", "key[3]"),
-    or a component ("NAME" or "key/NAME").
+    The text may be a feature ("key", or the end of its path), a part of a feature ("key[2:5]",
+    "key[3]"), or a component ("NAME" or "key/NAME").
 
     Args:
         role: Quantity that takes the columns.
@@ -235,7 +235,7 @@ def feature_key(
     file: str | Path,
     components: Sequence[str] = (),
 ) -> str:
-    """Feature of this key, or the only one whose path ends so; arguments as in `column_places`.
+    """Feature with this key, or the only one whose path ends in it, as in `column_places`.
 
     Raises:
         DatasetError: There is no such feature, or there are several, or several components.
@@ -280,7 +280,7 @@ class _Conventions:
         return by_component | whole
 
     def _whole_feature(self, feature: Feature) -> list[ComponentMeaning | None] | None:
-        """Meanings of the components where the key of the feature tells them; else None."""
+        """Meanings of the components if the key of the feature tells them; else None."""
         role, width = naming.role_of_key(feature.key), feature.width
         if role is None or (_is_command(feature) and role not in _COMMANDS):
             return None
@@ -337,9 +337,9 @@ class _Conventions:
     def _joint(
         self, feature: Feature, name: str, meaning: ComponentMeaning | None
     ) -> ComponentMeaning | None:
-        """A joint by its meaning or without one; None if other names tell that it is none.
+        """Meaning of a component as a joint; None if names tell that it is no joint.
 
-        An action names the joints that move: what only the state has is no joint of the arm.
+        An action names the joints that move: a component that only the state has is no joint.
         """
         joint = naming.joint_of(name)
         named = {naming.joint_of(other) for other in feature.names or ()}
@@ -360,12 +360,12 @@ class _Conventions:
         groups: dict[tuple[str, str], dict[str | int, int]] = {}
         for index, meaning in enumerate(meanings):
             if meaning is not None:
-                # Of two fingers of one name, the first counts.
+                # If two fingers have the same name, the first counts.
                 slots = groups.setdefault((meaning.role, meaning.side), {})
                 slots.setdefault(meaning.slot, index)
         for role, side in [*groups]:
             if role == "pose_matrix" and len(groups[role, side]) in _CARTESIAN:
-                # Numbered components of a pose in one of the encodings without names.
+                # Numbered components of a pose: their number tells the encoding.
                 slots = groups.pop((role, side))
                 encoding, content = _CARTESIAN[len(slots)]
                 self._notes.append(f"{feature.key}: assumed to be {content}")
@@ -416,7 +416,7 @@ class _Conventions:
 
 
 def _slot(slot: str | int) -> int:
-    """Place of a component in its role: a number, or that of w, x, y, z."""
+    """Index of a component in its role: its number, or its place in w, x, y, z."""
     return slot if isinstance(slot, int) else "wxyz".find(slot)
 
 
@@ -436,7 +436,7 @@ def _align_joints(
     if not joints:
         return (), found, {}
     names, numbered = joints[0].labels, joints[0].numbered
-    if numbered:  # names of another quantity with as many joints say more
+    if numbered:  # prefer the names of another quantity
         named = (s.labels for s in joints if not s.numbered and len(s.labels) == len(names))
         names = next(named, names)
     aligned, unmatched = {}, {}

@@ -2,8 +2,8 @@
 
 LeRobot declares neither units, meanings nor reference frames, and drops unknown fields from its
 own files. A sidecar, `meta/hrc_learn.json`, holds what the writer declared, and the contract:
-role, unit, range, sign and delay of each component, with the evidence and a confidence. It may
-be edited there, and every reader of the dataset obeys it.
+role, unit, range, sign and delay of each component, with the evidence and a confidence. The
+contract may be edited there, and every reader of the dataset obeys it.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ CONTRACT_ROLES = (*_QUANTITIES, *(role for role in ROLES if role not in _QUANTIT
 _FOLLOWS = 0.6
 """R squared above which a state counts as following its command."""
 _FOOTER = 8192
-"""Bytes at the end of a Parquet file that locate its pages and hold their statistics."""
+"""Size of the end of a Parquet file, which locates its pages and holds statistics [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +49,11 @@ class ComponentContract:
     unit: str
     """Unit on disk; "" if unknown."""
     low: float
-    """0.5 % quantile of all values."""
+    """Lower end of the range: 5 % quantile over episodes of the 0.5 % quantile in each."""
     high: float
-    """99.5 % quantile of all values."""
+    """Upper end of the range: 95 % quantile over episodes of the 99.5 % quantile in each."""
     sign: Literal[-1, 0, 1] = 0
-    """Direction of the state as this command grows, +1 or -1; 0 if unknown."""
+    """Direction in which the state follows an increasing command, +1 or -1; 0 if unknown."""
     delay: float | None = None
     """Delay of the state behind this command [s]; None if unknown."""
     confidence: float = 1.0
@@ -89,7 +89,7 @@ class Contract:
 
     components: tuple[ComponentContract, ...] = ()
     fingerprint: str = ""
-    """Fingerprint of the data it was inferred from."""
+    """Fingerprint of the data from which the contract was inferred."""
 
     def __post_init__(self) -> None:
         places = Counter(part.column for part in self.components)
@@ -98,7 +98,7 @@ class Contract:
                 raise ValueError(f"component {index} of {key} is listed {count} times")
 
     def rows(self) -> list[tuple[str, ...]]:
-        """The contract as a table with its header; similar neighbours are one row."""
+        """The contract as a table with a header; similar adjacent components form one row."""
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
         alike = groupby(self.components, lambda p: (p.key, p.role, p.unit, p.sign, p.delay))
         for (key, role, unit, sign, delay), group in alike:
@@ -167,8 +167,8 @@ class Contract:
     def keeping(self, kept: "Contract") -> "Contract":
         """This contract with the names and roles of an older one, which may have been edited.
 
-        A component that is read as another quantity now has its new role. Units of quantities
-        are those of this contract, which obeys the older one; other components keep theirs.
+        A component that is now read as another quantity keeps its new role. Quantities have the
+        units of this contract, which obeys the older one; other components have its units.
         """
         known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:
@@ -180,7 +180,7 @@ class Contract:
         return replace(self, components=tuple(parts))
 
     def without_doubt(self) -> tuple["Contract", list[str]]:
-        """The contract without its doubtful units, and the components that have them."""
+        """The contract without doubtful units, and the components that lose their unit."""
         doubtful = [p for p in self.components if p.unit and p.confidence < CONFIDENT]
         parts = [replace(p, unit="") if p in doubtful else p for p in self.components]
         return replace(self, components=tuple(parts)), [f"{p.key}/{p.name}" for p in doubtful]
@@ -197,7 +197,7 @@ class SidecarColumn:
     key: str
     """Feature."""
     names: tuple[str, ...]
-    """Its components."""
+    """Names of its components."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +222,7 @@ class Sidecar:
 
         Raises:
             DatasetError: A declared column does not exist, or a quantity has too many or too
-                few.
+                few columns.
         """
         if self.contract.components:
             return self.contract.selections(features)
@@ -238,7 +238,7 @@ def read_sidecar(root: Path) -> Sidecar:
 
     Raises:
         DatasetError: The file is damaged, was edited wrongly, or names a role that does not
-            exist; names the field.
+            exist; the message names the field.
     """
     path = root / SIDECAR_PATH
     if not path.exists():
@@ -338,7 +338,7 @@ def _describe(
 ) -> ComponentContract:
     """Complete the contract of a component that a quantity uses."""
     role = decision.role
-    # Of two roles for one quantity, the second is that of fingers.
+    # If a quantity has two roles, the second is for fingers.
     roles = [known for known, quantity in _QUANTITIES.items() if quantity == role] or [role]
     part = replace(
         part,

@@ -1,4 +1,4 @@
-"""Metadata and Parquet files of a dataset, read defensively: foreign files may be anything.
+"""Metadata and Parquet files of a dataset, read defensively: files may hold anything.
 
 Every fault becomes a `DatasetError` that names the file and the remedy. No file outside the
 dataset is opened, whatever a template in `meta/info.json` says.
@@ -61,7 +61,8 @@ def require_file(root: Path, file: str, episode: int | None = None) -> None:
 def is_inside(root: Path, file: str | Path) -> bool:
     """True if a file lies in the dataset once links are followed.
 
-    The Hub's cache keeps files in a folder of blobs next to its snapshots, which counts too.
+    The Hub's cache keeps files in a folder of blobs next to its snapshots. This folder counts
+    as a part of the dataset.
     """
     try:
         real, here = (root / file).resolve(), root.resolve()
@@ -80,7 +81,7 @@ def path_in(root: Path, template: object, key: str, **places: int | str) -> str:
         DatasetError: The template does not fit the version, or leads out of the dataset.
     """
     text = str(template)
-    absent = template is None and key == "data_path"  # videos may be declared without a file
+    absent = template is None and key == "data_path"  # videos may be declared without a path
     left = _FIELD.sub("", text)
     fields = {match[1] for match in _FIELD.finditer(text)}
     try:
@@ -114,7 +115,7 @@ def read_json(root: Path, file: str) -> dict:
 
 
 def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[dict]:
-    """JSON objects of a file with one a line.
+    """JSON objects of a file that has one per line.
 
     Args:
         root: Folder of the dataset.
@@ -139,7 +140,7 @@ def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[di
 def _parse(text: str, file: str, place: str = "") -> dict:
     try:
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: numbers of too many digits too
+    except (ValueError, RecursionError) as error:  # ValueError: also too many digits
         raise DatasetError(f"{place}is no valid JSON: {error}", file=file) from error
     if not isinstance(content, dict):
         raise DatasetError(f"{place}is no JSON object", file=file)
@@ -267,11 +268,11 @@ def is_unfinished(path: Path) -> bool:
 def finished_parquet(content: bytes, example: pa.Table) -> bytes:
     """A Parquet file whose writer was killed, with a new footer for its complete row groups.
 
-    A footer repeats what the headers of the pages say, and the schema. It is made from that of
-    an example; the pages are kept as they are.
+    A footer holds the schema and repeats the content of the page headers. The new footer is
+    made from the footer of an example; the pages are kept as they are.
 
     Args:
-        content: The file: pages as pyarrow writes them, with Snappy and dictionaries.
+        content: Content of the file, with pages as pyarrow writes them (Snappy, dictionaries).
         example: One row of a table with the columns of the file.
     """
     sink = pa.BufferOutputStream()
@@ -347,7 +348,7 @@ def _column(model: _Struct, pages: Sequence[_Page]) -> _Struct:
 
 
 def _read(data: bytes, at: int, kind: int) -> tuple[Any, int]:
-    """A value of Thrift's compact protocol, and the place behind it."""
+    """A value of Thrift's compact protocol, and the position after it."""
     if kind in (_TRUE, _FALSE):
         return kind == _TRUE, at
     if kind == _BYTE:
@@ -371,11 +372,11 @@ def _read(data: bytes, at: int, kind: int) -> tuple[Any, int]:
     number, at = _read_number(data, at)
     if kind == _BINARY:
         return data[at : at + number], at + number
-    return (number >> 1) ^ -(number & 1), at  # Parquet has no other types than integers
+    return (number >> 1) ^ -(number & 1), at  # all other types are integers
 
 
 def _read_number(data: bytes, at: int) -> tuple[int, int]:
-    """Unsigned number of seven bits a byte, the lowest first."""
+    """Unsigned number with seven bits per byte, the lowest bits first."""
     number = shift = 0
     while data[at] & 128:
         number |= (data[at] & 127) << shift

@@ -244,7 +244,7 @@ def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
 def places_v2(episode: int, chunks_size: int) -> dict[str, int]:
     """Fields of a path in version 2, which keeps one file per episode.
 
-    Some converters name the folder of `chunks_size` files as version 3 does.
+    Some converters use the field name of version 3 for the folder of `chunks_size` files.
     """
     chunk = episode // chunks_size
     return {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": episode}
@@ -305,7 +305,7 @@ def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
 Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 """Wrapper of a sequence of episodes, such as a progress bar."""
 EpisodeFilter = Callable[[EpisodeEntry], bool]
-"""True for an episode that is wanted, by its `index`, `length` and `tasks`."""
+"""Condition on an episode's `index`, `length` and `tasks`, true if the episode is wanted."""
 
 
 def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
@@ -339,7 +339,7 @@ def select_episodes(
     tasks: str | Sequence[str] | None = None,
     where: EpisodeFilter | None = None,
 ) -> tuple[EpisodeEntry, ...]:
-    """Episodes wanted, in the order wanted.
+    """The episodes wanted, in the order of `episodes`.
 
     Args:
         folder: The dataset.

@@ -19,7 +19,7 @@ RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
 """Column -> its values during one episode, in the type and unit on disk."""
 
 _BATCH_ROWS = 2**16
-"""Frames read at a time: enough for the speed of the disk, few enough for any memory."""
+"""Number of frames read at a time: enough for the full speed of a disk, and little memory."""
 
 
 def read_frames(
@@ -35,7 +35,7 @@ def read_frames(
 
 
 def raising[T](found: Iterable[T | DatasetError]) -> Iterator[T]:
-    """The items before the first error among them, which is raised."""
+    """The items; the first error among them is raised."""
     for item in found:
         if isinstance(item, DatasetError):
             raise item
@@ -50,15 +50,15 @@ def read_each(
 ) -> Iterator[RawFrames | DatasetError]:
     """Read columns of every episode, or give the error of one that cannot be read.
 
-    At most about 65,000 frames are held at a time, or one row group if that is larger; no row
-    group of sound data is read twice.
+    At most about 65,000 frames are held at a time, or one row group if that is larger. No row
+    group is read twice unless it is damaged.
 
     Args:
         folder: The dataset.
-        entries: Episodes wanted, in any order; that on disk is the fastest.
+        entries: Episodes wanted, in any order; the order on disk is the fastest.
         keys: Columns wanted; LeRobot's own index columns are added where they exist.
-        strict: Check that the rows are those that the metadata promise. False reads the wanted
-            columns alone, as they are.
+        strict: Check that the rows are those that the metadata promise. False reads only the
+            wanted columns, without checks.
     """
     for file, group in groupby(entries, key=lambda entry: entry.file):
         listed = list(group)
@@ -77,7 +77,7 @@ def read_each(
 def _columns(
     parquet: pq.ParquetFile, file: str, keys: Sequence[str], strict: bool
 ) -> list[str]:
-    """Columns to read: those wanted, and the existing ones that tell episode and time."""
+    """Columns to read: the wanted ones and, if strict, those of time, episode and task."""
     existing = parquet.schema_arrow.names
     for key in keys:
         if key not in existing:
@@ -90,7 +90,7 @@ def _columns(
 def _batches(
     entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
 ) -> Iterator[list[EpisodeEntry]]:
-    """Split episodes of a file at boundaries of row groups, gaps and steps back."""
+    """Split the episodes of a file into batches, at row groups, gaps and backward jumps."""
     batch: list[EpisodeEntry] = []
     rows, last_group = 0, -1
     for entry in entries:
@@ -212,7 +212,7 @@ def read_quantities(
         folder: The dataset.
         columns: Meaning of its columns.
         entries: Episodes wanted, as in `read_each`.
-        roles: Quantities wanted; None for all, and all extra columns.
+        roles: Quantities wanted; None for all quantities and all extra columns.
     """
     selections, extra = columns.selections, columns.extra
     if roles is not None:
@@ -231,7 +231,7 @@ def read_quantities(
 def _not_finite(
     entry: EpisodeEntry, quantities: Quantities, selections: Mapping[str, ColumnSelection]
 ) -> DatasetError | None:
-    """Fault of a value that is not finite; those of a feature that was not seen become 0."""
+    """Error for a value that is not finite; such values of an invisible feature become 0."""
     seen = quantities.get("feature_visible")
     for role, values in quantities.items():
         # The sum is finite unless a value is not: far cheaper than a mask.
@@ -316,8 +316,8 @@ def to_numpy(
     """Values of a Parquet column in their own type, nested lists flattened.
 
     Args:
-        column: Numbers, or lists of equally many numbers.
-        fault: Error of a row without a usable value, from its number and a message.
+        column: Numbers, or lists of equal length.
+        fault: Function that makes the error for a row, from the row's number and a message.
 
     Raises:
         DatasetError: A value is missing, or rows differ in their number of components.
@@ -351,7 +351,7 @@ def to_numpy(
 
 
 def _without_pandas(array: pa.Array) -> Shaped[np.ndarray, " values"]:
-    """Values of an array of numbers; pyarrow's own `to_numpy` imports pandas for a second."""
+    """Values of an array of numbers; pyarrow's own `to_numpy` imports pandas, which is slow."""
     if pa.types.is_boolean(array.type):  # packed to bits, which numpy cannot view
         return np.from_dlpack(array.cast(pa.uint8())).astype(bool)
     return np.from_dlpack(array)

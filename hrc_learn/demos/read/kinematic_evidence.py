@@ -1,7 +1,7 @@
 """Joint positions compared with the recorded pose of the end effector by forward kinematics.
 
-A known arm settles the unit, the order, the signs and the zeros of its joints: with the right
-ones, its forward kinematics give the recorded positions, up to the place of base and tool.
+The forward kinematics of a known arm give the recorded positions, up to the place of base and
+tool, only if the unit, order, signs and zeros of the recorded joints are right.
 """
 
 import itertools
@@ -21,26 +21,27 @@ from hrc_learn.kinematics import Arm
 from hrc_learn.kinematics.registry import arm_of_robot
 
 _FRAMES = 80
-"""Frames that are compared."""
+"""Number of frames that are compared."""
 _LEAST_MOTION = 0.01
-"""Motion of the end effector from which positions tell anything [m]."""
+"""Smallest motion of the end effector for a comparison [m]."""
 _AGREES, _AGREES_RELATIVE = 4e-3, 0.03
-"""Residual of agreement [m], and relative to the motion: arms are calibrated to millimetres."""
+"""Residuals up to which positions agree [m], and relative to the motion: arms are calibrated to
+millimetres."""
 _WORSE = 3.0
-"""Ratio of residuals from which one reading is preferred to another."""
+"""Ratio of residuals above which one interpretation is preferred to another."""
 _UNITS = {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi}
 _LEAST_OFFSET = math.radians(0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Reading of the joints under which forward kinematics give the recorded positions."""
+    """Interpretation of the joints for which forward kinematics give the recorded positions."""
 
     unit: str
     residual: float
     """Root mean square distance [m]."""
     other: float
-    """Residual of the joints in rad and deg, whichever is less, as they are recorded [m]."""
+    """Residual of the unchanged joints [m], in rad or deg, whichever is less."""
     change: str = ""
     """Signs or order that differ from the record, in words."""
 
@@ -49,7 +50,7 @@ def arm_columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
     """Column of each of the arm's joints among the joints of a dataset.
 
     Raises:
-        DatasetError: They are not the arm's.
+        DatasetError: The dataset's joints are not the arm's.
     """
     plain = [_plain(name) for name in names]
     wanted = [_plain(name) for name in arm.joint_names]
@@ -70,7 +71,7 @@ def _plain(name: str) -> str:
 
 
 def known_arm(robot: str | None, names: Sequence[str]) -> tuple[Arm, tuple[int, ...]] | None:
-    """Arm of a robot type and the columns of its joints; None if it or they are unknown."""
+    """Arm of a robot type and the columns of its joints; None if either is unknown."""
     arm = arm_of_robot(robot)
     try:
         return arm and (arm, arm_columns(names, arm))
@@ -83,10 +84,10 @@ def agreement(
     joints: Float64[np.ndarray, "frames joints"],
     position: Float64[np.ndarray, "frames 3"],
 ) -> Agreement | None:
-    """The reading of recorded joints that explains the positions; None if none does.
+    """The interpretation of recorded joints that explains the positions; None if none does.
 
     Args:
-        arm: The arm, whose joints the columns are.
+        arm: The arm; the columns of `joints` are its joints.
         joints: Joint positions as recorded.
         position: Positions of the end effector [m], in any frame parallel to the base.
     """
@@ -139,7 +140,7 @@ def residual(
 def _left(
     arm: Arm, q: Float64[np.ndarray, "frames joints"], position: Float64[np.ndarray, "frames 3"]
 ) -> Float64[np.ndarray, " numbers"]:
-    """Positions without their best fit p = p_flange + R_flange tool + base."""
+    """Residuals of the positions after the best fit p = p_flange + R_flange tool + base."""
     pose = arm.forward(torch.from_numpy(np.ascontiguousarray(q)))
     turns = quaternion.to_matrix(pose.orientation).numpy()
     free = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], axis=2)
@@ -150,9 +151,9 @@ def _left(
 def zero_offsets(
     arm: Arm, q: Float64[np.ndarray, "frames joints"], position: Float64[np.ndarray, "frames 3"]
 ) -> Float64[np.ndarray, " joints"]:
-    """Offsets that, added to joint positions, bring forward kinematics to the positions [rad].
+    """Offsets of the joint positions with which forward kinematics give the positions [rad].
 
-    They are 0 where the joints agree without them, and where they explain nothing.
+    Offsets below 0.5 degrees are set to 0; so are all, if they do not explain the error.
 
     Args:
         arm: The arm.
@@ -164,7 +165,7 @@ def zero_offsets(
     some = np.unique(np.linspace(0, len(q) - 1, _FRAMES).astype(int))
     q, position = q[some], position[some]
     nothing, before = np.zeros(q.shape[1]), residual(arm, q, position)
-    # The weight, 1 mm at 0.1 rad, settles offsets that a moved tool would explain as well.
+    # The weight, 1 mm at 0.1 rad, removes offsets that a moved tool explains equally well.
     found = least_squares(
         lambda offset: np.append(_left(arm, q + offset, position), 1e-2 * offset), nothing
     ).x

@@ -69,7 +69,7 @@ def read_feature(key: str, declared: dict) -> Feature:
     """One feature.
 
     Raises:
-        DatasetError: The declaration is malformed, or its names do not fit its shape.
+        DatasetError: The declaration is malformed. Names that do not fit the shape are ignored.
     """
     try:
         dtype, shape = str(declared["dtype"]), tuple(int(n) for n in declared["shape"])
@@ -127,7 +127,7 @@ def place(template: str, number: int, **fields: str) -> str:
 
 
 def data_schema(schema: pa.Schema, features: Mapping[str, dict]) -> pa.Schema:
-    """The schema with the types in Hugging Face's own terms, as LeRobot writes them."""
+    """The schema with metadata that states the types in Hugging Face's terms, as in LeRobot."""
     types = {}
     for name in schema.names:
         dtype, shape = features[name]["dtype"], list(features[name]["shape"])
@@ -197,8 +197,8 @@ def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> di
 def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Statistics:
     """Statistics over all episodes.
 
-    They are exact but for the quantiles, which are averaged over the episodes, weighted by
-    length, as LeRobot does.
+    They are exact except for the quantiles: these are averages over the episodes, weighted by
+    length, as in LeRobot.
 
     Args:
         episodes: Feature -> statistic -> its values, one row per episode.

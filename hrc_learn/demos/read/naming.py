@@ -1,7 +1,7 @@
 """Meaning of the names of features and components, as they occur in published datasets.
 
-There is no single convention: `names.toml` lists those seen. Unknown names are left to the
-caller's explicit mapping.
+There is no single convention: `names.toml` lists the known names. The caller must map unknown
+names explicitly.
 """
 
 import re
@@ -14,11 +14,11 @@ WORDS = read_toml(Path(__file__).with_name("names.toml"))
 """Content of `names.toml`."""
 
 JOINT_SUFFIXES: dict[str, list[str]] = WORDS["joint_suffixes"]
-"""Suffixes of `JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
+"""Role -> suffixes in `JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
 
 _JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
 
-# `joint_1_vel`: only after an unmistakable joint name, since `ee_pos` and `x_vel` are none.
+# `joint_1_vel`: only after a clear joint name, as `ee_pos` and `x_vel` are no joints.
 _UNDERSCORED = re.compile(
     r"(.*(?:joint|motor|axis)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)", re.IGNORECASE
 )
@@ -30,14 +30,14 @@ _CAMEL = re.compile(r"(?<=[a-z\d])(?=[A-Z])")
 _UNITS: dict[str, str] = WORDS["units"]
 """Unit -> its spellings in names (regular expression)."""
 _SPELLED = "|".join(f"(?P<u{i}>{spelled})" for i, spelled in enumerate(_UNITS.values()))
-# After a separator or in brackets, perhaps before a number: `q_deg`, `q (deg)`, `q_deg_3`.
+# A unit follows a separator or is in brackets; a number may follow: `q_deg`, `q (deg)`.
 _UNIT_AT_END = re.compile(
     rf"(?P<stem>.*[^\W_]\)?)(?:[._/ -]+|\s*(?=[(\[]))[(\[]?(?:{_SPELLED})"
     rf"(?P<rate>/s|_?per_s(?:ec)?|_s|ps)?[)\]]?(?P<number>[._]?\d+)?",
     re.IGNORECASE,
 )
 _METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|opening)$")
-"""Stems after which a lone `m` is the unit, and no name."""
+"""Stems after which a single `m` is a unit, not a part of the name."""
 
 _NO_JOINT = re.compile("|".join(WORDS["no_joint"]))
 
@@ -69,15 +69,15 @@ class ComponentMeaning:
     """Role of one component, and its place within the role."""
 
     role: str
-    """Role; "quaternion" is one of unknown order, "rotation" one of unknown encoding."""
+    """Role; "quaternion" has an unknown order, "rotation" an unknown encoding."""
     slot: str | int
     """Joint name, or index of the component."""
     side: str = ""
-    """The arm of two, "left" or "right"."""
+    """Arm of a robot with two arms, "left" or "right"; "" if the name states none."""
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """Name without the unit that it states, and the unit; "" if it states none."""
+    """Name without its unit, and the unit; "" if the name states none."""
     match = _UNIT_AT_END.fullmatch(name.strip())
     if match is None:
         return name, ""

@@ -17,36 +17,36 @@ from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.units import Quantities
 
-# Half a percent at either end is left to glitches.
+# Half a percent at either end is ignored: these values may be glitches.
 _LEVELS = (0.005, 0.05, 0.5, 0.95, 0.995)
 _MOST_FRAMES = 4000
 """Frames used to find a delay; the middle of a longer episode is enough."""
 _LONGEST_DELAY = 1.5
 """Largest delay considered [s]; no controller answers later."""
-# Fraction of the variance: a tenth of the motion.
+# Negligible fraction of the variance: a tenth of the motion.
 _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
 _REST, _FEWEST_STILL = 5, 5
-"""Frames over which a component must hardly move to be at rest, and fewest such frames."""
+"""Number of frames over which a component at rest hardly moves, and fewest frames at rest."""
 _REST_MOTION = 0.005
-"""Motion at rest, relative to the range."""
+"""Largest motion at rest, relative to the range."""
 FOLLOWS = 0.8
 """R squared above which a state follows its command."""
 LOST = 0.4
 """R squared below which a state does not follow its command."""
 _SAME_SLOPE = 0.3
-"""Largest difference of slopes of components in the same unit, relative to the usual one."""
+"""Largest relative difference from the typical slope, for components in the same unit."""
 _SAME_UNIT, _LATE = np.log(2.0), 0.75
-"""Logarithm of a slope (half to twice as far), and delay [s], up to which a state may follow
-positions."""
+"""Largest logarithm of the slope (a factor of 2), and largest delay [s], for a state that
+follows commanded positions."""
 PROMPT = 0.2
-"""Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
+"""Delay within which an arm follows [s]; at longer delays, a slow motion resembles its rate."""
 RATE_WINDOW = 0.2
 """Time over which joint rates, and commands that they are compared with, are averaged [s]: a
 change from frame to frame is mostly noise."""
 MOST_NAMED = 6
-"""Components named in a message."""
+"""Largest number of components named in a message."""
 # Relative variance of a window in which a component rests, up to rounding.
 _RESTING = 1e-10
 
@@ -94,8 +94,8 @@ class Tracking:
     delay: int
     """Delay of the state, the same for all components [frames]."""
     residual: Float32[np.ndarray, " delays"]
-    """Fraction of the variance left unexplained at each delay, from the longest lead on,
-    averaged over the components that follow their command."""
+    """Fraction of the variance left unexplained at each delay, in increasing order of delays
+    from -reach to reach, averaged over the components that follow their command."""
     slope: Float64[np.ndarray, " components"]
     """Change of the state per change of the command, at that delay."""
     fit: Float64[np.ndarray, " components"]
@@ -113,8 +113,8 @@ class EpisodeProfile:
     """Profile of each feature."""
     tracking: dict[str, Tracking] = field(default_factory=dict)
     """Tracking by role: `command_position` against the joints, `command_velocity` against the
-    joint rates, `rates` for position commands against rates, where the joints do not follow
-    them at once. Rates are means over `RATE_WINDOW`."""
+    joint rates, and `rates` for position commands against the joint rates, unless the joints
+    follow them promptly as positions. Rates are means over `RATE_WINDOW`."""
 
 
 def profile_columns(
@@ -206,7 +206,7 @@ class FeatureProfiles:
         return np.stack([getattr(profile, name) for profile in self.profiles]).astype(float)
 
     def median(self, name: str) -> Float64[np.ndarray, " components"]:
-        """Usual value of one statistic of each component."""
+        """Median of one statistic over the episodes, for each component."""
         return np.median(self.stack(name), axis=0)
 
     @cached_property
@@ -244,7 +244,7 @@ class FeatureProfiles:
 
 
 def listed(names: Sequence[str], places: Sequence[int] | np.ndarray) -> str:
-    """Names of the components at some places, bounded in number."""
+    """Names of the components with these indices, at most `MOST_NAMED`."""
     return ", ".join(names[int(place)] for place in places[:MOST_NAMED])
 
 
@@ -271,7 +271,7 @@ def feature_profiles(
 def gain_over(tracking: Tracking, delay: int) -> float:
     """Relative improvement of the episode's own delay over another delay, 0 to 1.
 
-    It is 0 if the other delay fits well too: delays of slow motions are hard to tell.
+    It is 0 if the other delay fits well too: delays of slow motions are hard to determine.
     """
     residual = tracking.residual
     other = residual[int(np.clip(len(residual) // 2 + delay, 0, len(residual) - 1))]
@@ -289,7 +289,7 @@ def _correlations(
     rests in its window.
     """
     inner = len(state) - 2 * reach
-    # Of mean 0 and variance 1; 0 where nothing moves.
+    # Scaled to mean 0 and variance 1; 0 where nothing moves.
     late, early = (
         (values - values.mean(0)) / np.maximum(values.std(0), 1e-12)
         for values in (state[reach : reach + inner], command)
@@ -302,7 +302,7 @@ def _correlations(
     mean = (sums[inner:] - sums[:-inner]) / inner
     variance = (squares[inner:] - squares[:-inner]) / inner - mean**2
     found = product / np.sqrt(np.maximum(variance, _RESTING))
-    return np.where(variance > _RESTING, found, 0.0)[::-1]  # the last window is the earliest
+    return np.where(variance > _RESTING, found, 0.0)[::-1]  # the last window has delay -reach
 
 
 def track(
@@ -352,13 +352,13 @@ def _resting_offset(
     command: Float64[np.ndarray, "frames components"],
     state: Float64[np.ndarray, "frames components"],
 ) -> Float64[np.ndarray, " components"]:
-    """Median of command minus state over the frames between which both hardly move."""
+    """Median of command minus state over the frames in which both hardly move."""
     span = np.maximum(np.ptp(state, axis=0), np.ptp(command, axis=0))
-    # Over five frames: a slow motion is no rest.
+    # Compared over five frames: a slow motion is no rest.
     still = np.maximum(
         *(np.abs(values[_REST:] - values[:-_REST]) for values in (command, state))
     ) <= _REST_MOTION * np.maximum(span, 1e-12)
-    # Frames in motion come last; the middle of the others is their median.
+    # Frames in motion are sorted last; the middle of the others is their median.
     gap = np.sort(np.where(still, (command - state)[_REST:], np.inf), axis=0)
     count = still.sum(0)
     places = np.stack([np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(gap) - 1)])
@@ -393,7 +393,7 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
 def _means(
     values: Float64[np.ndarray, "frames components"], window: int
 ) -> Float64[np.ndarray, "_windows components"]:
-    """Means over windows that begin at each frame, as many as differences over a window."""
+    """Means over `window` frames, beginning at each frame but the last `window` ones."""
     sums = np.cumsum(values, axis=0)
     return (sums[window:] - sums[:-window] - values[window:] + values[:-window]) / window
 
@@ -410,7 +410,7 @@ def commanded_rates(
     Returns:
         Joint rate per unit of the command [1/s], NaN for components that do not follow, and the
         typical fraction of the variance of rates that the commands explain (R squared); None if
-        most joints do not follow so.
+        most joints do not follow in this way.
     """
     positions, rates = (
         [known[name] for known in trackings if name in known]
@@ -423,11 +423,11 @@ def commanded_rates(
     )
     fit, slope = (over_episodes([getattr(t, name) for t in rates]) for name in ("fit", "slope"))
     position_fit = over_episodes([t.fit for t in positions])
-    # If both readings fit a smooth motion, the one without a long delay is meant.
+    # If both interpretations fit a smooth motion, the one without a long delay is right.
     prompt = rate_delay <= PROMPT < position_delay
     followed = (position_fit < LOST) | (prompt & (position_fit < fit))
     followed &= (fit > FOLLOWS) & (slope > 0)
-    # Joints that move together follow any command by their own factors.
+    # Joints that move together seem to follow any command, but by different factors.
     typical = np.median(slope[followed]) if followed.any() else 0.0
     followed &= np.abs(slope - typical) < _SAME_SLOPE * typical
     if 2 * followed.sum() <= len(slope):

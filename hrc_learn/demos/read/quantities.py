@@ -34,8 +34,8 @@ columns of the rotation matrix, one after the other, and `rotation_6d_rows` its 
 `rotation_matrix` is flattened in row order; `pose_matrix` is a flattened 4x4 homogeneous
 transform."""
 SIZES: dict[str, list[tuple[float, str, float, str]]] = _TABLES["sizes"]
-"""Largest value, unit, confidence, and second candidate, by the quantities whose unit their
-size tells."""
+"""Quantity whose unit is guessed by size -> rows of largest value, unit, confidence and second
+candidate."""
 
 ORIENTATION_ROLES: tuple[str, ...] = tuple(_TABLES["orientations"]["roles"])
 """Encodings of an orientation, preferred first."""
@@ -44,7 +44,8 @@ DIMENSIONS: dict[str, dict[str, float]] = _TABLES["dimensions"]
 hobby servos count; the position of their zero is unknown. A byte counts from 0 to 255, as
 grippers and hands of Robotiq and Inspire do."""
 CONTRACT_QUANTITIES: dict[str, str] = _TABLES["contract"]
-"""Role in a contract -> quantity of a demonstration, "" for none; other roles have one name."""
+"""Role in a contract -> quantity of a demonstration, "" for none. All other roles have the same
+name in both."""
 RECORDED: dict[str, list[str]] = _TABLES["recorded"]
 """Keyword of a frame -> role, feature and component names."""
 
@@ -60,7 +61,7 @@ def demonstration_fields(
 
     Args:
         quantities: Quantities in the units on disk, by role.
-        factors: SI units in the unit on disk, by role.
+        factors: Factors from the units on disk to SI units, by role.
 
     Raises:
         ValueError: The orientations are invalid.
@@ -72,12 +73,12 @@ def demonstration_fields(
     fields: dict[str, Any] = {role: values[role] for role in known if role in values}
     if "gripper" in values:
         opening = values["gripper"]
-        # Two fingers of opposite signs, as robomimic keeps them, open by their distance.
+        # robomimic stores two fingers with opposite signs: their distance is the opening.
         two = opening.shape[1] == 2
         fields["gripper"] = opening[:, 0] - opening[:, 1] if two else opening[:, 0]
     if "feature_visible" in values:
         fields["feature_visible"] = values["feature_visible"][:, 0] > 0
-    if "pose_matrix" in values:  # in a transform, the translation alone has a unit
+    if "pose_matrix" in values:  # only the translation of a transform has a unit
         values["pose_matrix"] = quantities["pose_matrix"]
         moved = transforms(values["pose_matrix"])[:, :3, 3].numpy()
         fields.setdefault("position", moved * factors["pose_matrix"])
@@ -89,7 +90,7 @@ def demonstration_fields(
 def to_quaternion(
     role: str, values: Float64[np.ndarray, "frames components"]
 ) -> Float64[np.ndarray, "frames 4"]:
-    """Unit quaternions (w, x, y, z), with neighbours on the same half of the sphere.
+    """Unit quaternions (w, x, y, z), their sign continuous along the frames.
 
     Args:
         role: Encoding, one of `ORIENTATION_ROLES`.
@@ -126,7 +127,7 @@ def transforms(values: Float64[np.ndarray, "frames 16"]) -> Tensor:
     """4x4 transforms from 16 numbers, in row order or, as in libfranka, in column order.
 
     Raises:
-        ValueError: Neither order has (0, 0, 0, 1) for its last row.
+        ValueError: In neither order, the last row is (0, 0, 0, 1).
     """
     by_rows = torch.from_numpy(values).reshape(-1, 4, 4)
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=by_rows.dtype)
@@ -138,7 +139,7 @@ def transforms(values: Float64[np.ndarray, "frames 16"]) -> Tensor:
 
 
 def _rotations(matrices: Tensor) -> Tensor:
-    """The matrices, if they are rotations."""
+    """The matrices, if they are orthogonal; a ValueError otherwise."""
     product = matrices @ matrices.mT
     # The tolerance allows for float32 and for few printed digits.
     wrong = ((product - torch.eye(3, dtype=product.dtype)).abs() > 1e-2).flatten(1).any(1)
@@ -149,7 +150,7 @@ def _rotations(matrices: Tensor) -> Tensor:
 
 
 def _normalized(q: Tensor) -> Tensor:
-    # Rounding leaves far less than 1 %.
+    # Rounding changes the length by far less than 1 %.
     wrong = ((q.norm(dim=-1) - 1).abs() > 0.01).nonzero()
     if len(wrong):
         k = int(wrong[0])

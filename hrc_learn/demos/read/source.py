@@ -37,12 +37,12 @@ from hrc_learn.demos.read.units import (
 )
 
 _SAMPLED = 32
-"""Episodes that decide on units."""
+"""Number of episodes that decide on units."""
 _POSES = 5
-"""Episodes whose poses are compared with the kinematics."""
+"""Number of episodes whose poses are compared with the kinematics."""
 _COMMAND = "command_position"
 _WHOLE_STEP, _SPEED = (0.1, 1.5), (2 / 3, 1.5)
-"""Motion per step, and per second, and unit of the command that counts as 1."""
+"""Ranges of the motion per unit of the command that count as 1: per step, and per second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class OpenedDataset:
     columns: ColumnMapping
     sidecar: Sidecar = field(default_factory=Sidecar)
     own_feature: bool = False
-    """True if the image feature is a column of the dataset, or left out by the caller."""
+    """True if the image feature is a column of the dataset, or the mapping decides on it."""
 
     @classmethod
     def of(cls, folder: DatasetFolder, mapping: MappingSpec | None = None) -> "OpenedDataset":
@@ -102,26 +102,26 @@ class OpenedDataset:
     def decide_units(
         self, entries: Sequence[EpisodeEntry], given: Mapping[str, str]
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
-        """Unit of every quantity, by a pass over the columns whose unit must be guessed.
+        """Unit of every quantity, from one pass over the columns whose unit must be guessed.
 
         Undeclared units are guessed from a sample of the dataset, so that the guess does not
-        depend on the episodes that are loaded. Episodes that cannot be read decide nothing.
+        depend on the episodes that are loaded. Episodes that cannot be read are ignored.
 
         Args:
             entries: Episodes that must not contradict the decision.
             given: Units from the caller.
 
         Returns:
-            The decisions, and the faults of those of the episodes that contradict them.
+            The decisions, and an error for each of the `entries` that contradicts them.
 
         Raises:
             DatasetError: A unit is unknown or does not fit its quantity.
         """
         known = {*self.declared_units, *given}
         guessed = guessed_from_values(self.columns.selections, known)
-        # The joints show what their commands are.
+        # Commands are identified by comparing them with the joints.
         more = {"time"} - known | ({"joint_position"} if _COMMAND in guessed else set())
-        # A known arm tells by its kinematics in which unit its joints are.
+        # The kinematics of a known arm tell the unit of its joints.
         more |= {"position"} if "joint_position" in guessed else set()
         roles = {*guessed, *(more & self.columns.selections.keys())}
         sample = {entry.index for entry in _spread(self.folder.episodes, _SAMPLED)}
@@ -171,12 +171,12 @@ class OpenedDataset:
     def _by_kinematics(
         self, joints: UnitDecision, poses: Sequence[tuple[np.ndarray, np.ndarray]], factor: Any
     ) -> UnitDecision:
-        """Decision on the unit of the joints, by the kinematics of a known arm if they tell.
+        """Decision on the unit of the joints, by the kinematics of a known arm if they agree.
 
         Args:
-            joints: Decision by their values.
+            joints: Decision by the values of the joints.
             poses: Joint positions and positions of the end effector, as recorded.
-            factor: Factor of the latter to metres.
+            factor: Factor from recorded positions to metres.
         """
         values, position = map(np.concatenate, zip(*poses, strict=True))
         known = known_arm(self.folder.robot_type, self.columns.joint_names)
@@ -210,7 +210,7 @@ def _meaning_of_commands(
     trackings: Sequence[Mapping[str, profiles.Tracking]],
     fps: float,
 ) -> dict[str, UnitDecision]:
-    """Decisions that change where commands are no positions of the joints."""
+    """Decisions to replace if the commands are not positions of the joints."""
     command, selection = decisions[_COMMAND], columns.selections[_COMMAND]
     if (found := profiles.commanded_rates(trackings, fps)) is None:
         if not selection.numbered or profiles.are_positions(trackings, fps):
@@ -220,9 +220,9 @@ def _meaning_of_commands(
         return {_COMMAND: replace(command, confidence=0.3, evidence=evidence, leader="")}
     slope, fit = found
     scale = float(np.nanmedian(slope)) / fps
-    # A controller that lags makes a part of each step.
+    # A lagging controller performs only a part of each step.
     factor = "" if _WHOLE_STEP[0] < scale < _WHOLE_STEP[1] else f"{scale:.2g} "
-    # A gripper without a name of its own comes last.
+    # A gripper that is not named as one comes last.
     hands = [is_hand(label) for label in selection.labels[:-1]]
     hands.append(selection.numbered or is_hand(selection.labels[-1]))
     units = tuple(
@@ -304,8 +304,8 @@ def load_demos(
             and `tasks`. To select by content, use `DemonstrationSet.filter`.
 
     Raises:
-        DatasetError: The dataset cannot be read; names file, episode, frame and key where
-            known, and the remedy.
+        DatasetError: The dataset cannot be read; the message names file, episode, frame and key
+            where known, and the remedy.
     """
     source = open_demos(path, episodes, mapping, units, joint_names, tasks=tasks, where=where)
     return source.load()
@@ -435,7 +435,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         return demo
 
     def spread(self, most: int) -> "DemonstrationSource":
-        """Subset of `most` demonstrations, spread evenly over the sequence and still unread."""
+        """Subset of at most `most` demonstrations, evenly spaced in the sequence and unread."""
         return self._part(_spread(self.entries, most))
 
     def _part(self, entries: Sequence[EpisodeEntry]) -> "DemonstrationSource":

@@ -19,7 +19,7 @@ ASSUMED = 0.95
 
 _BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES.items()}
 """Largest value by quantity and unit, allowing for noise."""
-# Wrists turn further than once, and no demonstration stays within 13 degrees.
+# Wrists may turn more than once, and no demonstration in degrees stays within 13 degrees.
 _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
@@ -31,14 +31,14 @@ _SLIDE = 0.12
 # Old datasets of LeRobot name the columns of joints and of poses alike.
 _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
 FEWEST_JOINTS, _POSE_AND_FINGERS = 5, 8
-"""Joints of the smallest usual arms; columns of a pose with two fingers."""
+"""Number of joints of the smallest usual arms; number of columns of a pose and two fingers."""
 # LeRobot clips normalised positions at exactly 100.
 _CLIP, _CLIPPED = 100.0, 0.002
-"""Value, and fraction of the frames at it from which a column counts as clipped."""
+"""This value, and the smallest fraction of frames at it in a column that counts as clipped."""
 GUESSED_BY_SIZE = tuple(SIZES)
-"""Quantities, apart from joints, whose unit their size tells."""
+"""Quantities other than joints whose unit is guessed from the size of their values."""
 _UNIT_LENGTH = 2e-3
-"""Deviation of a quaternion's length, of float32 and of few printed digits."""
+"""Error of a quaternion's length due to float32 or few printed digits."""
 # Arms of hobby servos, whose positions LeRobot stores in degrees or as -100..100.
 _HOBBY, _HOBBY_JOINTS = re.compile(WORDS["hobby"], re.IGNORECASE), {*WORDS["hobby_joints"]}
 
@@ -53,15 +53,15 @@ class Sizes(NamedTuple):
     whole: Bool[np.ndarray, " components"]
     """True where all values are whole numbers."""
     unit_length: Bool[np.ndarray, " components"]
-    """True where this component and the three after it have unit length, and move."""
+    """True where this component and the next three have unit length together, and move."""
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
     step: Float64[np.ndarray, " components"] = np.zeros(1)
-    """Step of which all differences of values are multiples, as of an encoder; 0: none."""
+    """Step, such as an encoder's, whose multiples all differences of values are; 0 for none."""
 
 
 class Guess(NamedTuple):
-    """Unit that the evidence speaks for."""
+    """Unit that the evidence suggests."""
 
     unit: str
     confidence: float
@@ -92,9 +92,9 @@ def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
 
 
 def _encoder_step(values: Float64[np.ndarray, " frames"]) -> float:
-    """Step of an encoder through which the values went; 0 if they are no multiples of one."""
+    """Step of the encoder that measured the values; 0 if their differences are no multiples."""
     apart = np.diff(np.unique(values))
-    # Stored as float32, a step has an error of some 1e-4 of itself.
+    # In float32, a step has a relative error of about 1e-4.
     if len(apart) < _FEWEST_STEPS or apart.min() < 1e-5 * np.abs(values).max():
         return 0.0
     step = float(np.median(apart[apart < 1.5 * apart.min()]))
@@ -105,7 +105,7 @@ def _encoder_step(values: Float64[np.ndarray, " frames"]) -> float:
 
 
 def typical(sizes: Sequence[Sizes]) -> Sizes:
-    """Sizes over episodes: no single episode decides."""
+    """Typical sizes over episodes, so that no single episode decides."""
     return Sizes(
         peak=np.median([s.peak for s in sizes], axis=0),
         clipped=np.mean([s.clipped for s in sizes], axis=0),
@@ -134,7 +134,7 @@ def guess_joints(
         robot_type: Robot type of the dataset, "" if unknown.
     """
     peaks = np.where(arm, sizes.peak, 0.0)
-    # All other columns may move little: they speak for no unit.
+    # Columns that do not move say nothing about the unit.
     moving = peaks > 1e-6
     if not moving.any():
         return Guess("rad", 0.9, "the joints do not move")
@@ -193,8 +193,8 @@ def _degrees_or_range(
             "%", 0.9, f"a joint is at exactly 100 in {share:.0f} % of the frames", "deg"
         )
     if hobby and any(label.lower().startswith("main_") for label in labels):
-        # These names went when LeRobot introduced -100..100 (lerobot 0.2, June 2025).
-        return Guess("deg", 0.85, f"{reach}, names are of the time before -100..100", "%")
+        # These names disappeared when LeRobot introduced -100..100 (lerobot 0.2, June 2025).
+        return Guess("deg", 0.85, f"{reach}, the names are older than -100..100", "%")
     if hobby:
         return Guess("deg", 0.5, f"{reach}; this arm is recorded in both units", "%")
     return Guess("deg", 0.75, reach, "%")
@@ -208,13 +208,13 @@ def guess_fingers(
     hobby: bool,
 ) -> list[str]:
     """Unit of each component if it is a finger, from its size and the unit of the arm."""
-    # A hand counts all its fingers alike, also those that move little.
+    # All fingers of a hand have the same unit, even those that move little.
     counted = hand & sizes.whole & (sizes.peak > _FINGER_RATIO) & (sizes.peak <= _BYTE)
     counted &= (sizes.peak[counted] > _PERCENT).any()
     slides = np.array(["finger" in label.lower() for label in labels])
     metres = slides & (sizes.peak > 0) & (sizes.peak <= _SLIDE)
     degrees = arm_unit == "deg"
-    # LeRobot gives grippers from 0 to 100, also where its arms are in degrees.
+    # LeRobot stores grippers as 0 to 100 even if the arm is in degrees.
     rules = (
         ("byte", counted),
         ("m", metres),
@@ -227,7 +227,7 @@ def guess_fingers(
 
 
 def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: bool) -> Guess:
-    """The guess, doubted where columns without telling names may hold no joints at all.
+    """The guess, less certain if columns without clear names may hold no joints at all.
 
     Args:
         guess: Unit, if the columns are joints.
@@ -256,7 +256,7 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
 def guess_by_size(role: str, sizes: Sizes) -> Guess:
     """Unit of an opening, a position or the angles of an orientation."""
     largest = float(sizes.peak.max())
-    # A gripper of 0..255 may be interpolated, but it ends at 255.
+    # Values of a gripper from 0 to 255 may be interpolated, but they end at 255.
     counts = bool(sizes.whole.all()) or abs(largest - 255) < 0.5
     _, unit, confidence, other = next(
         row for row in SIZES[role] if largest <= row[0] and (counts or row[1] != "byte")

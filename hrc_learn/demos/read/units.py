@@ -60,7 +60,7 @@ class UnitDecision:
 
     @property
     def steps(self) -> Bool[np.ndarray, " components"]:
-        """True for each component, or for all, that holds changes per step."""
+        """True for components that hold changes per step; one value if all have one unit."""
         return np.array([unit.endswith("/step") for unit in self.units or (self.unit,)])
 
     @property
@@ -70,7 +70,7 @@ class UnitDecision:
 
     @property
     def note(self) -> str | None:
-        """The guess and how to overrule it; None if nothing worth a word was guessed."""
+        """The guess and how to overrule it; None if no guess is worth mentioning."""
         # A gripper in metres or as a fraction of its opening is the usual case.
         if not self.guessed or (self.role == "gripper" and not self.converts):
             return None
@@ -133,8 +133,8 @@ def units_of(role: str) -> dict[str, float]:
     own = ROLES[role].unit
     options = next(units for units in DIMENSIONS.values() if own in units)
     if role in ("gripper", "joint_position", "command_position"):
-        # Grippers and hands give a fraction of their opening, hobby arms of their range.
-        # Fingers of some slide, in metres.
+        # Grippers and hands report a fraction of their opening, hobby arms a fraction of
+        # their range. Sliding fingers report metres.
         options = options | DIMENSIONS["ratio"] | {"m": 1.0}
     return options
 
@@ -155,7 +155,7 @@ def decide_units(
 
     Args:
         selections: Columns of the quantities, whose names are evidence.
-        sizes: Sizes of the values on disk of the quantities that must be guessed.
+        sizes: Sizes of the values on disk, for quantities whose unit must be guessed.
         stated: Units by role, or of each component, from the caller or the dataset.
         frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
         robot_type: Robot type of the dataset, "" if unknown.
@@ -187,7 +187,7 @@ def decide_units(
 
 
 def _named_units(selection: ColumnSelection) -> tuple[str, ...]:
-    """Unit of each component that its name states and the quantity can have; "" for none."""
+    """Unit that the name of each component states, if the quantity can have it; else ""."""
     rate = "/s" if selection.role.endswith("velocity") else ""
     known = units_of(selection.role)
     return tuple(
@@ -204,7 +204,7 @@ def _stated(role: str, unit: str | Sequence[str]) -> UnitDecision:
 
 
 def _following(role: str, leader: UnitDecision) -> UnitDecision:
-    """Decision for the unit of the leading quantity, if this quantity comes in it."""
+    """Decision to take over the unit of the leading quantity, if this quantity can have it."""
     velocity = role.endswith("velocity")
     unit = leader.unit + "/s" if velocity else leader.unit
     # A position given as a fraction of its range does not tell the unit of the velocity.
@@ -246,7 +246,7 @@ def _guess(
 
 
 def _with_command(joints: Sizes, command: Sizes) -> Sizes:
-    """Sizes of joints and their commands, which are clipped at 100 where joints stop before."""
+    """Sizes of joints and commands: commands are clipped at 100 where joints stop earlier."""
     if len(command.peak) != len(joints.peak):
         return joints
     near = (joints.peak > 90) & (command.peak > 90)
@@ -263,7 +263,7 @@ def _guess_joint_units(
     labels = selection.labels
     hand = np.array([is_hand(label) for label in labels])
     hand &= not hand.all()
-    # A gripper without a name of its own comes last.
+    # A gripper that is not named as one comes last.
     hand[-1] |= sizes.opening[-1] and not sizes.opening.all()
     stated = np.array([bool(unit) for unit in named])
     guess = unit_evidence.guess_joints(sizes, ~hand & ~stated, labels, robot_type)
@@ -322,7 +322,7 @@ def units_from_episodes(
         robot_type: Robot type of the dataset, "" if unknown.
 
     Returns:
-        The decisions, and the episodes and columns that contradict them.
+        The decisions, and an error for each episode that contradicts them.
 
     Raises:
         DatasetError: A unit is unknown, or does not fit its quantity.
