@@ -216,7 +216,7 @@ def test_a_pose_without_names_is_asked_about(recorded, tmp_path):
 def test_another_rate_is_refused_and_the_same_rate_keeps_the_changes(recorded, tmp_path):
     root = write(tmp_path / "set", recorded("measured"))
     with pytest.raises(
-        DatasetError, match="changes per step, which are not those of another rate"
+        DatasetError, match="changes per step, which would be wrong at another rate"
     ):
         repair_dataset(root, tmp_path / "out", RepairOptions(fps=50))
     repair_dataset(root, tmp_path / "out", RepairOptions(trim=False))
@@ -243,7 +243,7 @@ def units_of_commands(root):
 
 def test_changes_and_positions_are_not_merged(recorded, tmp_path):
     roots = [write(tmp_path / kind, recorded(kind)) for kind in ("position", "measured")]
-    with pytest.raises(DatasetError, match=r"rad/step.*one does not follow from the other"):
+    with pytest.raises(DatasetError, match=r"rad/step.*one cannot be converted to the other"):
         merge_datasets(roots, tmp_path / "out")
 
 

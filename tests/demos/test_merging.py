@@ -96,7 +96,7 @@ def in_between(root):
     [
         (
             lambda r: write_folder(r, [{STATE: joint_path(60)}], {STATE: HOBBY}),
-            "has no action, as the others have",
+            "has no action, unlike the others",
         ),
         (
             lambda r: write(
@@ -110,7 +110,7 @@ def in_between(root):
         ),
         (
             lambda r: (write(r, [joint_path(60)], HOBBY), sidecar(r, joint_position="%")),
-            "joint_position in %, but joint_position in rad in .*/a: one does not follow",
+            "joint_position in %, but joint_position in rad in .*/a: one cannot be converted",
         ),
         (
             lambda r: write(r, [joint_path(60)], [HOBBY[0], HOBBY[0], HOBBY[2]]),
@@ -139,7 +139,7 @@ def test_other_robots_and_columns_without_names_are_noted(tmp_path):
     notes = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new").notes
     assert f"{tmp_path / 'b'}: robot other; the merged dataset names test" in notes
     for key in (STATE, ACTION):
-        order = f"{tmp_path / 'b'}: {key} taken in its order, as not both datasets name it"
+        order = f"{tmp_path / 'b'}: {key} matched by position, as not both datasets name it"
         assert notes.count(order) == 1
 
 

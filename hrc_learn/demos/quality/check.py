@@ -51,7 +51,7 @@ MOTION_CHECKS = (
     episode_checks.copied_commands,
 )
 _PLACED = 5
-"""Episodes whose joints and poses are compared."""
+"""Number of episodes whose joints and poses are compared."""
 CONSISTENCY_CHECKS = (
     consistency.holds,
     consistency.noise,
@@ -75,7 +75,7 @@ def check_dataset(
         units: Units on disk by role, as in `load_demos`.
 
     Raises:
-        DatasetError: `mapping` or `units` name what does not exist.
+        DatasetError: `mapping` or `units` name an unknown quantity, column or unit.
     """
     for role, unit in (units or {}).items():
         unit_factor(role, unit)
@@ -85,7 +85,7 @@ def check_dataset(
         return report
     for check in METADATA_CHECKS:
         report.run(check, folder)
-    # A wrong mapping is no fault of the data; without a sound sidecar, names have to do.
+    # A wrong mapping raises. A faulty sidecar is reported, and columns are found by name.
     columns = map_columns(folder.features, mapping)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
     dataset = dataset or OpenedDataset(folder=folder, columns=columns)
@@ -100,7 +100,7 @@ def _first_pass(
     profiles: list[EpisodeProfile],
     sound: list[EpisodeEntry],
 ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
-    """Run the checks that need no units, and give the quantities of the sound episodes.
+    """Run the checks that need no units, and yield the quantities of the sound episodes.
 
     The profiles of all episodes and the entries of the sound ones are appended to the lists.
     """
@@ -123,10 +123,10 @@ def _first_pass(
 def _check_content(
     dataset: OpenedDataset, report: ValidationReport, units: Mapping[str, str]
 ) -> None:
-    """Decide on the units; check every motion, and episodes against others.
+    """Decide on the units, check every motion, and compare the episodes.
 
     Raises:
-        DatasetError: The units are wrong.
+        DatasetError: A unit is unknown or does not fit its quantity.
     """
     folder, columns = dataset.folder, dataset.columns
     profiles: list[EpisodeProfile] = []
@@ -225,7 +225,7 @@ def _is_sound(frames: RawFrames, mapping: ColumnMapping) -> bool:
 
 
 def _meaning(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> Iterator[Issue]:
-    """Guesses of columns and units, quantities of other joints, and a lack of any."""
+    """Report guesses, quantities of other joints, and missing joints and poses."""
     for note in (*mapping.notes, *(decision.note for decision in decisions.values())):
         if note:
             yield warning(message=note)

@@ -1,4 +1,4 @@
-"""Copies of a dataset with other frames: features, statistics, tasks and videos."""
+"""Copies of a dataset with edited frames: features, statistics, tasks and videos."""
 
 import shutil
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -54,7 +54,7 @@ def write_copy(
 
     Args:
         out: Folder of the new dataset, which must not exist.
-        episodes: The episodes, all of one header.
+        episodes: The episodes, all with the same header.
         tasks: Task texts in order of their indices.
         notes_of: Dataset whose card, licence and metadata of other programs are copied.
 
@@ -95,7 +95,7 @@ def _copy_notes(source: Path, target: Path) -> None:
 
 
 def listed_tasks(folder: DatasetFolder) -> list[str]:
-    """Task texts of a dataset, those of the list of tasks in order of their indices first."""
+    """Task texts of a dataset: first the list of tasks by index, then those of episodes."""
     listed = [folder.tasks[index] for index in sorted(folder.tasks)]
     listed += [task for entry in folder.episodes for task in entry.tasks]
     return [*dict.fromkeys(listed)] or [NO_TASK]
@@ -113,9 +113,9 @@ def new_header(
 
     Args:
         dataset: The old dataset.
-        units: Units from the caller, also in the contract.
-        cameras: Videos that are copied.
-        fps: Rate that episodes are resampled to [1/s]; None for the old one.
+        units: Units from the caller; they also replace those in the contract.
+        cameras: Features whose videos are copied.
+        fps: Rate to which episodes are resampled [1/s]; None for the old one.
         add_time: Add the old stamps as `time`.
     """
     folder, old, features = dataset.folder, dataset.sidecar, {}
@@ -173,10 +173,10 @@ class ColumnRewriter:
         self._recorded = recorded_statistics(folder) if pictures else {}
 
     def rewritten(self, edit: EpisodeEdit) -> Rewritten:
-        """An edited episode with the parts of the old videos and its tasks.
+        """An edited episode with its tasks and its parts of the old videos.
 
         Raises:
-            DatasetError: A video is missing or would have to be encoded anew, or a task is not
+            DatasetError: A video is missing or would have to be re-encoded, or a task is not
                 listed.
         """
         videos, tasks = self._videos_of(edit), self._tasks_of(edit)
@@ -235,7 +235,7 @@ class ColumnRewriter:
             path: The file.
             episode: Result of `rewritten`.
             numbers: Index of each task text.
-            frames_before: Number of frames of the episodes before.
+            frames_before: Number of frames of all earlier episodes.
         """
         edit, others = episode.edit, self._other_columns(episode.edit)
         pictures = {**episode.videos, **others}

@@ -1,4 +1,4 @@
-"""Checks of one episode against the others: sizes, rests, noise, columns and commands."""
+"""Compare each episode with the others: sizes, rests, noise, columns and commands."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
@@ -26,7 +26,7 @@ from hrc_learn.demos.read.profiles import (
 from hrc_learn.demos.read.units import UnitDecision
 
 FEWEST = 3
-"""Fewest episodes among which one can be compared with the others."""
+"""Smallest number of episodes in which one can be compared with the others."""
 _IMPOSSIBLE = 1e12
 """Size that no sensor reports: flipped bits, or memory that was never written."""
 _IMPLAUSIBLE = 1e3
@@ -34,7 +34,7 @@ _IMPLAUSIBLE = 1e3
 _FAR_OFF = 3.0
 """Distance from the other episodes, in spreads, above which an episode is examined."""
 _HALF_TURN = 0.9 * np.pi
-"""Length of a rotation vector [rad] above which noise of the hand can flip its sign."""
+"""Length of a rotation vector [rad] above which small motions can flip its sign."""
 _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
 _OFFSET = 0.1
@@ -43,7 +43,7 @@ hobby servos stop within a few degrees under load."""
 
 
 def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
-    """Episodes that were interrupted, or joined."""
+    """Report episodes that seem interrupted, or to hold several demonstrations."""
     if len(entries) <= FEWEST:
         return
     usual = float(np.median([entry.length for entry in entries]))
@@ -57,7 +57,7 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
 
 
 def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
-    """Components that change, and do not stay at an end of their range."""
+    """Report components that never change, or stay at an end of their range."""
     still = [feature.key for feature in features if feature.constant.all()]
     if len(still) > MOST_NAMED:
         text = f"{len(still)} features never change: {listed(still, range(len(still)))}, ..."
@@ -81,7 +81,7 @@ def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
 
 
 def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
-    """Values that no robot reports."""
+    """Report values that no robot produces."""
     usual = feature.median("peak")
     largest = np.maximum(np.abs(feature.stack("low")), np.abs(feature.stack("high")))
     scale = np.maximum(usual, np.where(feature.smooth, 1e-3, np.inf))
@@ -99,11 +99,11 @@ def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
 
 
 def holds(feature: FeatureProfiles) -> Iterator[Issue]:
-    """Components that froze in one episode, and hardly ever rest in the others."""
+    """Report components that froze in one episode, but hardly ever rest in the others."""
     held, frames = feature.stack("held"), feature.lengths
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
-    # Long in itself, long for this component, and longer than any pause of the operator.
+    # A large part of the episode, long for this component, and longer than a short pause.
     frozen = (
         (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * feature.fps))
     )
@@ -118,7 +118,7 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
 
 
 def noise(feature: FeatureProfiles) -> Iterator[Issue]:
-    """Components far noisier, or far coarser, in one episode than in the others."""
+    """Report components that are far noisier or coarser in one episode than in the others."""
     noise, span = feature.stack("noise"), feature.median("span")
     moving = feature.smooth & (span > 0)
     # Second differences vary by a factor of three between operators, not by ten.
@@ -137,7 +137,7 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
 
 
 def switches(feature: FeatureProfiles) -> Iterator[Issue]:
-    """Grippers and flags that stay, or switch the other way, in one episode alone."""
+    """Report grippers and flags that stay, or switch the other way, in one episode only."""
     span, usual_span = feature.stack("span"), feature.median("span")
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
     usual = np.median(ends, axis=0)
@@ -162,9 +162,9 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
 
 
 def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
-    """Columns exchanged, negated, offset or run backwards in one episode.
+    """Report columns that are exchanged, negated, offset or reversed in time in one episode.
 
-    An episode is described by five figures per component (5, 50 and 95 % quantiles, start and
+    An episode is described by five numbers per component (5, 50 and 95 % quantiles, start and
     goal) and compared with the median over all episodes, in units of their spread.
     """
     if not feature.key.startswith(("observation.", "state", "action")):
@@ -202,14 +202,14 @@ _Finding = tuple[Literal["error", "warning"], str]
 def _permuted(
     own: _Figures, usual: _Figures, scale: _PerComponent, off: _PerComponent, names: list[str]
 ) -> _Finding | None:
-    """Components that took each other's place."""
+    """Components that exchanged their places."""
     from scipy.optimize import linear_sum_assignment
 
     cost = np.abs(own[:, :, None] - usual[:, None, :]).mean(0) / scale
     # The bound keeps one outlier from deciding the whole assignment.
     _, best = linear_sum_assignment(np.minimum(cost, 50))
-    # Cycles of the permutation in which every component is far from its usual place: if only
-    # some are, they resemble the others by chance.
+    # Cycles of the permutation in which every component is far from its usual values: if only
+    # some components are far, they resemble the others by chance.
     cyclic, after = best != np.arange(len(best)), best
     for _ in best:
         cyclic &= off[after] > _FAR_OFF
@@ -228,7 +228,7 @@ def _permuted(
 def _moved(
     own: _Figures, usual: _Figures, scale: _PerComponent, off: _PerComponent, names: list[str]
 ) -> _Finding | None:
-    """Components with the opposite sign, a motion run backwards, or a moved zero."""
+    """Components with the opposite sign or a moved zero, or a motion reversed in time."""
     # Negation exchanges the quantiles 5 and 95 %. The negated figures must be usual, and far
     # closer than the original ones.
     turned = np.abs(-own[[2, 1, 0, 3, 4]] - usual).mean(0) / scale
@@ -270,7 +270,7 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
 def command_tracking(
     command: ColumnSelection, profiles: Sequence[EpisodeProfile]
 ) -> Iterator[Issue]:
-    """Delays, signs and pairs of commands and states that agree between episodes.
+    """Report episodes whose states follow their commands otherwise than in other episodes.
 
     Args:
         command: Columns of the commands.
@@ -293,7 +293,7 @@ def command_tracking(
     agreement = (np.abs(delays - delay) <= 2).mean()
     for profile, tracking in zip(profiles, trackings, strict=True):
         shift = tracking.delay - delay
-        # The own delay must explain far more of the motion than the usual one.
+        # The episode's own delay must explain far more of the motion than the usual delay.
         better = gain_over(tracking, round(delay)) > 0.8
         # Three frames are the scatter of estimated delays.
         if abs(shift) > max(3, 0.1 * abs(delay)) and better and agreement > 0.5:
@@ -315,9 +315,9 @@ def command_offsets(
     features: Sequence[FeatureProfiles],
     unit: UnitDecision,
 ) -> Iterator[Issue]:
-    """Constant distances between command and state at rest, and episodes where they changed.
+    """Report constant offsets of states at rest from their commands, and changes of them.
 
-    A leader and a follower that were calibrated differently are such a distance apart.
+    Different calibrations of a leader and its follower cause such offsets.
 
     Args:
         command: Columns of the commands.
@@ -356,7 +356,7 @@ def command_offsets(
 def joint_zeros(
     robot_type: str | None, joint_names: Sequence[str], demos: Sequence[Demonstration]
 ) -> Iterator[Issue]:
-    """Zeros of the joints, by the kinematics of a known arm and the position of its tool.
+    """Report wrong zeros of joints, by the kinematics of a known arm and its tool position.
 
     Args:
         robot_type: Robot type of the dataset.
@@ -400,7 +400,7 @@ def _component_tracking(
         yield f"{text}: {listed(names, lost)}", "warning"
     with np.errstate(all="ignore"):
         ratio = np.abs(slope / np.where(usual_slope, usual_slope, 1))
-    # A factor of exp(0.5) = 1.6: payload and contact explain less.
+    # Above a factor of exp(0.5) = 1.6: payload and contact cause smaller changes.
     size = np.flatnonzero(follows & (np.abs(np.log(ratio + 1e-9)) > 0.5))
     if len(size):
         text = (

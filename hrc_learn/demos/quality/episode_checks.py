@@ -18,7 +18,7 @@ _RATE_TOLERANCE = 0.05
 _JITTER_TOLERANCE = 0.10
 _REGULAR = 0.04
 _GAP = 1.6
-"""Multiple of the usual step above which a frame was lost in between."""
+"""Multiple of the usual step above which a frame was lost."""
 # A shorter episode is a false start.
 _SHORT_FRAMES, _SHORT_SECONDS = 10, 0.5
 _FASTEST_ARM = 12.0
@@ -26,7 +26,7 @@ _FASTEST_ARM = 12.0
 _STILL_SECONDS = 1.0
 """Longest rest before or after the motion that is not reported [s]."""
 _SMALLEST_MOTION = 1e-4
-"""Smallest motion [rad or m]; encoders and trackers resolve no less."""
+"""Smallest motion [rad or m]; encoders and trackers do not resolve smaller ones."""
 _SAME_EPISODE = 1e-3
 """Largest difference of two copies of an episode, relative to the span of the motion."""
 # A spike or jump exceeds this multiple of the usual fast step, and this fraction of the range.
@@ -38,7 +38,7 @@ _LEAST_SPIKE, _LEAST_JUMP = 0.03, 0.1
 def finite_values(
     folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
 ) -> Iterator[Issue]:
-    """Values that are finite."""
+    """Check that all values are finite."""
     for key, values in frames.items():
         # The sum is finite unless a value is not: far cheaper than a mask.
         if np.isfinite(values.sum(dtype=float)):
@@ -57,7 +57,7 @@ def finite_values(
 def repetitions(
     folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
 ) -> Iterator[Issue]:
-    """Frames that repeat the previous one: the robot was read too fast, or stood still."""
+    """Report frames that equal the previous one: the robot is read too fast or stands still."""
     if entry.length < 3:
         return
     same = repeated_frames(frames)[1:]
@@ -92,7 +92,7 @@ def is_clock(values: np.ndarray) -> bool:
 def episode_length(
     folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
 ) -> Iterator[Issue]:
-    """Episodes long enough for a demonstration."""
+    """Report episodes that are too short for a demonstration."""
     seconds = entry.length / folder.fps
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
         text = f"only {entry.length} frames ({seconds:.2g} s): a false start?"
@@ -102,7 +102,7 @@ def episode_length(
 def recorded_stamps(
     folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
 ) -> Iterator[Issue]:
-    """LeRobot's own time stamps."""
+    """Check LeRobot's own time stamps."""
     if "timestamp" in frames:
         time = frames["timestamp"][:, 0].astype(float)
         yield from stamps(entry, "timestamp", time, folder.fps)
@@ -111,7 +111,7 @@ def recorded_stamps(
 def stamps(
     entry: EpisodeEntry, key: str, time: Float64[np.ndarray, " frames"], fps: float
 ) -> Iterator[Issue]:
-    """Time stamps [s]: order, offset, rate, gaps and jitter."""
+    """Check time stamps [s]: order, offset, rate, gaps and jitter."""
     steps = np.diff(time)
     if not np.isfinite(time).all() or not len(steps):
         return  # values that are not finite are reported as such
@@ -140,7 +140,7 @@ def stamps(
     gaps = np.flatnonzero(steps > _GAP * usual)
     rate = 1 / float(steps.mean())
     if not len(gaps) and abs(usual * fps - 1) <= _RATE_TOLERANCE < abs(rate / fps - 1):
-        # A loop that is late now and then keeps its usual step, but not its rate.
+        # A loop that is sometimes late keeps its usual step, but not its mean rate.
         text = (
             f"{len(time)} frames in {time[-1] - time[0]:.4g} s are {rate:.4g} Hz, but fps says "
             f"{fps:g}: the loop was late; hrc repair --fps {fps:g} resamples"
@@ -164,7 +164,7 @@ UsualMotion = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
 def quaternion_signs(entry: EpisodeEntry, quantities: Quantities) -> Iterator[Issue]:
-    """Quaternions of continuous sign."""
+    """Check that the signs of quaternions are continuous."""
     for role, values in quantities.items():
         flips = role.startswith("quaternion") and (values[1:] * values[:-1]).sum(1) < 0
         if np.any(flips):
@@ -181,7 +181,7 @@ def arm_motion(demo: Demonstration) -> Float64[np.ndarray, "frames _"] | None:
 
 
 def motion_present(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
-    """Motion at all: no primitive can be fitted to an arm at rest."""
+    """Check that the arm moves: no primitive can be fitted to an arm at rest."""
     motion = arm_motion(demo)
     span = np.inf if motion is None else float(np.ptp(motion, axis=0).max())
     if span < _SMALLEST_MOTION:
@@ -191,7 +191,7 @@ def motion_present(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
 
 
 def rest_at_ends(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
-    """Rest before or after the motion, which a fit would reproduce."""
+    """Report long rests before or after the motion, which a fit would reproduce."""
     motion, time = arm_motion(demo), demo.time
     span = 0.0 if motion is None else float(np.ptp(motion, axis=0).max())
     if motion is None or span == 0:
@@ -212,7 +212,7 @@ def rest_at_ends(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
 def spikes_and_jumps(
     entry: EpisodeEntry, demo: Demonstration, usual: UsualMotion
 ) -> Iterator[Issue]:
-    """Frames out of line with both neighbours, and steps far beyond those usual here."""
+    """Report frames far from both neighbours, and steps far larger than usual."""
     for role, (step, span) in usual.items():
         steps = np.diff(getattr(demo, role), axis=0)
         smooth = (step > 0) & (step < 0.2 * span)  # other joints switch between levels
@@ -242,13 +242,13 @@ def spikes_and_jumps(
 
 
 def joint_speeds(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
-    """Speeds that a joint can reach: no lost frames, glitches or wrapped encoders."""
+    """Report joint speeds due to lost frames, glitches or wrapped encoders."""
     joints, names = demo.joint_position, demo.joint_names
     if joints is None:
         return
     change = np.diff(joints, axis=0)
     speed = np.abs(change) / np.diff(demo.time)[:, None]
-    # Fingers are faster, and often counted in units of their own.
+    # Fingers are faster, and often have units of their own.
     limits = np.array([np.inf if is_hand(name) else _FASTEST_ARM for name in names])
     too_fast = (speed > limits).any(1)
     if not too_fast.any():
@@ -268,7 +268,7 @@ def joint_speeds(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
 
 
 def copied_commands(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
-    """Actions that differ from the state: a copy teaches a policy to stand still."""
+    """Report actions that equal the state: they teach a policy to stand still."""
     joints, command = demo.joint_position, demo.command_position
     if joints is not None and command is not None and np.array_equal(joints, command):
         text = "is a copy of the state at the same frame; a policy learns to stay where it is"
@@ -278,7 +278,7 @@ def copied_commands(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]
 def duplicates(
     motions: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, " numbers"], float]],
 ) -> Iterator[Issue]:
-    """Episodes that show different motions.
+    """Report episodes that show the same motion.
 
     Args:
         motions: Episode, its motion at a fixed number of phases (`motion_sketch`), and the
@@ -287,7 +287,7 @@ def duplicates(
     if len({sketch.shape for _, sketch, _ in motions}) != 1:
         return
     sketches = np.stack([sketch for _, sketch, _ in motions])
-    # Equal motions have nearly equal means: neighbours in their order are compared.
+    # Equal motions have nearly equal means: only motions of similar means are compared.
     means = sketches.mean(1)
     order = np.argsort(means)
     for number, (entry, sketch, span) in enumerate(motions):

@@ -1,4 +1,4 @@
-"""Edits of an episode: frames removed, values mended, and a regular grid of frames."""
+"""Edits of an episode: frames removed, values corrected, frames resampled to a grid."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -29,9 +29,9 @@ _RESTING = 0.01
 """Fraction of its range within which a value rests: more than the noise of encoders."""
 _MEASURED_ANGLES = ("joint_position", "euler_xyz", "euler_intrinsic_xyz")
 _LARGEST_REMAINDER = 0.3 / (2 * np.pi)
-"""Largest motion within a frame: what may be left of a jump without its whole turns [turns]."""
+"""Largest remainder of a jump without its whole turns, due to motion within a frame [turns]."""
 _NEIGHBOURS = 4
-"""Steps on either side that tell the speed of the joint."""
+"""Number of steps on either side that indicate the speed of a joint."""
 _SMOOTH = ("joint_position", "joint_velocity", "position")
 
 
@@ -44,11 +44,11 @@ class EpisodeEdit:
     columns: ColumnMapping
     units: Mapping[str, UnitDecision]
     frames: RawFrames
-    """Columns to be written; of LeRobot's own, only `task_index`."""
+    """Columns to be written; of LeRobot's index columns, only `task_index`."""
     time: Float64[np.ndarray, " _frames"]
     """True stamps if there are any, LeRobot's otherwise [s]."""
     kept: Int64[np.ndarray, " _frames"]
-    """Frame of the old episode; the nearest one after resampling."""
+    """Index of each frame in the old episode; after resampling, that of the nearest frame."""
     resampled: bool = False
     changes: tuple[str, ...] = ()
 
@@ -77,7 +77,7 @@ class EpisodeEdit:
         return np.array(named) | (role == "gripper")
 
     def only(self, wanted: Bool[np.ndarray, " _frames"], change: str) -> "EpisodeEdit":
-        """The wanted frames alone.
+        """The episode with the wanted frames only.
 
         Raises:
             DatasetError: Fewer than two frames would be left.
@@ -135,7 +135,7 @@ def unedited(
 
 
 def renew_stamps(edit: EpisodeEdit, fps: float) -> EpisodeEdit:
-    """Replace LeRobot's own stamps if they do not increase: they are frame / fps."""
+    """Replace LeRobot's own stamps by frame / fps if they do not increase."""
     stalled = int((~(np.diff(edit.time) > 0)).sum())
     if not stalled or "time" in edit.selections:
         return edit
@@ -169,7 +169,7 @@ def drop_bad_frames(edit: EpisodeEdit, allowed: bool) -> EpisodeEdit:
 
 
 def drop_late(edit: EpisodeEdit) -> EpisodeEdit:
-    """Drop the frames whose stamp is not later than all before.
+    """Drop the frames whose stamp is not later than all earlier ones.
 
     Raises:
         DatasetError: No two frames are left.
@@ -181,7 +181,7 @@ def drop_late(edit: EpisodeEdit) -> EpisodeEdit:
 
 
 def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
-    """Drop the frames that repeat the previous one because the robot reports more slowly.
+    """Drop the frames that repeat the previous one because the robot reports too slowly.
 
     A frame with a different command, or any other difference, stays. Repetitions that last
     longer than `_PAUSE` show an arm at rest, and stay too.
@@ -226,7 +226,7 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
 
 
 def _while_all_rest(edit: EpisodeEdit, first: int, last: int) -> tuple[int, int]:
-    """First and last frame to keep, such that grippers, hands and commands rest outside."""
+    """First and last frame to keep, such that all state and action columns rest outside."""
     for key, values in edit.frames.items():
         if not key.startswith(("observation.", "action", "state")) or is_clock(values):
             continue
@@ -264,7 +264,7 @@ def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
     """Remove jumps by whole turns from joints, Euler angles and rotation vectors.
 
     Only measurements of the arm change: commands, hands, grippers and switches stay as they
-    are. A joint whose command jumps with it stays too, so that the two agree.
+    are. A joint also stays as it is if its command jumps, so that the two agree.
     """
     quantities = edit.quantities
     for role in (*_MEASURED_ANGLES, "rotation_vector"):
@@ -299,8 +299,8 @@ def _turns(
 ) -> Float64[np.ndarray, "frames columns"]:
     """Whole turns by which each value has jumped since the first frame.
 
-    A jump counts only if its remainder fits the motion before and after: a two-level signal of
-    -3 and 3 rad leaves 0.28 rad while it rests otherwise, which is no turn.
+    A jump counts only if its remainder fits the motion before and after. A signal that switches
+    between -3 and 3 rad leaves a remainder of 0.28 rad, but otherwise rests: it does not turn.
     """
     steps = np.diff(values, axis=0)
     whole = np.rint(steps)
@@ -330,10 +330,10 @@ def fix_signs(edit: EpisodeEdit) -> EpisodeEdit:
 def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     """Resample every column to a regular grid that begins at the first frame.
 
-    Joints, joint velocities and poses follow cubic splines, other columns straight lines;
-    integers, switches and hands take the nearest frame. Joints, commands and Euler angles that
-    jump by whole turns are unwrapped. Rotation vectors are interpolated as they are: unwrap
-    them first. Stamps must increase.
+    Joints, joint velocities, positions and quaternions follow cubic splines, other columns
+    straight lines; integers, switches and hands take the nearest frame. Joints, commands and
+    Euler angles that jump by whole turns are unwrapped. Rotation vectors are interpolated as
+    they are: unwrap them first. Stamps must increase.
 
     Raises:
         DatasetError: The episode is shorter than a period, or it holds transforms, which cannot
@@ -353,7 +353,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
             key="pose_matrix",
         )
     if "command_position" in edit.units and edit.units["command_position"].steps.any():
-        text = "holds changes per step, which are not those of another rate: keep the frames"
+        text = "holds changes per step, which would be wrong at another rate: keep the frames"
         raise edit.fault(text, key="command_position")
     time = np.minimum(grid, known[-1])
     smooth = fix_signs(_unwrapped_all(edit))
@@ -381,7 +381,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
 
 
 def _levels(edit: EpisodeEdit) -> Iterator[tuple[str, Bool[np.ndarray, " components"]]]:
-    """Components of each column without values between: integers, switches and hands."""
+    """Components of each column that are not interpolated: integers, switches and hands."""
     profiles = profile_columns(edit.frames)
     hands: set[tuple[str, int]] = set()
     for role in {"joint_position", "gripper", "command_position"} & edit.selections.keys():
@@ -395,7 +395,7 @@ def _levels(edit: EpisodeEdit) -> Iterator[tuple[str, Bool[np.ndarray, " compone
 
 
 def _unwrapped_all(edit: EpisodeEdit) -> EpisodeEdit:
-    """Angles and commands without jumps by whole turns, which no interpolation follows."""
+    """The episode without jumps of angles and commands by whole turns, for interpolation."""
     quantities = edit.quantities
     for role in (*_MEASURED_ANGLES, "command_position"):
         if role in quantities:

@@ -1,4 +1,4 @@
-"""One dataset of several: columns by name, units and tasks as in the first, videos copied."""
+"""Merge datasets: match columns by name, convert to the units of the first, copy videos."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ from hrc_learn.demos.recorded_episode import RecordingHeader
 from hrc_learn.demos.videos import read_segments
 
 _ESSENTIAL = ("action", "observation.state")
-"""Features without which no policy learns; others may be left out."""
+"""Features that policies need; others may be left out."""
 
 
 @dataclass(kw_only=True)
@@ -53,12 +53,12 @@ def merge_datasets(
     Args:
         paths: The datasets, two or more. They are not changed.
         out: Folder of the new dataset, which must not exist.
-        fps: Rate to which datasets of other rates are resampled [1/s]; None refuses those.
-        videos: Keep the videos, which are copied without a new encoding.
+        fps: Rate to which datasets of other rates are resampled [1/s]; None refuses these.
+        videos: Keep the videos; they are copied without re-encoding.
 
     Raises:
-        DatasetError: A dataset cannot be read, or does not fit the first one: its rate, a
-            component, a unit or the size of its images.
+        DatasetError: A dataset cannot be read, or its rate, a component, a unit or the size of
+            its images does not fit the first one.
         FileExistsError: `out` exists.
         ValueError: Fewer than two datasets are given.
     """
@@ -86,7 +86,7 @@ _Column = tuple[str, int]
 
 
 class _Source:
-    """One of the datasets, and the way from its columns to those of the first.
+    """One of the datasets, and the mapping from its columns to those of the first dataset.
 
     Attributes:
         folder: Its metadata.
@@ -94,7 +94,7 @@ class _Source:
         meanings: Quantity and joint of each component that has one.
         units: Unit of each of these components.
         places: Component of this dataset for each component of a feature of the first one.
-        factors: Factor to the unit of the first dataset for each of them.
+        factors: Factor of each of these components to the unit of the first dataset.
     """
 
     def __init__(self, dataset: OpenedDataset):
@@ -129,7 +129,7 @@ class _Source:
 
 
 class _Merge:
-    """One merge: the datasets, the features of all of them, and the report."""
+    """One merge: the datasets, their common features, and the report."""
 
     def __init__(
         self, opened: Sequence[OpenedDataset], fps: float, videos: bool, report: MergeReport
@@ -150,13 +150,13 @@ class _Merge:
                 )
 
     def _common_features(self) -> dict[str, Feature]:
-        """Features of all datasets, as the first one declares them."""
+        """Features that all datasets have, as the first one declares them."""
         common = {}
         everywhere = dict.fromkeys(key for source in self.sources for key in source.features)
         for key in (key for key in everywhere if key not in INDEX_KEYS):
             without = [str(one.root) for one in self.sources if key not in one.features]
             if without and key in _ESSENTIAL:
-                raise DatasetError(f"has no {key}, as the others have", file=without[0])
+                raise DatasetError(f"has no {key}, unlike the others", file=without[0])
             if without:
                 self.report.notes.append(f"{key}: left out, {', '.join(without)} has none")
             elif self.first.features[key].dtype != "video" or self.videos:
@@ -175,7 +175,7 @@ class _Merge:
         return common
 
     def _match(self, source: _Source, key: str) -> None:
-        """Find the component of a source for each of the first dataset, and its factor.
+        """Find the source's component and its factor for each component of the first dataset.
 
         Raises:
             DatasetError: A component is missing, or its unit cannot be converted.
@@ -186,11 +186,11 @@ class _Merge:
             places = [self._place(source, key, index) for index in places]
             self.report.notes.append(f"{source.root}: {key} matched by name to {own.names}")
         elif source is not self.first and own.width > 1 and not (own.names and other.names):
-            text = f"{source.root}: {key} taken in its order, as not both datasets name it"
+            text = f"{source.root}: {key} matched by position, as not both datasets name it"
             self.report.notes.append(text)
         if len({*places}) < len(places):
             raise source.fault(
-                f"its components do not name those of {self.first.root} one to one: "
+                f"its components do not match those of {self.first.root} one to one: "
                 f"{', '.join(other.names or ())}",
                 key,
             )
@@ -200,7 +200,7 @@ class _Merge:
         source.places[key], source.factors[key] = places, np.array(factors)
 
     def _place(self, source: _Source, key: str, index: int) -> int:
-        """Component of a source with the name, or the meaning, of one of the first dataset."""
+        """Component of a source with the name or meaning of one in the first dataset."""
         name = self.first.features[key].component(index)
         wanted = self.first.meanings.get((key, index))
         names = source.features[key].names or ()
@@ -223,7 +223,7 @@ class _Merge:
             own.steps & other.steps & own.guessed
             and 0.7 < np.divide(other.factor, own.factor) < 1.4
         ):
-            return 1.0  # estimates of one scale
+            return 1.0  # two estimates of the same scale
         for asked, decision in ((self.first, own), (source, other)):
             if decision.doubt:
                 advice = f"hrc check {asked.root} --units {decision.role} UNIT --keep-contract"
@@ -231,8 +231,8 @@ class _Merge:
         if own.role != other.role or own.si_unit != other.si_unit:
             raise source.fault(
                 f"{source.features[key].component(place)} is {other.role} in {other.unit}, but "
-                f"{own.role} in {own.unit} in {self.first.root}: one does not follow from the "
-                f"other",
+                f"{own.role} in {own.unit} in {self.first.root}: one cannot be converted to "
+                f"the other",
                 key,
             )
         note = f"{source.root}: {key} converted from {other.unit} to {own.unit}"
@@ -266,7 +266,7 @@ class _Merge:
         for key, feature in features.items():
             others = [source.folder.info["features"].get(key, {}) for source in self.sources]
             if any(other.get("info") != feature.get("info") for other in others):
-                feature.pop("info", None)  # of the videos; LeRobot finds it anew
+                feature.pop("info", None)  # of the videos; LeRobot determines it anew
         old = own.sidecar
         columns = {role: c for role, c in old.columns.items() if c.key in features}
         parts = tuple(part for part in old.contract.components if part.key in features)
@@ -277,7 +277,7 @@ class _Merge:
     def _episodes(
         self, source: _Source, features: Mapping[str, dict]
     ) -> Iterator[edits.EpisodeEdit]:
-        """Episodes of a dataset as those of the first one, at its rate."""
+        """Episodes of a dataset with the columns and the rate of the merged one."""
         folder = source.folder
         for entry, frames in read_frames(folder, folder.episodes, folder.numbers):
             edit = edits.unedited(source.dataset, source.decisions, entry, frames)

@@ -27,15 +27,15 @@ _MEASURES = read_toml(Path(__file__).with_name("measures.toml"))
 MEASURES = {name: row["meaning"] for name, row in _MEASURES.items()}
 """Measure of an episode -> its meaning or unit."""
 
-# Doubt added by one finding: an error alone outranks all that is merely unusual.
+# Doubt added by one finding: an error counts as much as ten warnings.
 _ERROR, _WARNING = 10.0, 1.0
 _UNUSUAL = 4.0
-"""Robust spreads (1.4826 times the median deviation) above which a measure is unusual: one in
-16,000 for a normal distribution."""
+"""Number of robust spreads (1.4826 times the median deviation) above which a measure is
+unusual: one in 16,000 for a normal distribution."""
 _PHASES = 20
-"""Points along the motion at which episodes are compared."""
+"""Number of points along the motion at which episodes are compared."""
 _DIMENSIONS = 16
-"""Principal components for distances: a neighbour search in more is far slower."""
+"""Number of principal components for distances: with more, a neighbour search is far slower."""
 _NEIGHBOURS = 3
 
 
@@ -50,9 +50,9 @@ class EpisodeQuality:
     measures: dict[str, float] = field(default_factory=dict)
     """Values by the names of `MEASURES`; empty if the episode cannot be read."""
     score: float = 0.0
-    """Doubt, 0 without any reason."""
+    """Doubt: the sum of the weights of all reasons."""
     reasons: list[str] = field(default_factory=list)
-    """Reasons, the weightiest first."""
+    """Reasons: findings of the check, then faults of reading, then unusual measures."""
     place: tuple[float, float] | None = None
     """First two principal components: similar episodes are close on this map."""
     start: int = 0
@@ -93,9 +93,9 @@ class Ranking:
 def rank_episodes(path: str | Path, progress: Progress | None = None) -> Ranking:
     """Rank the episodes of a dataset by how doubtful they are.
 
-    The score counts the findings of `check_dataset`, the distance of the motion from the most
-    similar ones, and unusual durations, rests, jerk and late frames. Memory grows by a few
-    kilobytes per episode, independent of its length.
+    The score adds up the findings of `check_dataset`, the distance of the motion from the most
+    similar ones, and unusual durations, gripper motions, rests, jerk and late frames. Memory
+    grows by a few kilobytes per episode, independent of its length.
 
     Args:
         path: Folder of the dataset.
@@ -136,7 +136,7 @@ def _one_of_each_kind(
     Args:
         qualities: Episodes by index.
         issues: Issues of the dataset.
-        most: Number of episodes above which a kind distinguishes none; None for no limit.
+        most: Number of episodes above which a kind is too common to count; None for no limit.
     """
     placed = [(issue.episode, issue) for issue in issues if issue.episode in qualities]
     worst: dict[tuple, Issue] = {}
@@ -151,10 +151,10 @@ def _one_of_each_kind(
 def _demonstrations(
     root: Path, qualities: Mapping[int, EpisodeQuality], progress: Progress | None
 ) -> Iterator[tuple[EpisodeQuality, Demonstration]]:
-    """Readable episodes, one at a time; the error of each other one becomes its doubt."""
+    """Readable episodes, one at a time; the errors of all others are added to their doubt."""
     dataset = open_dataset(root)
     entries = dataset.folder.episodes
-    # Episodes in other units than the rest are errors of the check.
+    # The check reports episodes in other units than the rest.
     decisions, _ = dataset.decide_units(entries, {})
     demos = DemonstrationSource(dataset, entries, decisions).each()
     for entry, demo in zip(progress(entries) if progress else entries, demos, strict=True):
@@ -172,7 +172,7 @@ def _measure(
     """Measure an episode.
 
     Returns:
-        Its joints or position, and the gripper; None if none is recorded.
+        Its joints or position, and its gripper, as columns; None if neither is recorded.
     """
     steps = np.diff(demo.time)
     quality.measures = {
@@ -199,7 +199,7 @@ def gripper_moves(gripper: Float64[np.ndarray, " frames"]) -> int:
     """Number of times that a gripper opens or closes by more than half of its travel.
 
     A grasp that was tried twice, or an object that was dropped, adds two. Small changes of the
-    opening, as while it holds an object, count as rest.
+    opening, such as while holding an object, do not count.
 
     Args:
         gripper: Opening in any unit.
@@ -209,7 +209,7 @@ def gripper_moves(gripper: Float64[np.ndarray, " frames"]) -> int:
     if high <= low:
         return 0
     third = (high - low) / 3
-    # Between the outer thirds of the travel the gripper counts as before.
+    # In the middle third of the travel, the gripper keeps its last state.
     ends = np.where(known < low + third, -1, np.where(known > high - third, 1, 0))
     return int(np.count_nonzero(np.diff(ends[ends != 0])))
 
@@ -267,7 +267,7 @@ def _principal_components(
     # A component that rests in most episodes must not dominate.
     scale = np.maximum(scale, 0.05 * scale.max())
     centred = ((columns - np.median(columns, axis=0)) / scale).reshape(len(shapes), -1)
-    # Outliers would determine all components: twenty ranges are beyond any such motion.
+    # Without a bound, here twenty ranges, outliers would determine all principal components.
     left, sizes, _ = np.linalg.svd(np.clip(centred, -20, 20), full_matrices=False)
     return (left * sizes)[:, :_DIMENSIONS] / np.sqrt(_PHASES)
 

@@ -1,4 +1,4 @@
-"""Repaired copies of a dataset, also of what a killed recorder of LeRobot left."""
+"""Repaired copies of datasets, even of those that a killed recorder of LeRobot left."""
 
 import shutil
 from collections import Counter
@@ -54,9 +54,9 @@ class RepairOptions:
     trim: bool = True
     """Trim the rest before and after the motion to 0.1 s."""
     drop_late: bool = True
-    """Drop frames that a column of true stamps has no later than the one before."""
+    """Drop frames whose true stamp is not later than all earlier ones."""
     drop_repeats: bool = False
-    """Drop frames that repeat the one before, commands included, for up to 0.1 s."""
+    """Drop frames that repeat the previous one, commands included, for up to 0.1 s."""
     unwrap: bool = True
     """Remove jumps by whole turns from measured joints and angles of the arm."""
     fix_signs: bool = True
@@ -70,7 +70,7 @@ class RepairOptions:
     fps: float | int | None = None
     """Rate of a regular grid to resample to [1/s]; None keeps the frames."""
     videos: bool = True
-    """Keep the videos. Resampling, and dropped frames in the middle, would need new ones."""
+    """Keep the videos. Resampling, or dropping frames in the middle, would require new ones."""
     dry_run: bool = False
     """Report the changes without writing anything."""
 
@@ -131,9 +131,9 @@ def repair_dataset(
 
     The old dataset is not changed. If LeRobot's recorder was killed, the episodes that it had
     saved are recovered first. Columns keep their keys, names and units. The new
-    `timestamp` is frame / fps by definition. If LeRobot's old stamps differ from that, or
-    frames may be dropped in the middle, and no column holds true stamps, `time` is added with
-    the old ones.
+    `timestamp` is frame / fps by definition. If no column holds true stamps, the old stamps are
+    added as `time`, provided that they differ from frame / fps or frames may be dropped in the
+    middle.
 
     Args:
         path: The dataset to repair.
@@ -142,10 +142,10 @@ def repair_dataset(
         mapping: Columns of quantities that are not found by name, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`; kept in the new dataset.
         progress: Wraps the episodes, such as with a progress bar.
-        kept: Episode index -> frames to keep, for the episodes to keep; None keeps all.
+        kept: Episode index -> frames to keep; all other episodes are left out. None keeps all.
 
     Raises:
-        DatasetError: An episode cannot be read or repaired, and must not be left out.
+        DatasetError: An episode cannot be read or repaired, and may not be left out.
         FileExistsError: `out` exists.
     """
     with _finished(Path(path)) as (root, notes):
@@ -176,10 +176,11 @@ def _finished(root: Path) -> Iterator[tuple[Path, list[str]]]:
 
 
 def unfinished_files(root: Path) -> list[str]:
-    """Unfinished files of LeRobot's recorder, which was killed or failed (version 3.0).
+    """Files that LeRobot's recorder (version 3.0) left unfinished when it was killed or failed.
 
-    It writes the rows of each episode at once, but the footers of its files, and the list of
-    episodes, only at its end. An episode whose save fails has its rows, but is not listed.
+    The recorder writes the rows of each episode at once, but the footers of its files and the
+    list of episodes only when it ends. An episode whose save failed has rows, but no entry in
+    the list.
     """
     data, lists = (sorted(root.glob(f"{part}/*/file-*.parquet")) for part in ("data", _LISTS))
     files = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
@@ -189,7 +190,7 @@ def unfinished_files(root: Path) -> list[str]:
     if not names and data:
         rows = [read_rows(root, file, ("length",), ()) for file in episode_lists(root)]
         known = [row["length"] for row in chain(*rows)]
-        # The columns of a sound recording need not be read.
+        # The columns of an intact recording need not be read.
         if sum(pq.read_metadata(path).num_rows for path in data) > sum(known):
             takes = [end - begin for path in data for _, begin, end in _takes(root, path)]
             if (extra := len(takes) - len(known)) > 0 and not Counter(known) - Counter(takes):
@@ -198,7 +199,7 @@ def unfinished_files(root: Path) -> list[str]:
 
 
 def _takes(root: Path, path: Path) -> list[tuple[int, int, int]]:
-    """Index of each episode in a file, its first row and the one after its last.
+    """Index, first row and end row (exclusive) of each episode in a file.
 
     After a failed save, the recorder gives the next episode the same index.
     """
@@ -210,12 +211,12 @@ def _takes(root: Path, path: Path) -> list[tuple[int, int, int]]:
 
 
 def finish_recording(root: Path, target: Path) -> int:
-    """Copy what a recorder left that ended early into an empty folder, to be read there.
+    """Copy an unfinished recording into an empty folder such that it can be read there.
 
-    Files that are complete are linked. Of episodes of the same index, the last one counts.
+    Complete files are linked. If several episodes have the same index, the last one counts.
 
     Returns:
-        Number of episodes that `meta/info.json` counts and that are not there.
+        Number of episodes that `meta/info.json` counts, but that are lost.
 
     Raises:
         DatasetError: No saved episode is complete, or the metadata are damaged.
@@ -230,7 +231,7 @@ def finish_recording(root: Path, target: Path) -> int:
     for path in sorted(target.glob("data/*/file-*.parquet")):
         if is_unfinished(path):
             content = finished_parquet(path.read_bytes(), _example(features))
-            path.unlink()  # it may be the file of the recording itself
+            path.unlink()  # it may be a link to the file of the recording
             path.write_bytes(content)
         takes[path] = _takes(target, path)
     last = {index: (path, begin) for path in takes for index, begin, _ in takes[path]}
@@ -258,7 +259,7 @@ def finish_recording(root: Path, target: Path) -> int:
 
 
 def _example(features: Mapping[str, Mapping]) -> pa.Table:
-    """One row of the features."""
+    """Table of the features with a single row of placeholders."""
     others = {
         key: pa.array(["" if feature["dtype"] == "string" else {"bytes": b"", "path": ""}])
         for key, feature in features.items()
@@ -277,7 +278,7 @@ def _place(kind: str, path: Path) -> dict[str, int]:
 def _place_videos(
     root: Path, key: str, known: Sequence[dict], rows: Sequence[dict], fps: float
 ) -> None:
-    """Add videos of a camera that no known episode names to rows, in the order of recording."""
+    """Add the videos of a camera that no known episode uses to `rows`, in recording order."""
     kind, left = f"videos/{key}", [*rows]
     for path in sorted(root.glob(f"{kind}/*/file-*.mp4")):
         place, begin = _place(kind, path), 0
@@ -309,7 +310,7 @@ class _Repair:
         """True if the increasing stamps of LeRobot are 1/fps apart in all episodes."""
         self.decisions, faults = dataset.units_from(self._readable(), units)
         self.faults = {fault.episode: fault for fault in faults}
-        """Episodes that contradict the units of the others."""
+        """Episode index -> error, for episodes that contradict the units of the others."""
         add_time = (
             "time" not in dataset.columns.selections
             and options.fps is None

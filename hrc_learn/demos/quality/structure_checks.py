@@ -36,7 +36,7 @@ _PLACEHOLDERS = (
     *("test", "testing", "asdf", "todo", "tbd", "n/a", "na", "none", "null", "xxx", "foo"),
     *("task", "demo", "placeholder", "untitled"),
 )
-"""Task texts that were typed to get past the question."""
+"""Task texts that were typed only to skip the question."""
 
 
 def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
@@ -61,7 +61,7 @@ def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
 def read_sound_episodes(
     folder: DatasetFolder, report: ValidationReport
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    """Episodes that can be read, with their numbers; faults go into the report."""
+    """Episodes that can be read, with their numeric columns; faults go into the report."""
     for file, entries in folder.files.items():
         found = report.attempt(partial(_sound_keys, folder, file, entries, report))
         if not found:
@@ -79,7 +79,7 @@ def read_sound_episodes(
 def _sound_keys(
     folder: DatasetFolder, file: str, entries: list[EpisodeEntry], report: ValidationReport
 ) -> tuple[list[str], int]:
-    """Numeric columns that a file holds once, and its number of rows."""
+    """Numeric columns that a file holds exactly once, and its number of rows."""
     parquet = open_parquet(folder.root, file, entries[0].index)
     rows, schema = parquet.metadata.num_rows, parquet.schema_arrow
     report.attempt(lambda: require_rows(folder, file, rows))
@@ -92,7 +92,7 @@ def _sound_keys(
 def _column_faults(
     folder: DatasetFolder, file: str, schema: pa.Schema, report: ValidationReport
 ) -> Iterator[Issue]:
-    """Columns of a file that are missing, repeated or of another type than declared."""
+    """Report columns of a file that are missing, repeated or of another type than declared."""
     counts = Counter(schema.names)  # Arrow makes a new list at each access
     missing = [key for key in INDEX_KEYS if key not in folder.features and not counts[key]]
     for key, feature in folder.features.items():
@@ -112,14 +112,14 @@ def _column_faults(
         if key not in INDEX_KEYS:
             text = "the column is declared in meta/info.json, but missing"
             yield Issue(message=text, file=file, key=key)
-        # All files come from one recorder: the first one stands for all.
+        # All files come from the same recorder: report the first one only.
         elif not any(issue.key == key for issue in report.warnings):
             text = "the column is missing: LeRobot cannot open this, hrc repair adds it"
             yield warning(message=text, file=file, key=key)
 
 
 def _number_type(kind: pa.DataType) -> str | None:
-    """LeRobot's name of the type of the numbers in a column; None if Arrow nests no numbers."""
+    """LeRobot's name of the type of the numbers in a column; None if it has none."""
     while pa.types.is_nested(kind) and not (pa.types.is_struct(kind) or pa.types.is_map(kind)):
         if not hasattr(kind, "value_type"):
             return None
@@ -128,7 +128,7 @@ def _number_type(kind: pa.DataType) -> str | None:
 
 
 def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
-    """LeRobot's index columns: contiguous, of this episode, and of a listed task."""
+    """Check that LeRobot's index columns count up, name this episode, and name listed tasks."""
     count = np.arange(entry.length)
     expected = {"frame_index": count, "episode_index": np.full(entry.length, entry.index)}
     expected["index"] = folder.first_index[entry.index] + count
@@ -147,7 +147,7 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
 
 
 def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
-    """A file of statistics, which policies normalise by."""
+    """Check that a file of statistics exists, with which policies normalise."""
     files = (_STATISTICS, "meta/episodes_stats.jsonl")
     if not any((folder.root / file).is_file() for file in files):
         text = "no statistics: LeRobot's policies cannot normalise their inputs"
@@ -157,7 +157,7 @@ def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
 def statistics_fit(
     folder: DatasetFolder, features: Sequence[FeatureProfiles]
 ) -> Iterator[Issue]:
-    """Statistics that agree with the data."""
+    """Check that the statistics agree with the data."""
     exists = (folder.root / _STATISTICS).exists()
     recorded = read_json(folder.root, _STATISTICS) if exists else {}
     for feature in features:
@@ -180,7 +180,7 @@ def statistics_fit(
         least, most = feature.stack("low").min(0), feature.stack("high").max(0)
         span = np.maximum(most - least, 1e-6)
         wrong = ~np.isfinite(low + high + mean + std) | (std < 0) | (low > high)
-        # A part of a dataset may keep the statistics of the whole, which enclose it.
+        # A part of a dataset may keep the statistics of the whole, whose range is wider.
         wrong |= (least < low - 0.02 * span) | (most > high + 0.02 * span)
         wrong |= (mean < low - 0.02 * span) | (mean > high + 0.02 * span)
         # Far wider statistics belong to other data or to another unit.
@@ -194,7 +194,7 @@ def statistics_fit(
 
 
 def unchanged_files(folder: DatasetFolder) -> Iterator[Issue]:
-    """Files as this package wrote them; the sidecar may be edited."""
+    """Check that files are as this package wrote them; the sidecar may be edited."""
     try:
         changed = changed_files(folder.root)
     except ValueError as error:
@@ -211,7 +211,7 @@ def unchanged_files(folder: DatasetFolder) -> Iterator[Issue]:
 
 
 def unlisted_files(folder: DatasetFolder) -> Iterator[Issue]:
-    """Data files without an episode."""
+    """Report data files without an episode."""
     for path in sorted((folder.root / "data").glob("*/*"))[:_MOST_LISTED]:
         name = str(path.relative_to(folder.root))
         if name not in folder.files:
@@ -219,7 +219,7 @@ def unlisted_files(folder: DatasetFolder) -> Iterator[Issue]:
 
 
 def task_texts(folder: DatasetFolder) -> Iterator[Issue]:
-    """Tasks: named, listed once, and known to every episode."""
+    """Check that tasks have texts, are listed once, and include those of every episode."""
     texts, file = list(folder.tasks.values()), "meta/tasks"
     for index, task in folder.tasks.items():
         if not task.strip():
@@ -240,7 +240,7 @@ def task_texts(folder: DatasetFolder) -> Iterator[Issue]:
 
 
 def component_names(folder: DatasetFolder) -> Iterator[Issue]:
-    """Component names: distinct and printable."""
+    """Check that component names fit the shape, are distinct and are printable."""
     for key, feature in folder.features.items():
         names = feature.names or ()
         declared = flatten_names(folder.info["features"][key].get("names")) or ()
@@ -256,7 +256,7 @@ def component_names(folder: DatasetFolder) -> Iterator[Issue]:
 
 
 def offsets(folder: DatasetFolder) -> Iterator[Issue]:
-    """Episodes that do not overlap in their file, and leave no gap."""
+    """Check that the episodes of a file neither overlap nor leave gaps."""
     for entries in folder.files.values():
         ordered = sorted(entries, key=lambda entry: entry.start)
         for before, entry in pairwise(ordered):

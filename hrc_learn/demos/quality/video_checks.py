@@ -14,11 +14,11 @@ from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.videos import VideoSegment, image_at, read_segments, video_keys
 
 _MOST_FILES = 2000
-"""Files whose packets are counted; reading a terabyte of videos takes an hour."""
+"""Largest number of files whose packets are counted: reading a terabyte takes an hour."""
 _MOST_DECODED = 60
-"""Files of which images are decoded."""
+"""Approximate number of files from which images are decoded."""
 _MOST_EPISODES = 8
-"""Episodes of one file of which images are decoded."""
+"""Largest number of episodes of a file from which images are decoded."""
 
 
 Shown = list[tuple[EpisodeEntry, VideoSegment]]
@@ -26,7 +26,7 @@ Shown = list[tuple[EpisodeEntry, VideoSegment]]
 
 
 class _Stream(NamedTuple):
-    """Properties of a video stream, without decoding it."""
+    """Properties of a video stream, found without decoding it."""
 
     images: int
     rate: float
@@ -44,7 +44,7 @@ def check_videos(folder: DatasetFolder, report: ValidationReport) -> None:
         if not any(file.exists() for file in files):
             text = (
                 "the video is declared, but no file of it is here; joints and poses can be "
-                "read, LeRobot itself needs it"
+                "read, but LeRobot needs it"
             )
             report.add(warning(message=text, file=f"videos/**/{key}", key=key))
             continue
@@ -143,7 +143,7 @@ def _size_and_rate(
 def _length(
     folder: DatasetFolder, shown: Shown, stream: _Stream, place: dict[str, Any]
 ) -> Iterator[Issue]:
-    """Number of images per episode, end of the file, and overlaps of episodes."""
+    """Check the number of images per episode, the end of the file, and overlaps of episodes."""
     fps = folder.fps
     for entry, segment in shown:
         images = stream.images
@@ -173,7 +173,7 @@ def _length(
 
 
 def _images(folder: DatasetFolder, shown: Shown, place: dict[str, Any]) -> Iterator[Issue]:
-    """Some images of some episodes: decodable, and not all the same.
+    """Check that some images of some episodes can be decoded and are not all the same.
 
     Raises:
         DatasetError: An image cannot be decoded.
