@@ -103,7 +103,10 @@ A PyTorch version without this function counts as always inside a transform.
 
 
 def transforming() -> bool:
-    """True inside `torch.func` transforms and forward derivatives, where NumPy cannot read."""
+    """True inside `torch.func` transforms and forward derivatives.
+
+    NumPy cannot read tensors there.
+    """
     return _transform_level() is not None or forward_ad._current_level >= 0
 
 

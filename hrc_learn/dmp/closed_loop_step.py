@@ -84,7 +84,7 @@ def step(
         scale: Function that scales states (*batch, K, D) caused by the forcing term.
         gain: Factor on these states.
         goal_filter: Rate in dg/ds = -rate (g - target); None: the goal jumps to its target.
-        push: Second derivative by s that is added to the motion.
+        push: Second derivative with respect to s that is added to the motion.
         pace: Speed of the clock, stored for the velocity.
     """
     spring, s, target = response.spring, state.s + ds, state.target

@@ -27,7 +27,7 @@ ROUNDING = 38.0
 """Decay exponent beyond which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
 DOMAINS = ("time", "phase")
 DEGREE = 3
-"""Degree of the splines: the lowest whose forcing has a continuous second derivative."""
+"""Degree of the splines: the lowest that gives a forcing with continuous second derivative."""
 
 
 def check_positive(name: str, value: float) -> None:
@@ -46,8 +46,8 @@ def check_count(count: int) -> None:
 class SpringDamper:
     """y'' = alpha (beta (g - y) - y'), solved exactly for any gains.
 
-    (paper eq. (eq_tf)); primes are derivatives by s = t / tau. With x = (y - g, y') this
-    is x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
+    (paper eq. (eq_tf)); primes are derivatives with respect to s = t / tau. With
+    x = (y - g, y') this is x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
     """
 
     alpha: float = 25.0
@@ -234,7 +234,7 @@ class GaussianBasis:
         return torch.linspace(0, 1, self.count, dtype=torch.float64)
 
     def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Gaussians psi_i at normalised time `s`, not normalised."""
+        """Gaussians psi_i at normalised time `s`, before their normalisation."""
         return self._exponents(s).exp()[..., : self.count]
 
     def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
@@ -293,7 +293,7 @@ class PeriodicBasis:
         return torch.arange(self.count, dtype=torch.float64) / self.count
 
     def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Bells psi_i at normalised time `s`, not normalised."""
+        """Bells psi_i at normalised time `s`, before their normalisation."""
         return self._exponents(s).exp()
 
     def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
@@ -311,9 +311,9 @@ class PeriodicBasis:
 class SplineBasis:
     """Uniform cubic B-splines, faded by the phase z: phi_i = B(s / h - i + 2) z.
 
-    B is centred at zero and vanishes beyond two spacings. A weight therefore changes nothing
-    before c_i - 2 h, to the last bit, and at most four weights act at a time. The splines add
-    up to one without normalisation (de Boor 1978, "A practical guide to splines", chapter IX).
+    B is centred at zero and vanishes beyond two spacings. A weight therefore has no effect at
+    all before c_i - 2 h, and at most four weights act at a time. The splines add up to one
+    without normalisation (de Boor 1978, "A practical guide to splines", chapter IX).
 
     The centres are c_i = (i - 2) h, i = 1 ... N, with the spacing h = 1 / (N - 1). The first
     lies one spacing before the start, so that the first interval is complete; the last lies
@@ -407,7 +407,7 @@ def balanced_units(
     """Units in which a ridge penalises the weights and the next `others` columns alike.
 
     Late weights act through a small phase, so the unit of a weight is 1 / phase at its centre.
-    The other columns, such as the start velocity, take the size of the largest weight column.
+    Other columns, such as the start velocity, are scaled to the size of the largest of these.
     """
     unit = 1 / basis.phase(basis.centre_times().to(A))
     norm = A.norm(dim=0)

@@ -154,8 +154,8 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
             position: (T, D) or (*B, T, D); D = 1 if its shape is that of `time`. For
                 demonstrations of different lengths, a list of (T_i, D), with a list of (T_i,)
-                as `time`. Its floating-point dtype is that of the primitive; the fit runs in
-                float64.
+                as `time`. The floating-point dtype of the positions is that of the primitive;
+                the fit runs in float64.
             n_basis: N, unless `basis` is given. None: 50, and noise is removed from the
                 samples; see `FitOptions.smooth`. If there are at most 1.5 N samples, the motion
                 follows piecewise cubics between them.
@@ -320,8 +320,8 @@ def fit_shared(
 ) -> tuple[JointDMP, Float[Tensor, "D"]]:
     """Fit one primitive to all demonstrations, in one pass and bounded memory.
 
-    The rows [A B] of min |A X - B|^2 enter through their products [A B]'[A B], which add up in
-    any order and over any number of processes.
+    The problem min |A X - B|^2 is solved from the products [A B]'[A B], to which the rows of
+    A and B add in any order and over any number of processes.
 
     The fit minimises the distance of all samples to one primitive, which has the start, goal
     and duration of each demonstration in turn, but the same weights and start velocity (per

@@ -46,11 +46,11 @@ WIDTHS = (2.0, 1.0, 0.5, 0.25)
 PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
 """Ridges relative to the data; a ridge of 1 halves the effect of a single context."""
 FEWEST = 4
-"""Smallest number of demonstrations for a regression; fewer do not tell it from the mean."""
+"""Number of demonstrations from which a regression can be distinguished from the mean."""
 CLEARLY, DEVIATIONS = 0.02, 0.8
-"""Decrease of the mean error, relative to this error and in standard errors, above which a more
-complex model is preferred: on seven datasets, predictions of unseen demonstrations were best
-with 0.5 to 1 standard errors (`benchmarks/bench_learn.py`)."""
+"""A more complex model has to decrease the mean error by more than this fraction of it, and by
+more than this number of standard errors: on seven datasets, predictions of unseen
+demonstrations were best with 0.5 to 1 standard errors (`benchmarks/bench_learn.py`)."""
 GRID = 101
 """Number of times at which motions are compared."""
 CONSTANT = 1e-9
@@ -116,9 +116,9 @@ def learn(
     """Learn a motion from demonstrations; held-out errors select basis, approach and model.
 
     Args:
-        demonstrations: Demonstrations with `time` and `joint_position`, `position` or
-            `orientation`, as from `load_demos`; or pairs of times (T,) [s] and values: joints
-            or other coordinates, (T, D), or a `Pose` of (T).
+        demonstrations: Demonstrations with `time` and `joint_position`, or with `position` and
+            perhaps `orientation`, as from `load_demos`; or pairs of times (T,) [s] and values:
+            joints or other coordinates, (T, D), or a `Pose` of (T).
         context: (n, C), known before the motion. None: start and goal.
         frames: Frames of each demonstration, (n, F), for positions in space.
         n_basis: N. None: the smallest of `BASIS_COUNTS` whose error on held-out samples is

@@ -62,8 +62,9 @@ class LinearPrimitive(nn.Module):
 
     y'' = alpha (beta (g - y) - y') + scale * sum_i phi_i(s) w_i,   s = t / duration
 
-    (paper eqs. (eq_tf), (eq_cs)), primes are derivatives by s. Without coupling, the motion is
-    a linear map of weights, start, start velocity and goal, computed exactly; see `Response`.
+    (paper eqs. (eq_tf), (eq_cs)); primes are derivatives with respect to s. Without coupling,
+    the motion is a linear map of weights, start, start velocity and goal, computed exactly; see
+    `Response`.
     Leading batch dimensions hold one primitive each.
     """
 
@@ -188,7 +189,7 @@ class LinearPrimitive(nn.Module):
         """Primitives with other coordinates; gradients flow to the arguments.
 
         Args:
-            coordinates: As from `coordinates`; their batch is that of the result.
+            coordinates: As returned by `coordinates`; their batch is that of the result.
             duration: [s]; None keeps the value of this primitive, here and below.
             amplitude: Range of each column.
             timestamps: Normalised times of the default rollout.
@@ -278,7 +279,7 @@ class LinearPrimitive(nn.Module):
         time: Times | None = None,
         forcing_gain: Scalars | None = None,
     ) -> Trajectory:
-        """Motion of the columns; the demonstrated one without boundary and times.
+        """Motion of the columns; without boundary and times, the demonstrated motion.
 
         Args:
             boundary: Start, goal and start velocity, in columns.
@@ -414,7 +415,7 @@ class LinearPrimitive(nn.Module):
             duration, pace = duration * slower, pace / slower
         push = None
         if external_acceleration is not None:
-            # Second derivatives by s are tau^2 times those by t.
+            # Second derivatives with respect to s are tau^2 times those with respect to t.
             push = finite("coupling", self._as_tensor(external_acceleration))
             if push.ndim and push.shape[-1] not in (1, self.weights.shape[-2]):
                 raise ValueError(
@@ -444,7 +445,7 @@ class LinearPrimitive(nn.Module):
     def resolve_boundary(
         self, boundary: Boundary, duration: Float[Tensor, "*#batch"]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Start, goal and dy/ds at the start, of a motion with this duration [s]."""
+        """Start, goal and initial dy/ds of a motion with this duration [s]."""
         start, goal, velocity = boundary
         start = self.start if start is None else checked_vector("start", start, self.start)
         goal = self.goal if goal is None else checked_vector("goal", goal, self.goal)

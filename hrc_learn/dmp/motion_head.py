@@ -79,7 +79,7 @@ class MotionHead(nn.Module):
         Args:
             columns: D.
             n_basis: N.
-            duration: Duration [s], or a range, in which a parameter selects its logarithm.
+            duration: Duration [s], or its range: a parameter then selects its logarithm.
             delay: Longest delay before a motion [s]; 0: no delay and no parameter for it.
             amplitude: Root mean square deviation over a motion for unit normal weights, and
                 standard deviation of the goal for a unit normal parameter, in the units of the

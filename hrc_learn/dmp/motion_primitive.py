@@ -229,7 +229,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         boundary, tau, frame = self._resolved(given, duration, speed, **options)
         columns = self.motion.initial_columns(boundary, tau)
         if frame is not None:
-            # A copy for each element: an export takes one tensor in two places for one input.
+            # A copy for each element: an export treats one tensor in two places as one input.
             frame = frame.expand(*columns.position.shape[:-1], frame.shape[-1]).clone()
         return self.state_of(columns, frame)
 
@@ -321,8 +321,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         Start and goal keep their values and velocities, and columns without a via point do not
         change. With `within`, the motion outside of this time does not change either. Via
         points hold for the primitive's own start, goal and duration: set others before, with
-        `with_boundary`. Gradients flow to times, values and velocities. The motion may change
-        1.5 times as much as the curve through the via points; beyond, they are too close.
+        `with_boundary`. Gradients flow to times, values and velocities. If the motion would
+        change over 1.5 times as much as the curve through the via points, these are too close.
 
         Args:
             time: Times of the via points [s], (*batch, n).
@@ -497,7 +497,7 @@ def via_values(
 def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     """Batch of primitives of one kind, basis and spring, along a new first axis.
 
-    If timestamps differ, each primitive keeps its own, with the last one repeated as padding.
+    If timestamps differ, each primitive keeps its own; the last one is repeated as padding.
     The result has a fit report if all primitives have one.
 
     Raises:

@@ -124,8 +124,8 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         rate = per_s / end
         at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
         at_rest = at_rest.velocity[..., 0, :]
-        # In units of s, a goal velocity of 1 changes the start by 1 and the start velocity by
-        # -1 (columns -2 and -3 of the response), and itself adds 1 to the end velocity.
+        # In normalised time, a goal velocity of 1 shifts the start by 1 and the start velocity
+        # by -1 (columns -2 and -3 of the response), and itself adds 1 to the end velocity.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         gain = 1 + at_end[-2] - at_end[-3]
         # The end velocity is linear in v, so the difference gives v directly.

@@ -69,7 +69,7 @@ def angular_acceleration(
     rate: Float[Tensor, "*batch 3"],
     second: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Angular acceleration [rad/s^2], from e and its first and second derivative by time."""
+    """Angular acceleration [rad/s^2], from e and its first and second time derivative."""
     return -drift_free_slope(error, rate, second)
 
 

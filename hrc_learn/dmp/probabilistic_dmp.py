@@ -178,7 +178,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Args:
             primitive: A single primitive, fitted with `scaling="none"`.
             slack: Standard deviation of the forcing term, equal at all times, in units of the
-                force that holds a coordinate at a distance of its range from the goal.
+                spring's force at a distance from the goal that equals the coordinate's range.
         """
         motion = primitive.motion
         certain = _linear_coordinates(motion)

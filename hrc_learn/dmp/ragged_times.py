@@ -5,9 +5,9 @@ would need such a matrix, with N + 3 numbers per sample. Here the polynomials of
 are multiplied by the coordinates first. The result is a piecewise polynomial per column, whose
 value at any time is a sum of a few coefficients weighted by powers.
 
-This sum is linear in the coordinates, and its derivative by time is the motion of the next
-order. The same two functions therefore compute a motion, its adjoint, and their derivatives of
-any order.
+This sum is linear in the coordinates, and its time derivative is the motion of the next order.
+The same two functions therefore compute a motion, its adjoint, and their derivatives of any
+order.
 """
 
 from collections.abc import Iterator
@@ -43,7 +43,7 @@ time than the motion."""
 def motion(
     response: Response, s: Float[Tensor, "B T"], coordinates: Float[Tensor, "B D M"], order: int
 ) -> Float[Tensor, "B T D"]:
-    """Derivative of y by s on ragged times; differentiable in times and coordinates.
+    """Motion or a derivative of it on ragged times; differentiable in times and coordinates.
 
     Args:
         response: Response of the primitive.
@@ -68,7 +68,7 @@ def motion(
 
 @dataclass(frozen=True, eq=False)
 class CoefficientTable:
-    """Map from coordinates to the coefficients of a motion, or of one of its derivatives by s.
+    """Map from coordinates to the coefficients of a motion, or of one of its derivatives.
 
     Each piece has K coefficients: those of 1, u, u^2 ... with u from -1 to 1 along the piece,
     and those of functions of time that are not polynomial. One more piece covers all times
@@ -284,7 +284,7 @@ def _motion(s: Tensor, coordinates: Tensor, response: Response, order: int) -> T
 
 
 def _adjoint(s: Tensor, grad: Tensor, response: Response, order: int) -> Tensor:
-    """Gradient by the coordinates of `_motion`, for the gradient `grad` by the motion."""
+    """Gradient with respect to coordinates, from the gradient with respect to the motion."""
     table = _table(response, order, grad)
     B, _, D = grad.shape
     by_x = grad.new_empty(B, D, len(table.matrix))

@@ -407,7 +407,7 @@ def product(
         return y
     if single:
         return X @ H
-    # One flat product: a batched one of PyTorch against a shared matrix is ten times slower.
+    # One flat product: PyTorch's batched product with a common matrix is ten times slower.
     return (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
 
 

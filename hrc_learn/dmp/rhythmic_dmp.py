@@ -120,7 +120,8 @@ def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
     # Padded to twice the length, so that the end does not overlap the start.
     power = torch.fft.rfft(even_y - even_y.mean(0), n=2 * T, dim=0).abs().square()
     similar = torch.fft.irfft(power, n=2 * T, dim=0)[:T].sum(-1)
-    # Late lags overlap little, so their sums are small: compare means, except the last quarter.
+    # Late lags overlap little, so their sums are small: compare means, and drop the last
+    # quarter.
     similar = similar[: T * 3 // 4] / torch.arange(T, T - T * 3 // 4, -1).to(y)
     crossed = (similar < 0).cummax(0).values
     peak = (similar[1:-1] >= similar[:-2]) & (similar[1:-1] >= similar[2:]) & crossed[1:-1]
@@ -134,7 +135,7 @@ def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
 def _solve(
     response: Response, s: Tensor, y: Float[Tensor, "T D"], regularization: float
 ) -> Float[Tensor, "D M"]:
-    """Coordinates of the closest rhythm: weights, start velocity by s, start, and centre."""
+    """Coordinates of the closest rhythm: weights, start velocity dy/ds, start, and centre."""
     centre = _mean_of_whole_cycles(s, y)
     H = response.state(s)[:, 0]
     # Units in which the ridge penalises all columns alike.

@@ -28,7 +28,7 @@ MAXIMUM_KNOTS = 120
 """Intervals of the splines: finer than any reasonable number of basis functions."""
 STRENGTHS = -10, 6, 81
 """Decimal exponents of the first and the last penalty compared, relative to the samples, and
-the number of penalties. They are 0.2 decades apart: the error changes by less than 1 %."""
+the number of penalties. A step of 0.2 decades changes the error by less than 1 %."""
 LIKELIHOOD_MARGIN = 1.0
 """Twice the logarithm of a likelihood ratio that is not significant; two standard deviations
 would be four."""
@@ -39,7 +39,7 @@ ORDER = 3
 """Order of the penalised differences: a motion without jerk is a parabola."""
 SAMPLES_EACH = 1.5
 """Samples per basis function from which a fit determines the motion between samples: with
-fewer, accelerations exceed the true ones several times."""
+fewer, accelerations are several times the true ones."""
 DENSE = 4
 """Samples per basis function of the grids of `densified`, enough to show the cubics' detail."""
 

@@ -81,8 +81,8 @@ def _fit_ragged(
     """Least squares on the trajectory for all demonstrations at once, on ragged times.
 
     Returns:
-        Weights, start velocity dy/ds, and a flag for each demonstration that leaves functions
-        undetermined; its other results must not be used.
+        Weights, start velocity dy/ds, and a flag for each demonstration: if it is true, the
+        samples leave functions undetermined and the other results must not be used.
     """
     known = [samples.first.double(), samples.last.double()]
     if rate is not None:
@@ -301,8 +301,8 @@ def fit_ridge(
     """Minimise |Y - A X|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
 
     The constant is not penalised, so that a strong penalty leads to the mean of the targets.
-    With the hat matrix H = A (A'A + P)^-1 A', the residual of sample i in a fit without it, at
-    the same penalty P, is e_i / (1 - H_ii) (PRESS; Allen 1974, "The relationship between
+    With the hat matrix H = A (A'A + P)^-1 A', the residual of sample i in a fit to the others,
+    at the same penalty P, is e_i / (1 - H_ii) (PRESS; Allen 1974, "The relationship between
     variable selection and data augmentation").
 
     Args:

@@ -219,8 +219,8 @@ class MotionTokenizer(nn.Module):
 
         A motion begins exactly in the given state. It stays within the demonstrated range,
         extended by a tenth to either side. A start outside moves the limits. A motion can
-        leave them if its start velocity puts the second control point more than a quarter of
-        the range outside.
+        leave them if its start velocity puts the second control point outside by more than a
+        quarter of the range.
 
         Args:
             ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.

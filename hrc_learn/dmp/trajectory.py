@@ -120,7 +120,7 @@ class Trajectory(ArrayOutputs):
 
     @full_precision
     def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
-        """Derivative of the motion by time."""
+        """Time derivative of the motion."""
         s = self.s
         latest = None if s.requires_grad else self._response.latest_grid(s)
         if not order and self._array is not None and latest is not None:

@@ -19,11 +19,11 @@ from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
 
 SAMPLES_PER_FUNCTION = 8
-"""Times per basis function at which curve and motion are compared: no basis function follows a
-change within an eighth of their distance."""
+"""Times per basis function at which curve and motion are compared: basis functions cannot
+follow a change within an eighth of their distance."""
 OUTSIDE = 1e-9
 """Height that a basis function may reach outside of a window, relative to its peak. Of the
-Gaussians, only the few nearest to the ends of the window exceed it."""
+Gaussians inside, only the few nearest to the ends of the window exceed this height."""
 RIDGE = 1e-7
 """Ridge that keeps weights with equal effect small, relative to the largest."""
 QUINTIC = torch.tensor(
@@ -49,7 +49,7 @@ class ViaPoints:
     """Normalised times (float64)."""
     position: Float[Tensor, "*batch n D"]
     rate: Float[Tensor, "*batch n D"]
-    """Derivative by s."""
+    """Derivative with respect to s."""
 
 
 @full_precision
@@ -130,7 +130,7 @@ def _check_overshoot(
 
 
 def _missing(motion: LinearPrimitive, via: ViaPoints) -> Float[Tensor, "*batch n 2 D"]:
-    """Differences in position and rate by s at the via points; NaN where they are free."""
+    """Differences in position and dy/ds at the via points; NaN where they are free."""
     fixed = motion.with_coordinates(motion.coordinates().detach()).requires_grad_(False)
     time = via.s * motion.duration.double()[..., None]
     now = fixed.rollout_columns(Boundary(), fixed.duration, time)

@@ -84,7 +84,7 @@ class PositionRegion(Region):
     def feedback(
         self, x: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
-        """Potential and its gradient over the position, in the base frame."""
+        """Potential and its gradient with respect to the position, in the base frame."""
         scaled = (x - self.centre) / self.half_size
         f = (scaled * scaled - 1).clamp(min=0)
         k_c = self.stiffness
@@ -135,7 +135,7 @@ class _Cone(Region):
         """sin(phi/2) n with the axis n of the error, sin(phi/2) and cos(phi/2)."""
 
     def _potential_and_slope(self, sine: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-        """Potential, and its derivative by phi, divided by sin(phi/2)."""
+        """Potential, and its derivative with respect to phi, divided by sin(phi/2)."""
         f = (self.sharpness * torch.atan2(sine, cosine) - 1).clamp(min=0)
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
         # Divided by the sine, because the vector part of the error is sin(phi/2) n.
@@ -155,13 +155,13 @@ class OrientationRegion(_Cone):
     phi <= 2/alpha_o: 7.6 degrees for alpha_o = 15. The error has the sign of the shortest
     rotation, so p and -p are the same orientation.
 
-    The gradient suits the geometric Jacobian: it is the derivative of P by a small rotation of
-    the end effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis n of the
-    error. `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n
+    The gradient suits the geometric Jacobian: it is the derivative of P with respect to a small
+    rotation of the end effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis
+    n of the error. `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n
     (orient_diff_potential), which has the same direction and 2 phi times the length.
 
     With `coordinates="rotation_vector"` the gradient suits the analytic Jacobian: it is the
-    derivative of P by the rotation vector of x, J_l^T times the gradient above.
+    derivative of P with respect to the rotation vector of x, J_l^T times the gradient above.
     `formulation="paper"` is then twice this derivative: it equals the printed chain
     (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever the chain's divisions by the
     components of both quaternions are defined.
@@ -201,9 +201,9 @@ class AxisRegion(_Cone):
     free.
 
     f and P are those of `OrientationRegion` for the angle phi between both axes. The gradient
-    is the derivative of P by a small rotation of the end effector about the base axes. It is
-    perpendicular to both axes, so it requests no rotation about the tool's own axis. If both
-    axes are opposite, the goal determines the axis of rotation.
+    is the derivative of P with respect to a small rotation of the end effector about the base
+    axes. It is perpendicular to both axes, so it requests no rotation about the tool's own
+    axis. If the two axes are opposite, the goal determines the axis of rotation.
     """
 
     def feedback(
@@ -298,7 +298,7 @@ class VisionRegion(Region):
     def feedback(
         self, x: Float[Tensor, "*batch rows"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both rows"]]:
-        """Potential and its gradient by the feature position [1/px]; means over the points."""
+        """Potential and its gradient with respect to x [1/px]; means over the points."""
         scaled = (x - self.target) / self.half_size
         if scaled.shape[-1] > 2:
             P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
@@ -365,7 +365,7 @@ class JointRegion(Region):
     def feedback(
         self, x: Float[Tensor, "*batch n"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
-        """Potential and its gradient over the joint positions."""
+        """Potential and its gradient with respect to the joint positions."""
         offset = x - self.centre
         distance = self.half_range - offset.abs()
         f, f_reference = (depth.clamp(max=0) for depth in self._depths(distance))
@@ -413,7 +413,7 @@ class PostureRegion(Region):
     def feedback(
         self, x: Float[Tensor, "*batch n"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
-        """Potential and its gradient over the joint positions."""
+        """Potential and its gradient with respect to the joint positions."""
         offset = x - self.goal
         square = torch.linalg.vecdot(offset, offset).unsqueeze(-1)
         root = torch.sqrt(1 + square / self.saturation**2)
