@@ -1,8 +1,8 @@
-"""Drivers in processes of their own, which answer one call at a time: arms and grippers.
+"""Drivers of arms and grippers in processes of their own, which answer one call at a time.
 
-Arms end at rest: when their program ends, and when its loop stalls, is stopped or dies. Each
-request of the loop is its heartbeat, each answer that of the process, so both learn within the
-timeout that the other is gone.
+An arm is brought to rest when its program ends, and when its control loop stalls, is suspended
+or dies. Each request is a heartbeat of the loop and each answer one of the driver's process, so
+both notice within the timeout if the other is gone.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from hrc_learn.protocols import Arm, ArmState, Gripper
 from hrc_learn.watchdog import Watchdog, WatchdogError, bring_to_rest
 
 _STARTUP = 60.0
-"""Longest that connecting may take [s]."""
+"""Timeout for connecting [s]."""
 
 
 class DriverError(RuntimeError):
-    """The driver of a device raised an exception; the message has it."""
+    """The driver of a device raised an exception, which the message quotes."""
 
 
 class ArmFaultError(RuntimeError):
@@ -45,7 +45,7 @@ def imported(name: str, advice: str) -> Any:
     """Import the library of a driver when its device is opened.
 
     Raises:
-        ImportError: It is not installed; the message gives the advice.
+        ImportError: The library is not installed; the message contains the advice.
     """
     try:
         return importlib.import_module(name)
@@ -70,17 +70,18 @@ class Connected(ABC):
 def checked_velocity(
     velocity: Float[np.ndarray, "..."], names: Sequence[str], fastest: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Joint velocities to command [rad/s], at most the fastest.
+    """Check joint velocities and clip them to the fastest [rad/s].
 
     Raises:
-        ValueError: They are not finite, or beyond the fastest by more than rounding.
+        ValueError: They have another shape, are not finite, or exceed the fastest by more than
+            rounding.
     """
     velocity = np.asarray(velocity, dtype=float)
     if velocity.shape != (len(names),) or not np.isfinite(velocity).all():
         raise ValueError(
             f"joint_velocity must be {len(names)} finite numbers, but is {velocity}."
         )
-    # A filter that leads along a limit rounds.
+    # A filter that follows a limit may exceed it by rounding.
     for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6))[:1]:
         text = f"{names[i]}: {velocity[i]:.3f} rad/s is beyond its limit"
         raise ValueError(f"{text} of {fastest[i]:.3f} rad/s.")
@@ -93,33 +94,33 @@ class DriverProcess:
 
     Attributes:
         process: The process.
-        news: Number that the process sends with each answer, as of the last one.
+        news: Number that came with the last answer of the process.
     """
 
     def __init__(self, serve: Callable[..., None], *arguments: object, name: str):
         """Start the process and wait until its driver is connected.
 
         Args:
-            serve: Called in the process with its end of the connection and the arguments; it
-                is pickled. See `opened` and `answer_calls`.
+            serve: Runs in the process, given its end of the connection and the arguments; must
+                be picklable. See `opened` and `answer_calls`.
             arguments: Further arguments of `serve`.
             name: Name of the device.
 
         Raises:
             DriverError: The device cannot be reached.
-            WatchdogError: The process died, or takes too long.
+            WatchdogError: The process died or took too long.
         """
         self.news = 0
         self._name, self._lost, self._number = name, "", 0
         self._calling = threading.Lock()
-        # A forked process would have this one's locks, but not the threads that hold them.
+        # A forked process would inherit locks, but not the threads that hold them.
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self.process = context.Process(
             target=serve, args=(theirs, *map(ByValue, arguments)), name=name, daemon=True
         )
         self.process.start()
-        theirs.close()  # or its end would never be noticed here
+        theirs.close()  # otherwise the end of the process would go unnoticed
         try:
             self._answer(_STARTUP)
         except BaseException:
@@ -148,10 +149,10 @@ class DriverProcess:
             return self._answer(timeout)
 
     def end(self, timeout: float) -> None:
-        """Close the connection, and kill a process that has not answered.
+        """Close the connection, and kill the process if a call was left unanswered.
 
         Args:
-            timeout: Longest wait for the process [s].
+            timeout: Longest wait for the process to end by itself [s].
         """
         hangs = self._lost != ""
         self._lost = self._lost or f"the process of the {self._name} is closed."
@@ -192,8 +193,10 @@ class DriverProcess:
 
 
 def opened[Driver](connection: Connection, open_driver: Callable[[], Driver]) -> Driver | None:
-    """Connect to a device in the driver's process; None if an error has been sent instead."""
-    # Ctrl-C reaches all processes of a terminal: the calling one decides what follows from it.
+    """Connect to a device, in the driver's process. If this fails, send the error and return
+    None.
+    """
+    # Ctrl-C reaches all processes of a terminal: the calling process decides what to do.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         return open_driver()
@@ -212,7 +215,7 @@ def answer_calls(
     Args:
         connection: The process's end of the connection.
         carry_out: Carries out a call, given its name and arguments.
-        news: Number to send with each answer.
+        news: Returns the number to send with each answer.
     """
     with suppress(EOFError, OSError):
         connection.send((0, None, "", news()))
@@ -249,8 +252,8 @@ def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iter
                 arm.command(runner.step())
 
     SIGTERM and SIGHUP end the block as `SystemExit` with status 128 + number, SIGINT as
-    `KeyboardInterrupt`; further signals change nothing until the arm is at rest. An ignored
-    signal stays ignored. Signals are left alone in threads other than the main one.
+    `KeyboardInterrupt`; further signals have no effect until the arm is at rest. An ignored
+    signal stays ignored. Outside the main thread, signals are not handled.
 
     Args:
         stop: Brings the arm to rest.
@@ -276,7 +279,7 @@ def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iter
             yield
         finally:
             ending = True
-    finally:  # also where the signal came in the line above
+    finally:  # also if the signal came in the line above
         stopped = bring_to_rest(stop, patience)
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -287,11 +290,11 @@ def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iter
 
 
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> dict[int, Any]:
-    """Set a handler of the signals; those before it."""
+    """Set a handler for the signals, and return the previous handlers."""
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
         for number in SIGNALS:
-            # None: a library handles it by itself.
+            # None: the handler was set by a library, outside Python.
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 before[number] = signal.signal(number, handler)
     return before
@@ -299,7 +302,7 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> dict[int, A
 
 @runtime_checkable
 class StoppableArm(Arm, Gripper, Protocol):
-    """An arm and its gripper, as a driver has them."""
+    """An arm with a gripper, as drivers implement it."""
 
     def stop(self) -> None:
         """Bring the arm to rest."""
@@ -313,14 +316,13 @@ class ArmProcess:
         while servoing():
             arm.command(velocity(arm.read()))
 
-    The process stops the arm when no command has come for the timeout, whatever the loop's own
-    process does: holds the interpreter, is stopped or is killed. Ctrl-C does not reach it, on
-    SIGTERM it stops the arm and ends. If the process itself dies, its connection to the arm
-    falls, which ends the motion at any arm with a control box, and the loop's next request
-    raises `WatchdogError`.
+    The process stops the arm if no command comes within the timeout, even if the loop's own
+    process blocks its interpreter, is suspended or is killed. It ignores Ctrl-C; on SIGTERM it
+    stops the arm and ends. If it dies itself, its connection to the arm is lost, which ends the
+    motion of any arm with a control box, and the loop's next request raises `WatchdogError`.
 
-    After a trip commands are not carried out until the loop has seen that `trips` has changed
-    and starts from rest: the first command after one only brings the news.
+    After such a stop (a trip), commands are ignored until an answer has updated `trips`, which
+    shows the loop that it has to start from rest.
 
     Every method raises `DriverError` with the driver's own exception, and `WatchdogError` if
     the process does not answer within the timeout.
@@ -330,13 +332,14 @@ class ArmProcess:
         """Start the process and connect.
 
         Args:
-            open_arm: Connects to the arm, in the process; it is pickled.
-            timeout: Longest silence of the loop, and longest wait for an answer [s].
+            open_arm: Connects to the arm, in the process; must be picklable.
+            timeout: Longest time without a sign of life from the loop, and longest wait for an
+                answer [s].
 
         Raises:
             ValueError: The timeout is not positive.
             DriverError: The arm cannot be reached.
-            WatchdogError: The process died, or takes too long.
+            WatchdogError: The process died or took too long.
         """
         if not timeout > 0:
             raise ValueError(f"timeout must be positive, but is {timeout}")
@@ -346,12 +349,12 @@ class ArmProcess:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process."""
+        """ID of the process."""
         return self._driver.process.pid
 
     @property
     def trips(self) -> int:
-        """Number of times that the process had stopped the arm, as of its last answer."""
+        """Number of times that the process has stopped the arm, as of its last answer."""
         return self._driver.news
 
     def read(self) -> ArmState:
@@ -359,7 +362,7 @@ class ArmProcess:
         return self._call("read")
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
-        """Set the joint velocities [rad/s]. One that the driver accepts is a sign of life."""
+        """Set the joint velocities [rad/s]. A command without an error is a sign of life."""
         self._call("command", np.asarray(joint_velocity, dtype=float), self.trips)
 
     def move(self, width: float) -> None:
@@ -367,7 +370,7 @@ class ArmProcess:
         self._call("move", float(width))
 
     def feed(self) -> None:
-        """Report that the loop is alive, with no command."""
+        """Report that the loop is alive, without a command."""
         self._call("feed")
 
     def stop(self) -> None:
@@ -378,7 +381,7 @@ class ArmProcess:
         """Bring the arm to rest and end the process.
 
         Raises:
-            WatchdogError: The arm could not be stopped, or the process was gone.
+            WatchdogError: The arm could not be stopped, or the process has ended.
         """
         try:
             if not self._driver.call("close", timeout=_PATIENCE + self._timeout):
@@ -414,7 +417,7 @@ def _serve(
                 return bring_to_rest(arm.stop, _PATIENCE)
             case "command":
                 velocity, trips = arguments
-                # A loop that does not know of a stop would make the arm jump to its velocity.
+                # If the loop did not know of a stop, the arm would jump to its velocity.
                 if trips == dog.trips:
                     arm.command(velocity)
                 dog.feed()

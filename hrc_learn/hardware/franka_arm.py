@@ -1,11 +1,11 @@
 """A Franka arm at 1 kHz, through Franka's own binding pylibfranka.
 
-The FR3 only: pylibfranka 0.21 speaks version 10 of the protocol, that of an FR3 with system
-5.9 or later. A Panda (FER) needs libfranka 0.9 or before, version 5 of the protocol, for which
-there is no such binding: take `FrankyArm` in franky's build for its server version.
+FR3 only: pylibfranka 0.21 speaks version 10 of the protocol, that of an FR3 with system 5.9 or
+later. A Panda (FER) needs libfranka 0.9 or earlier, version 5 of the protocol, for which no
+pylibfranka exists: use `FrankyArm` with franky's build for its server version.
 
-Tested against the protocol simulators franka-sim, with all that it enforces, and franky-sim.
-NOT RUN ON HARDWARE.
+Tested against the protocol simulators franka-sim, including all limits that it enforces, and
+franky-sim. NOT RUN ON HARDWARE.
 """
 
 from __future__ import annotations
@@ -37,24 +37,27 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
 _STARTUP = 60.0
-"""Longest that connecting may take [s]."""
+"""Timeout for connecting [s]."""
 _STALE = 0.2
 """Age of a reading at which the loop counts as stalled [s]: ten times what the control box
 allows before it stops the arm by itself."""
 _STALE_IN_LOCKSTEP = 2.0
-"""The same of a simulator [s]: its machine may be busy with the task. libfranka itself gives a
-connection up after 1 s."""
+"""The same for a simulator [s], whose machine may be busy with the task. libfranka itself gives
+up a connection after 1 s."""
 _REST = 3.0
-"""Longest that coming to rest may take [s]: at the limits of the maker half a second, with a
-tenth of the acceleration three."""
+"""Timeout for coming to rest [s]. At the maker's limits this takes half a second; with a tenth
+of the acceleration, 2.6 s from the highest speed of joints 1 to 4 of an FR3, but 4 to 5 s from
+that of the others."""
 _RECOVERY = 15.0
-"""Longest that recovery may take [s]; the control box needs some seconds."""
+"""Timeout for recovery [s]; the control box needs some seconds."""
 _LOOK = 0.02
-"""Time over which a velocity is measured, by two positions [s]: a single one is noisy."""
+"""Time between the two positions from which a velocity is computed [s]: a single velocity
+reading is noisy."""
 _STILL = 0.02
-"""Below this it is rest [rad/s]: an encoder's noise of 0.1 mrad is a quarter of it."""
+"""Velocity below which the arm counts as at rest [rad/s]: 0.4 mrad within `_LOOK`, four times
+the noise of an encoder."""
 _PAUSE = 5e-4
-"""Between two looks at whether something has happened [s]."""
+"""Period of polling the reports [s]."""
 
 
 @final
@@ -65,20 +68,20 @@ class FrankaArm(Connected):
             while servoing():
                 arm.command(velocity(arm.read()))
 
-    The loop has a process of its own, and so has the gripper: nothing that Python does here
-    holds them up, and no call waits for either, except `stop`, `recover` and `close`. So it
-    goes into no `ArmProcess`, which it takes the place of: a velocity holds for
-    `FrankaConfig.timeout`; then, or when this process has died, the loop brings the arm to rest
-    and ends the motion. If the loop dies or stalls, the control box stops the arm after 20 ms.
+    Loop and gripper run in processes of their own: nothing that Python does here delays them,
+    and only `stop`, `recover` and `close` wait for them. An `ArmProcess` is not needed: a
+    velocity holds for `FrankaConfig.timeout`; afterwards, or when this process has died, the
+    loop brings the arm to rest and ends the motion. If the loop dies or stalls, the control box
+    stops the arm after 20 ms.
 
-    Whatever is commanded, position, velocity, acceleration, jerk and tool speed keep the limits
-    of `chain`. The arm may still hit itself or others, at which the control box stops it.
+    For any command, position, velocity, acceleration, jerk and tool speed stay within the
+    limits of `chain`. The arm may still hit itself or others; the control box then stops it.
 
-    A fault leaves the arm stopped by its control box: `command` raises what happened, `read`
-    goes on as long as there is a connection, and `recover` makes the arm move again.
+    After a fault, the control box has stopped the arm: `command` raises the reason, `read`
+    continues as long as there is a connection, and `recover` makes the arm ready again.
 
     Attributes:
-        gripper: The gripper on its threads; None without one.
+        gripper: The gripper, driven by its threads; None: no gripper.
     """
 
     def __init__(self, ip: str, chain: SerialChain, config: FrankaConfig | None = None):
@@ -87,12 +90,12 @@ class FrankaArm(Connected):
         Args:
             ip: Address of the control box.
             chain: The arm with its limits and its tool centre point.
-            config: How to drive it.
+            config: Settings of the loop.
 
         Raises:
-            DriverError: The arm or its gripper cannot be reached, or realtime is missing; it
-                says which.
-            ValueError: The arm has not seven joints.
+            DriverError: The arm or its gripper cannot be reached, or real-time scheduling is
+                missing; the message says which.
+            ValueError: The arm does not have seven joints.
         """
         if len(chain.joint_names) != JOINTS:
             raise ValueError(
@@ -101,7 +104,7 @@ class FrankaArm(Connected):
         self._config = config = config or FrankaConfig()
         self._names = chain.joint_names
         self._shared, self._orders = Shared(), Orders()
-        # Of the threads here that command: the loop is never held up by it.
+        # Held by threads of this process that command; the loop never waits for it.
         self._writing = threading.Lock()
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
@@ -116,7 +119,7 @@ class FrankaArm(Connected):
             self._await(lambda report: report.phase == Phase.IDLE, _STARTUP, "connect")
             if config.gripper:
                 hand = partial(FrankaHand, ip, speed=config.grip_speed, force=config.grip_force)
-                # pylibfranka holds the interpreter while the fingers move.
+                # pylibfranka holds the GIL while the fingers move.
                 self.gripper = GripperThread(partial(GripperProcess, hand), startup=_STARTUP)
         except BaseException:
             self._end()
@@ -124,25 +127,25 @@ class FrankaArm(Connected):
 
     @property
     def pid(self) -> int | None:
-        """Number of the process that has the loop."""
+        """ID of the loop's process."""
         return self._process.pid
 
     @property
     def fault(self) -> str:
-        """Reason for which the arm has stopped; empty if it has not."""
+        """Reason why the arm has stopped; empty if it has not."""
         stopped = self.report.phase in (Phase.FAULTED, Phase.ENDED)
         return self._shared.message if stopped else ""
 
     @property
     def report(self) -> Report:
-        """Newest report of the loop, with its counts of cycles and faults."""
+        """Newest report of the loop, with the numbers of cycles and faults."""
         return self._shared.report.read()
 
     def read(self) -> ArmState:
-        """Return the newest state, by the clock of the robot.
+        """Return the newest state; `time` is the robot's clock [s].
 
         Raises:
-            DriverError: The loop has ended, or has read none for 0.2 s (2 s in lockstep).
+            DriverError: The loop has read no state for 0.2 s (2 s in lockstep).
         """
         report = self.report
         age = time.monotonic() - report.stamp
@@ -164,17 +167,17 @@ class FrankaArm(Connected):
             ValueError: They are not seven finite numbers.
             DriverError: The arm has been stopped; `recover` makes it move again.
         """
-        # The loop's filter keeps the limits, whatever is wanted.
+        # No limit here: the loop's filter enforces the limits.
         velocity = checked_velocity(joint_velocity, self._names, np.full(JOINTS, np.inf))
         self._check()
         self._order(joint_velocity=velocity, stamp=time.monotonic(), stop=False)
 
     def stop(self) -> None:
-        """Bring the arm to rest, and wait until it is.
+        """Bring the arm to rest, and wait for that.
 
         Raises:
-            DriverError: It does not come to rest, or the loop has ended: then the control box
-                has stopped it.
+            DriverError: The arm does not come to rest, or the loop has ended; in that case the
+                control box has stopped the arm.
         """
         self._order(stop=True, stamp=-math.inf)
         self._await(
@@ -186,7 +189,7 @@ class FrankaArm(Connected):
             nonlocal before
             passed = report.time - before.time
             if passed < _LOOK:
-                # Of an arm that its control box has stopped no clock may run any more.
+                # Once the control box has stopped the arm, its clock may stand still.
                 return report.phase == Phase.FAULTED
             way = np.abs(report.joint_position - before.joint_position).max()
             before = report
@@ -207,13 +210,12 @@ class FrankaArm(Connected):
         self.gripper.move(width)
 
     def recover(self) -> None:
-        """Make the arm move again after a fault, connecting again if need be; does nothing
-        where there is none.
+        """Make the arm ready again after a fault; without a fault, do nothing.
 
-        What was commanded before is forgotten.
+        Reconnects if necessary. Earlier commands are discarded.
 
         Raises:
-            DriverError: That is not possible; it says why.
+            DriverError: Recovery failed; the message says why.
         """
         if self.report.phase != Phase.FAULTED:
             self._check()
@@ -224,7 +226,7 @@ class FrankaArm(Connected):
         self._check()
 
     def close(self) -> None:
-        """Bring the arm to rest, end the motion and both processes."""
+        """Bring the arm to rest, end the motion, and end both processes."""
         self._order(end=True)
         self._process.join(_REST)
         self._end()
@@ -235,7 +237,7 @@ class FrankaArm(Connected):
             self._shared.orders.write(self._orders)
 
     def _check(self) -> None:
-        """Raise what keeps the arm from moving."""
+        """Raise an error if the arm cannot move."""
         report = self.report
         stopped = report.phase in (Phase.FAULTED, Phase.ENDED)
         if stopped or not self._process.is_alive():
@@ -246,12 +248,12 @@ class FrankaArm(Connected):
             return self._shared.message
         if report.phase == Phase.ENDED or not self._process.is_alive():
             return (
-                f"the process that has the loop has ended. {self._shared.message} The control "
-                "box has stopped the arm: make sure of that, and connect again."
+                f"the process of the loop has ended. {self._shared.message} The control box "
+                "has stopped the arm: make sure that it is at rest, and connect again."
             )
         return (
-            f"the loop has read no state for {age:.2f} s: something holds its process up, at "
-            "which the control box stops the arm."
+            f"the loop has read no state for {age:.2f} s: something holds its process up, so "
+            "the control box stops the arm."
         )
 
     def _await(self, reached: Callable[[Report], bool], patience: float, what: str) -> None:
@@ -265,7 +267,8 @@ class FrankaArm(Connected):
 
     def _end(self) -> None:
         if self._process.is_alive():
-            # It hangs or is stopped. Without its connection the control box ends the motion.
+            # It hangs or is suspended. Once its connection is lost, the control box ends the
+            # motion.
             self._process.kill()
         self._process.join()
         if self.gripper is not None:
@@ -274,15 +277,15 @@ class FrankaArm(Connected):
 
 @final
 class FrankaHand:
-    """The gripper of a Franka arm, by pylibfranka."""
+    """The gripper of a Franka arm, driven through pylibfranka."""
 
     def __init__(self, ip: str, *, speed: float, force: float):
         """Connect.
 
         Args:
             ip: Address of the control box.
-            speed: Of the fingers [m/s].
-            force: To squeeze with [N].
+            speed: Finger speed [m/s].
+            force: Grasping force [N].
 
         Raises:
             ImportError: The driver is not installed.
@@ -297,16 +300,16 @@ class FrankaHand:
         return self._gripper.move(width, self._speed)
 
     def squeeze(self) -> bool:
-        # Whatever is between the fingers is a grasp; nothing is one of width zero.
+        # Any width counts as a grasp, even closed fingers with nothing in between.
         self._gripper.grasp(0.0, self._speed, self._force, 0.1, 0.1)
         return True
 
     def close(self) -> None:
-        """The connection ends with the process."""
+        """Nothing to do: the connection ends with the process."""
 
 
 def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:
-    """Function that opens the runner of the loop's step, in any process."""
+    """Return a function that opens the runner of the loop's step in any process."""
     limits = replace(
         chain.limits,
         acceleration=config.dynamics * chain.limits.acceleration,
@@ -320,7 +323,7 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         dt=CYCLE,
     )
     if config.load is not None and config.load.far_end is not None:
-        # From the frame of the flange to that of the tool centre point.
+        # Converted from the flange's frame to that of the tool centre point.
         offset = chain.tcp.new_tensor(config.load.far_end) - chain.tcp[:3, 3]
         example = replace(example, load=chain.tcp[:3, :3].T @ offset)
     open_runner = partial(EagerRunner, step, example)
@@ -330,7 +333,7 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
 
 
 def _with_load(open_runner: Callable[[], StepRunner], far_end: Tensor | None) -> StepRunner:
-    """The runner with the far end of a load, which stays the same in all cycles."""
+    """Open the runner and set the far end of the load, which never changes."""
     runner = open_runner()
     if far_end is not None:
         runner.observation["load"][:] = far_end.numpy()

@@ -1,14 +1,13 @@
 """The 1 kHz loop of a Franka arm, in a process of its own.
 
 Each millisecond the control box sends the state of the arm and takes one answer. pylibfranka
-holds the interpreter while it waits, and an interpreter that is busy elsewhere answers late:
-so nothing else runs in this process, and the rest of the world speaks to it through shared
-memory, which neither side ever waits for.
+holds the GIL while it waits, and a busy interpreter answers late: so nothing else runs in this
+process. Other processes communicate with it through shared memory; neither side ever waits.
 
-The velocity that is wanted goes through the exported step (`VelocityStep`): position, velocity,
-acceleration, jerk and tool speed keep their limits whatever is asked for. It starts from what
-the control box itself has as the commanded velocity and acceleration, in the first cycle and
-after each that was lost, for there the box goes on with a constant acceleration.
+The wanted velocity passes the exported step (`VelocityStep`), which enforces the limits of
+position, velocity, acceleration, jerk and tool speed. In the first cycle and after each lost
+one, the step starts from the commanded velocity and acceleration that the control box reports,
+because the box continues with a constant acceleration when an answer is missing.
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ _SAME = 1e-9
 _RESTS = 1e-6
 """Commanded velocities below this are rest [rad/s]."""
 _SLOWEST, _FOLLOWS = 4.0, 0.02
-"""Slowest robot clock, in seconds per second of its own time, and the rate at which a slower
-clock is learned (about 50 cycles).
+"""Longest real time per second of the robot's clock [s], and the gain with which a slow clock
+is tracked (over about 50 cycles).
 """
 _PARENT_EVERY = 50
-"""Cycles between two looks at whether the process that commands still lives."""
+"""Number of cycles between checks that the commanding process is alive."""
 
 
 def connect(ip: str, config: FrankaConfig) -> Any:
@@ -69,7 +68,7 @@ def connect(ip: str, config: FrankaConfig) -> Any:
 
 
 def recover(robot: Any, config: FrankaConfig) -> None:
-    """Clear what has stopped the arm, and send the control box its settings again."""
+    """Clear the error that has stopped the arm, and send the settings again."""
     robot.automatic_error_recovery()
     config.send_to(robot)
 
@@ -88,7 +87,11 @@ def import_pylibfranka() -> Any:
 
 
 def _take_priority(needed: bool) -> None:
-    """Come before other processes; where that is not allowed, only if it is not needed."""
+    """Set real-time priority, if this is allowed.
+
+    Raises:
+        RealtimeError: It is needed, but not allowed.
+    """
     highest = os.sched_get_priority_max(os.SCHED_FIFO)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
@@ -120,7 +123,7 @@ def serve(
 
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, end)
-    # Collections would take milliseconds at a bad moment; a cycle leaves no garbage in circles.
+    # A garbage collection would take milliseconds; the loop creates no reference cycles.
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -129,21 +132,21 @@ def serve(
 
 @final
 class Punctuality:
-    """Tells which answers would come too late, by the clocks of this machine and of the robot.
+    """Detects answers that would be too late, from the clocks of this machine and the robot.
 
-    A process that has been held up finds a state whose time is over. Its answer would be
-    dropped, or worse be taken for another cycle: it is better not given. A robot that is slower
-    than its clock, as a simulator on a busy machine, is not late for that. Of two states in a
-    row one is answered, however late: a machine on which each answer takes longer than a cycle
-    moves the arm all the same.
+    After a delay, the process reads a state whose cycle is over. An answer would be dropped or,
+    worse, be used in another cycle: sending none is better. The clock of a simulator on a busy
+    machine may run slower than real time; this alone makes no answer late. Of two successive
+    states, at least one is answered, however late, so that the arm moves even if each answer
+    takes longer than a cycle.
     """
 
     def __init__(self, *, lockstep: bool = False):
-        """None has been read yet.
+        """Start before the first state.
 
         Args:
-            lockstep: Whether the robot is a simulator that waits for each answer, so that none
-                is late, and may stand still in between.
+            lockstep: True for a simulator that waits for each answer, so that none is late, and
+                may stand still in between.
         """
         self._lockstep = lockstep
         self._last = math.nan
@@ -151,11 +154,11 @@ class Punctuality:
         self._skipped = self._skipped_before = False
 
     def late(self, now: float, period: float) -> bool:
-        """True if a state should stay unanswered; called once for each, before `overdue`.
+        """True if a state should stay unanswered; called once per state, before `overdue`.
 
         Args:
             now: Time at which the state was read [s].
-            period: Robot time since the state before [s].
+            period: Time since the previous state by the robot's clock [s].
         """
         passed, self._last = now - self._last, now
         self._skipped_before, self._skipped = self._skipped, False
@@ -182,10 +185,10 @@ class Punctuality:
 
 @final
 class ControlLoop:
-    """Reads, steps and answers.
+    """Loop that reads a state, computes a step and sends the answer.
 
     Attributes:
-        ending: Whether to bring the arm to rest and end.
+        ending: True to bring the arm to rest and end the loop.
     """
 
     def __init__(
@@ -198,7 +201,7 @@ class ControlLoop:
             ip: Address of the control box.
             config: Settings of the loop.
             runner: Exported step with the period `CYCLE`.
-            parent: Number of the commanding process; the loop ends when it has gone.
+            parent: ID of the commanding process; the loop ends when that process has died.
         """
         self.ending = False
         self._driver = import_pylibfranka()
@@ -206,7 +209,7 @@ class ControlLoop:
         self._shared, self._report = shared, Report()
         self._orders = Orders()
         self._sent = self._reported = np.full(JOINTS, np.nan)
-        self._recovered = -np.inf  # a velocity from before must not move the arm afterwards
+        self._recovered = -np.inf  # velocities from before a recovery must not move the arm
         self._velocity = runner.observation["joint_velocity"]
         self._position = runner.observation["joint_position"]
         self._stop = runner.observation["stop"]
@@ -224,12 +227,12 @@ class ControlLoop:
                     self._move()
                 else:
                     self._watch()
-            except Exception as error:  # of the driver: the box has stopped the arm
+            except Exception as error:  # from the driver: the box has stopped the arm
                 self._fail(error)
         self._publish(Phase.ENDED)
 
     def _warm_up(self) -> None:
-        """First steps are slow: take them before the arm waits for them."""
+        """Take the first steps, which are slow, before the arm waits for them."""
         self._position[...], self._velocity[...], self._stop[...] = 0.0, 0.0, True
         for _ in range(20):
             self._runner.step()
@@ -239,19 +242,19 @@ class ControlLoop:
         self.ending |= self._orders.end
 
     def _wanted(self) -> Float[np.ndarray, "7"]:
-        """The velocity that holds now [rad/s]."""
+        """Velocity to track now [rad/s]."""
         return np.zeros(JOINTS) if self._idles() else self._orders.joint_velocity
 
     def _idles(self) -> bool:
-        """True without a current command: none is recent, or none has come since the last
-        fault.
+        """True without a current command: the last one is too old, was a stop, or came before
+        the last recovery.
         """
         stamp = self._orders.stamp
         silent = time.monotonic() - stamp >= self._config.timeout
         return silent or self._orders.stop or stamp <= self._recovered
 
     def _watch(self) -> None:
-        """One cycle at rest."""
+        """Read one state while the arm is at rest."""
         self._note(self._link.read_once())
         self._check_parent()
         self._publish(Phase.IDLE)
@@ -292,7 +295,7 @@ class ControlLoop:
                 self._publish(Phase.MOVING)
                 continue
             rests = bool(np.abs(self._sent).max() < _RESTS)
-            # Rest is sent once more before the motion ends, so that its acceleration is zero.
+            # A motion ends with two zero velocities, so that its acceleration is zero.
             finished = rests and report.resting and number > 1
             finished = finished and (self._idles() or self.ending)
             answer = self._driver.JointVelocities(self._sent.tolist())
@@ -304,7 +307,7 @@ class ControlLoop:
             self._publish(Phase.MOVING)
 
     def _adopt(self, state: Any) -> None:
-        """Go on from what the box has where it has not got the last answer."""
+        """Continue from the state of the box if it has missed the last answer."""
         reported, acceleration = np.array(state.dq_d), np.array(state.ddq_d)
         if answer_was_lost(reported, acceleration, self._reported, self._sent):
             self._runner.state["safety.velocity"][:] = reported
@@ -349,7 +352,7 @@ class ControlLoop:
         self._publish(Phase.IDLE)
 
     def _look_on(self) -> None:
-        """Go on reading while the arm is stopped, where there is still a connection."""
+        """Continue reading while the arm is stopped, if there still is a connection."""
         try:
             self._note(self._link.read_once())
         except Exception:
@@ -379,7 +382,7 @@ def answer_was_lost(
     if not np.isfinite(reported).all():
         return False
     if np.isnan(sent).any():
-        return True  # a motion begins with what the box has
+        return True  # a motion starts from the state of the box
     if np.abs(reported - sent).max() <= _AGREES:
         return False
     unchanged = np.abs(reported - before).max() <= _SAME
@@ -391,7 +394,7 @@ def _explained(error: Exception) -> str:
     """Explanation of a driver's error, with what to do."""
     kind = type(error).__name__
     advice = {
-        "ControlException": "See that nothing touches the arm, then call recover().",
+        "ControlException": "Make sure that nothing touches the arm, then call recover().",
         "CommandException": "Release the stop button and the brakes in Desk, activate FCI, "
         "then call recover().",
         "NetworkException": "The connection has gone: check cable and power, then call "

@@ -1,7 +1,7 @@
 """Memory that the loop of a Franka arm shares with the process that commands it.
 
-Orders go one way, reports the other, each as the newest line of numbers in a mailbox: neither
-side ever waits for the other.
+Orders go to the loop, reports come back; a mailbox for each holds the newest line of numbers,
+so neither side ever waits for the other.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def _zeros() -> Float[np.ndarray, "7"]:
 
 
 class Numbers:
-    """Base of dataclasses whose fields are the numbers of a line, in order, and which have a
-    default.
+    """Base of dataclasses that are stored as a line of numbers: their fields in order, each of
+    which has a default.
     """
 
     def line(self) -> Float[np.ndarray, " size"]:
-        """The numbers."""
+        """All fields as one line of numbers."""
         return np.concatenate([np.ravel(value) for value in vars(self).values()], dtype=float)
 
     @classmethod
@@ -60,13 +60,13 @@ class Numbers:
 class Mailbox[Line: Numbers]:
     """The newest line of numbers that one process writes and others read, without a lock.
 
-    The memory holds two lines and the number of lines written, which tells which one is the
-    newest. The writer fills the other one, then counts. So a reader always finds a whole line,
-    even while the writer is suspended or has died in the middle of one.
+    The memory holds two lines and the number of lines written, from which follows which line is
+    the newest. The writer overwrites the older line, then increases the number. So a reader
+    always finds a complete line, even if the writer is suspended or dies while writing.
     """
 
     def __init__(self, line: Line):
-        """Take shared memory for lines of this kind, with this one in it."""
+        """Allocate shared memory for lines of this type, and store this line."""
         self.__setstate__((type(line), RawArray("d", 2 * len(line.line()) + 1)))
         self.write(line)
 
@@ -79,7 +79,7 @@ class Mailbox[Line: Numbers]:
         self._written, self._lines = numbers[:1], numbers[1:].reshape(2, -1)
 
     def write(self, line: Line) -> None:
-        """Replace the line. There is one writer at a time."""
+        """Replace the newest line. Only one process may write at a time."""
         self._lines[int(self._written[0] + 1) % 2] = line.line()
         self._written += 1
 
@@ -88,7 +88,7 @@ class Mailbox[Line: Numbers]:
         while True:
             written = self._written[0]
             line = self._lines[int(written) % 2].copy()
-            # After another line, the writer may have begun to replace this one.
+            # If a newer line was written meanwhile, this one may be half overwritten.
             if self._written[0] == written:
                 return self._kind.of(line)
 
@@ -106,7 +106,7 @@ class Orders(Numbers):
     end: bool = False
     """True brings the arm to rest and ends the loop."""
     joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """Wanted [rad/s]."""
+    """Wanted joint velocity [rad/s]."""
 
 
 @dataclass
@@ -119,15 +119,15 @@ class Report(Numbers):
     time: float = 0.0
     """Robot's clock [s]."""
     recoveries: int = 0
-    """Requests for recovery that have been dealt with."""
+    """Number of recoveries that have been carried out, successfully or not."""
     faults: int = 0
-    """So far."""
+    """Number of faults so far."""
     cycles: int = 0
-    """Answered in motion."""
+    """Number of cycles answered during motions."""
     lost: int = 0
-    """Cycles whose state could not be answered in time."""
+    """Number of cycles whose state could not be answered in time."""
     cost: float = 0.0
-    """Duration from reading the state that was answered last to sending the answer [s]."""
+    """Time from reading the last answered state to sending its answer [s]."""
     resting: bool = True
     """True if the velocity sent last is zero."""
     joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
@@ -140,7 +140,7 @@ class Report(Numbers):
 
 @final
 class Shared:
-    """The memory that both processes have."""
+    """Memory that both processes can access."""
 
     def __init__(self):
         self.orders, self.report = Mailbox(Orders()), Mailbox(Report())
@@ -148,7 +148,7 @@ class Shared:
 
     @property
     def message(self) -> str:
-        """About the last fault."""
+        """Message about the last fault."""
         return self._text.value.decode("utf-8", "replace")
 
     @message.setter

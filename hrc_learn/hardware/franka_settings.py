@@ -1,4 +1,4 @@
-"""Settings of a Franka arm, for both of its drivers."""
+"""Settings of a Franka arm, for both drivers (pylibfranka and franky)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Load:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of mass, in the flange's frame [m]."""
     inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
-    """About that centre, along the flange's axes [kg m^2]."""
+    """Inertia about the centre of mass, along the flange's axes [kg m^2]."""
     far_end: tuple[float, float, float] | None = None
-    """Point of the load farthest from the flange, in its frame [m]: `FrankaArm` caps its speed
-    as that of the tool. None: no such point."""
+    """Point of the load farthest from the flange, in its frame [m]: `FrankaArm` limits its
+    speed like that of the tool. None: no such limit."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.mass < math.inf:
@@ -48,14 +48,14 @@ class Load:
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionConfig:
-    """Estimated external load from which on the arm stops by a reflex.
+    """Estimated external load above which the arm stops by a reflex.
 
-    The default is that of the maker's own example of joint velocities (libfranka,
-    examples/generate_joint_velocity_motion.cpp), for contacts and collisions alike.
+    The defaults are those of the maker's example for joint velocities (libfranka,
+    examples/generate_joint_velocity_motion.cpp), for both contacts and collisions.
     """
 
     torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
-    """On each joint [N m]."""
+    """Threshold on each joint [N m]."""
     force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
     """Threshold at the end effector: forces along x, y, z [N], torques about them [N m]."""
 
@@ -72,7 +72,7 @@ class RealtimeError(RuntimeError):
     """The machine has no real-time scheduling, and it is required."""
 
     def __init__(self, why: str):
-        """Add the cure to what is missing."""
+        """Append the remedy to the reason."""
         super().__init__(
             f"{why}: boot a kernel with PREEMPT_RT and allow the user rtprio 99 in "
             "/etc/security/limits.d. Where late commands do no harm, as with a simulator, give "
@@ -85,7 +85,7 @@ class FrankyConfig:
     """Settings of an arm and its gripper."""
 
     dynamics: float = 0.3
-    """Fraction of the limits of acceleration and jerk that is used, above 0 to 1."""
+    """Fraction of the acceleration and jerk limits that is used, in (0, 1]."""
     timeout: float = 0.15
     """Time for which a velocity holds [s]; then the driver brings the arm to rest."""
     realtime: bool = True
@@ -93,11 +93,11 @@ class FrankyConfig:
     grip_force: float = 20.0
     """Grasping force [N]."""
     grip_speed: float = 0.1
-    """Finger speed [m/s]; the highest of the Franka Hand."""
+    """Finger speed [m/s]; the default is the highest of the Franka Hand."""
     collision: CollisionConfig = field(default_factory=CollisionConfig)
-    """External load from which on the arm stops by a reflex."""
+    """External load above which the arm stops by a reflex."""
     load: Load | None = None
-    """Load on the flange besides the end effector; None leaves the arm's earlier setting."""
+    """Load on the flange in addition to the end effector; None keeps the arm's setting."""
 
     def __post_init__(self) -> None:
         if not 0 < self.dynamics <= 1:
@@ -115,7 +115,7 @@ class FrankyConfig:
         torque, force = list(self.collision.torque), list(self.collision.force)
         robot.set_collision_behavior(torque, torque, force, force)
         if self.load is not None:
-            # By columns, which for a symmetric matrix is by rows.
+            # The driver expects columns; for a symmetric matrix they equal the rows.
             inertia = np.ravel(self.load.inertia).tolist()
             robot.set_load(self.load.mass, list(self.load.centre), inertia)
 
@@ -124,13 +124,13 @@ class FrankyConfig:
 class FrankaConfig(FrankyConfig):
     """Settings of an arm's 1 kHz loop.
 
-    Where an answer comes late, the loop cannot know for which cycle the control box takes it;
-    if for another one, its change of acceleration is off by as much as the acceleration itself.
-    With dynamics of 0.3 that stays allowed on an FR3: 3 rad/s^2 in 1 ms and 1500 rad/s^3 are
-    4500 of its 5000 rad/s^3.
+    If an answer is late, the loop cannot know in which cycle the control box uses it. In a
+    wrong cycle, the change of acceleration is off by up to the acceleration itself. With
+    dynamics of 0.3 this is still allowed on an FR3: 3 rad/s^2 within 1 ms plus 1500 rad/s^3
+    make 4500 rad/s^3, below its limit of 5000.
 
-    Without real-time scheduling some cycles are late; the control box tolerates up to 20 in a
-    row. The loop still takes the priority if the user may have it.
+    Without real-time scheduling, some answers are late; the control box tolerates up to 20
+    missing answers in a row. Even then, the loop sets real-time priority if it is allowed to.
     """
 
     grip_force: float = 40.0
@@ -138,8 +138,8 @@ class FrankaConfig(FrankyConfig):
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Settings of the safety filter, which uses these limits."""
     lockstep: bool = False
-    """True for a simulator that stands still until it is answered and while no command comes:
-    no answer is late then, and each state gets one.
+    """True for a simulator that waits for each answer, and stands still while no command comes:
+    no answer is ever late, and each state is answered.
     """
     compiled: bool = True
     """True compiles the step, once per machine, in a minute or two. An uncompiled step takes a

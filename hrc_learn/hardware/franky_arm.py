@@ -1,4 +1,4 @@
-"""A Franka arm behind the `Arm` and `Gripper` protocols, by the driver package `franky`.
+"""A Franka arm as an `Arm` and a `Gripper`, driven through the package `franky`.
 
 Run with franky 2.0 (PyPI: franky-control) against simulators of the arm's network protocol; NOT
 RUN ON HARDWARE.
@@ -27,30 +27,30 @@ from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
 
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
-"""Holds 1 under a kernel with PREEMPT_RT."""
+"""File that contains 1 under a kernel with PREEMPT_RT."""
 _MISSING = (
     "a real Panda needs the driver package franky: pip install franky-control, in the build "
     "for the server version of its control box, on a machine with a real-time kernel"
 )
 _JOINTS = tuple(f"joint {k}" for k in range(1, 8))
 _COMING_TO_REST = 2.0
-"""Longest wait for the arm to rest [s]: from the fastest velocity with 0.15 of the driver's
+"""Timeout for coming to rest [s]: from the fastest velocity with 0.15 of the driver's
 acceleration."""
 
 
 class FrankyArm(Connected):
     """A Franka arm and its gripper.
 
-    A velocity holds for at most the config's `timeout`; then the driver brings the arm to rest.
-    If this process dies, its connection drops, which ends the motion at once. A late command
-    starts from the remaining velocity.
+    A velocity holds for at most the config's `timeout`; then the driver brings the arm to rest;
+    a command that comes meanwhile starts from the remaining velocity. If this process dies, its
+    connection drops, which ends the motion at once.
 
     After a reflex, a user stop or a lost connection every command raises `ArmFaultError` until
     `recover` has succeeded. The gripper has its own threads (`GripperThread`): the arm never
     waits for it; its failures appear on stderr and are raised by `gripper.check`.
 
     Attributes:
-        gripper: The gripper, on its threads.
+        gripper: The gripper, driven by its threads.
     """
 
     def __init__(self, ip: str, config: FrankyConfig | None = None):
@@ -58,14 +58,15 @@ class FrankyArm(Connected):
 
         Args:
             ip: Address of the control box.
-            config: How the driver leads the arm.
+            config: Settings of the driver.
 
         Raises:
             ImportError: The driver is not installed.
-            RealtimeError: The kernel has no real-time scheduling, and it is to be enforced.
+            RealtimeError: Real-time scheduling is required and missing.
             ConnectionError: The arm cannot be reached.
-            ArmFaultError: It is stopped by its user stop or by an error that stays.
-            GripperError: Its gripper cannot be reached.
+            ArmFaultError: The arm takes no commands, because of its user stop, its guiding
+                buttons or an error that cannot be cleared.
+            GripperError: The gripper cannot be reached.
         """
         self._ip, self.config = ip, config or FrankyConfig()
         if self.config.realtime:
@@ -86,8 +87,8 @@ class FrankyArm(Connected):
     def read(self) -> ArmState:
         """Return the newest state; `time` is the clock of the control box [s].
 
-        While the arm is at rest this waits for the next state, for a millisecond. After a
-        reflex it goes on, with the arm at rest.
+        While the arm is at rest, this waits a millisecond for the next state. Reading also
+        works after a reflex.
 
         Raises:
             ArmFaultError: The connection is lost.
@@ -106,7 +107,7 @@ class FrankyArm(Connected):
 
         Raises:
             ValueError: They are not finite, or beyond the driver's limits.
-            ArmFaultError: The arm has stopped, or another one before this has been lost.
+            ArmFaultError: The arm has stopped, or the motion of an earlier command has failed.
         """
         velocity = checked_velocity(joint_velocity, _JOINTS, self._fastest)
         self._raise_fault()
@@ -131,7 +132,7 @@ class FrankyArm(Connected):
                 if self._is_moving():
                     self._move(self._franky.JointVelocityStopMotion())
             except Exception as error:
-                # What ended the motion: the arm is at rest already. The next command tells.
+                # The error ended the motion: the arm is at rest. The next command raises it.
                 self._failed(error)
         if self._lost and not self._closed:
             self._raise_fault()
@@ -139,11 +140,11 @@ class FrankyArm(Connected):
     def recover(self) -> None:
         """Make the arm ready again after a fault, once its cause is gone.
 
-        Connects anew where the connection was lost.
+        Reconnects if the connection was lost.
 
         Raises:
-            ArmFaultError: The arm stays stopped; the message says by what.
-            ConnectionError: It cannot be reached.
+            ArmFaultError: The arm stays stopped; the message says why.
+            ConnectionError: The arm cannot be reached.
         """
         if self._closed:
             self._raise_fault()
@@ -159,7 +160,7 @@ class FrankyArm(Connected):
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
 
-        Returns at once; `gripper` tells what came of it.
+        Returns at once; failures appear on stderr and are raised by `gripper.check`.
         """
         self.gripper.move(width)
 
@@ -174,11 +175,11 @@ class FrankyArm(Connected):
             return
         try:
             self.stop()
-            with suppress(Exception):  # what ended the motion: the arm is at rest already
+            with suppress(Exception):  # the error ended the motion: the arm is at rest
                 self._robot.join_motion(timeout=_COMING_TO_REST)
         finally:
             self.gripper.close()
-            # The control box takes one connection at a time: this one ends here.
+            # The control box accepts one connection at a time, so end this one.
             self._robot, self._closed = None, True
             self._fault = f"the arm at {self._ip} is closed: open it again."
 
@@ -188,8 +189,8 @@ class FrankyArm(Connected):
         mode = modes.Enforce if config.realtime else modes.Ignore
         before = _scheduling()
         try:
-            # Makes the thread that connects a realtime one, and all that it starts later: only
-            # the driver's own thread is to be one (`_move`).
+            # This gives real-time priority to the calling thread and all threads that it
+            # starts later. Only the driver's own thread should have it (see `_move`).
             self._robot = franky.Robot(self._ip, realtime_config=mode)
             self._scheduling = _scheduling()
         except franky.RealtimeException as error:
@@ -197,8 +198,8 @@ class FrankyArm(Connected):
         except (franky.NetworkException, franky.IncompatibleVersionException) as error:
             raise ConnectionError(
                 f"cannot connect to an arm at {self._ip} ({error}): check the cable and the "
-                "address, switch on the arm, release its joints and activate FCI on its desk, "
-                "and take the build of franky-control for its server version."
+                "address, switch on the arm, unlock its joints and activate FCI in Desk, and "
+                "install the build of franky-control for its server version."
             ) from error
         finally:
             os.sched_setscheduler(0, *before)
@@ -211,7 +212,7 @@ class FrankyArm(Connected):
         self._fastest = np.array(self._robot.joint_velocity_limit.get(), dtype=float)
 
     def _recover(self) -> None:
-        with suppress(Exception):  # what ended the last motion is what is recovered from
+        with suppress(Exception):  # the error of the last motion, which is recovered from
             self._robot.poll_motion()
         if not self._robot.recover_from_errors():
             raise self._stopped(self._robot.state, "its error recovery failed")
@@ -220,8 +221,8 @@ class FrankyArm(Connected):
     def _move(self, motion: Any) -> None:
         """Begin a motion.
 
-        The driver's thread that speaks to the control box begins with it, and has the priority
-        of the thread that it is begun from.
+        The driver then starts the thread that communicates with the control box; it inherits
+        the priority of the calling thread.
         """
         before = _scheduling()
         os.sched_setscheduler(0, *self._scheduling)
@@ -232,8 +233,8 @@ class FrankyArm(Connected):
 
     def _is_moving(self) -> bool:
         """True during a motion; raises the error that ended the last one, once."""
-        # Its own result is no answer: it says True where nothing moves, against its
-        # documentation (franky 2.0).
+        # The result of poll_motion is not usable: contrary to its documentation, it is True
+        # at rest (franky 2.0).
         self._robot.poll_motion()
         return self._robot.is_in_control
 
@@ -245,7 +246,8 @@ class FrankyArm(Connected):
             state = self._robot.state
         except Exception as error:
             raise self._failed(error) from error
-        # As a motion begins, the driver has that of the end of the last one for a cycle.
+        # When a motion begins, the driver returns the last state of the previous motion for a
+        # cycle.
         if self._newest is None or state.time.to_msec() >= self._newest.time.to_msec():
             self._newest = state
         return self._newest
@@ -269,7 +271,7 @@ class FrankyArm(Connected):
         return ArmFaultError(self._fault)
 
     def _failed(self, error: Exception) -> ArmFaultError:
-        if self._fault:  # what follows from it tells less
+        if self._fault:  # later errors are consequences of the first
             return ArmFaultError(self._fault)
         self._lost = isinstance(error, self._franky.NetworkException)
         if self._lost:
@@ -290,7 +292,7 @@ class FrankyArm(Connected):
 
 
 class _FrankyGripper:
-    """The arm's gripper, as `GripperThread` drives it."""
+    """The arm's gripper, as a `GripperDriver`."""
 
     def __init__(self, franky: Any, ip: str, config: FrankyConfig):
         self._config = config
@@ -310,18 +312,20 @@ class _FrankyGripper:
 
     def squeeze(self) -> bool:
         force, speed = self._config.grip_force, self._config.grip_speed
-        # Whatever its width, a thing between the fingers is a grasp.
+        # An object of any width counts as grasped.
         return self._gripper.grasp_async(0.0, speed, force, epsilon_outer=1.0).get()
 
     def close(self) -> None:
-        """The connection ends with the last reference: a call under way needs it."""
+        """Nothing to do: the connection ends with its last reference, and a call in progress
+        still needs it.
+        """
 
 
 def require_realtime() -> None:
     """Check that this machine's kernel schedules in real time.
 
     Raises:
-        RealtimeError: It does not.
+        RealtimeError: The kernel does not.
     """
     try:
         has = _REALTIME_KERNEL.read_text(encoding="utf-8").strip() == "1"

@@ -68,7 +68,7 @@ class GripperThread(Connected):
             gripper.check()  # raises what has failed since `move`
 
     One thread reads the width. Another executes the requests; after each, it continues with the
-    newest. A lost connection is reopened. Failures are printed on stderr and kept until the
+    newest one. A lost connection is reopened. Failures are printed on stderr and kept until the
     next move, so that a task can check for them at a suitable moment while the
     control loop continues.
 

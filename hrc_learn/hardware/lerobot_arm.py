@@ -1,4 +1,4 @@
-"""An arm of LeRobot behind the `Arm` and `Gripper` protocols, such as the SO-101 follower.
+"""An arm driven by LeRobot, such as the SO-101 follower, as an `Arm` and a `Gripper`.
 
 Run with LeRobot's driver and the maker's SDK against a simulation of the servos' bus; NOT RUN
 ON HARDWARE.
@@ -30,12 +30,12 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
 _SLOPE = 5
-"""Readings that the velocity is the slope of: one step of a 12-bit encoder between two readings
-at 50 Hz would be 0.08 rad/s."""
+"""Number of readings whose slope is the velocity: with two readings at 50 Hz, one step of a
+12-bit encoder would be 0.08 rad/s."""
 _STATUS = 0.5
 """Time between two readings of the servos' status [s]."""
 _CONFIRMED, _LATE = 3, 0.005
-"""Readings that confirm an alarm, and the time before each for late replies to arrive [s]."""
+"""Number of readings that confirm an alarm, and the wait for late replies before each [s]."""
 _ALARMS = ("voltage", "angle sensor", "temperature", "current", "", "overload")
 """Meaning of the bits of a Feetech servo's register "Status"."""
 
@@ -45,33 +45,33 @@ class LeRobotConfig:
     """Settings of an arm that LeRobot drives."""
 
     rate: float = 50.0
-    """Readings and position commands a second: six servos take 3 ms of the bus."""
+    """Rate of readings and position commands [Hz]: six servos occupy the bus for 3 ms."""
     timeout: float = 0.15
-    """Longest time that a velocity holds without another command [s]."""
+    """Longest time for which a velocity holds without another command [s]."""
     silence: float = 0.4
-    """Longest time without a reading [s]: LeRobot waits 50 ms for a reply, three times."""
+    """Longest time without a reading [s]; LeRobot waits 50 ms for a reply, up to three times."""
     lag: float = 0.35
     """Largest distance of the commanded positions from the measured ones [rad]."""
     blocked: float = 1.0
-    """Time at this distance after which the arm counts as blocked [s]."""
+    """Time at the distance `lag` after which the arm counts as blocked [s]."""
     opening: float = 0.08
     """Opening of the gripper at LeRobot's 100 % [m]."""
     unit: Literal["", "deg", "rad"] = ""
     """Unit of the joints. Empty: from the robot's calibration."""
     zeros: dict[str, float] = field(default_factory=dict)
-    """Positions in the arm's description of joints that LeRobot calls 0 [rad]."""
+    """Joint positions, in the arm's description, at which LeRobot's values are 0 [rad]."""
     reversed: tuple[str, ...] = ()
-    """Joints that turn against those of the description."""
+    """Joints whose direction is opposite to that in the description."""
 
 
 class LeRobotArm(Connected):
-    """A robot of LeRobot with joint positions, driven by velocities.
+    """A position-controlled robot of LeRobot, driven by velocities.
 
-    A thread reads the positions and sends the next ones, into which the velocities are
-    integrated. Without a command for the config's `timeout` they stay where they are: position
-    servos then hold the arm. A bus that is silent, a servo that reports a fault and a joint
-    that stays behind stop the arm: every command raises `ArmFaultError` until `recover`
-    succeeds.
+    A thread reads the positions, integrates the velocities and sends the resulting positions.
+    Without a command for the config's `timeout`, these stay constant and the servos hold the
+    arm. A servo that reports a fault and a joint that lags behind stop the arm: every command
+    raises `ArmFaultError` until `recover` succeeds. While the bus is silent, commands
+    raise it, too.
     """
 
     def __init__(
@@ -80,15 +80,16 @@ class LeRobotArm(Connected):
         chain: SerialChain,
         config: LeRobotConfig | None = None,
     ):
-        """Connect. The servos hold the arm where it is from then on.
+        """Connect. From then on, the servos hold the arm where it is.
 
         Args:
             settings: LeRobot's settings of the robot: type, port, id and others.
             chain: Kinematics and limits of the arm.
-            config: How the driver leads the arm.
+            config: Settings of the driver.
 
         Raises:
-            ValueError: There is no such robot or setting, or its joints are not the chain's.
+            ValueError: There is no such robot or setting, or its joints differ from the
+                chain's.
             ConnectionError: The robot cannot be reached, or is not calibrated.
         """
         self.config = config = config or LeRobotConfig()
@@ -103,7 +104,7 @@ class LeRobotArm(Connected):
             self._lower = np.maximum(limits.lower.numpy(), zero - span)
             self._upper = np.minimum(limits.upper.numpy(), zero + span)
             self._readings: deque[tuple[float, np.ndarray]] = deque(maxlen=_SLOPE)
-            # One thread at a time on the bus, and in the numbers; both only in this order.
+            # Locks of the bus and of the numbers below; always taken in this order.
             self._bus, self._lock = threading.Lock(), threading.Lock()
             self._ended = threading.Event()
             self._fault, self._failure = "", ""
@@ -118,7 +119,7 @@ class LeRobotArm(Connected):
             raise
         self._thread = threading.Thread(target=self._keep_going, name="lerobot", daemon=True)
         self._thread.start()
-        # A process that ends without `close` leaves the torque as LeRobot's settings say, too.
+        # If the program ends without `close`, LeRobot's setting for the torque applies, too.
         atexit.register(self.close)
 
     def read(self) -> ArmState:
@@ -158,14 +159,14 @@ class LeRobotArm(Connected):
             self._velocity, self._commanded_at = velocity, time.monotonic()
 
     def move(self, width: float) -> None:
-        """Set the opening of the gripper [m]; it is reached in the gripper's own time."""
+        """Set the opening of the gripper [m], without waiting until it is reached."""
         with self._lock:
             self._share = float(np.clip(width / self.config.opening, 0.0, 1.0))
 
     def stop(self) -> None:
-        """Let the servos hold the arm where it is commanded to be.
+        """Let the servos hold the arm at the present commanded positions.
 
-        A silent bus leaves them at the last positions sent, so that this needs no answer.
+        On a silent bus, they hold the last positions sent, so this needs no reply.
         """
         with self._lock:
             self._advance()
@@ -195,11 +196,11 @@ class LeRobotArm(Connected):
                 self._behind_since = math.inf
 
     def close(self) -> None:
-        """Stop the arm and disconnect; LeRobot switches the torque off, unless told not to."""
+        """Stop the arm and disconnect; LeRobot's settings decide if the torque goes off."""
         atexit.unregister(self.close)
         self._ended.set()
         self._thread.join(5.0)
-        with suppress(Exception):  # a bus that has gone, or a servo with an alarm
+        with suppress(Exception):  # the bus is gone, or a servo has an alarm
             self._robot.disconnect()
 
     def _keep_going(self) -> None:
@@ -211,7 +212,7 @@ class LeRobotArm(Connected):
             try:
                 with self._bus:
                     self._turn()
-            except Exception as error:  # a lost reply: the silence counts
+            except Exception as error:  # a lost reply: only a long silence is a fault
                 self._failure = in_words(error)
                 forget_late_replies(self._robot)
 
@@ -241,7 +242,7 @@ class LeRobotArm(Connected):
         for _ in range(_CONFIRMED):
             if not any(alarms.values()):
                 return ""
-            # The SDK may have taken a late reply to another question for this one's.
+            # The SDK may have mistaken a late reply to another request for this one's.
             time.sleep(_LATE)
             forget_late_replies(self._robot)
             again = self.units.alarms(self._robot)
@@ -256,7 +257,7 @@ class LeRobotArm(Connected):
         return ""
 
     def _advance(self) -> None:
-        """Integrate the velocity up to now, or to the end of its time."""
+        """Integrate the velocity until now, or until it has expired."""
         now = time.monotonic()
         until = min(now, self._commanded_at + self.config.timeout)
         elapsed = max(0.0, until - self._moved_at)
@@ -266,7 +267,7 @@ class LeRobotArm(Connected):
         self._moved_at = now
 
     def _judge(self, alarm: str) -> None:
-        """Stop an arm with an alarm, or with a joint that stays behind."""
+        """Stop the arm after an alarm, or if a joint has lagged behind for too long."""
         now, behind = time.monotonic(), np.abs(self._goal - self._readings[-1][1])
         if behind.max() < 0.99 * self.config.lag:
             self._behind_since = math.inf
@@ -297,9 +298,9 @@ def led_goal(
     lower: Float[np.ndarray, " n"],
     upper: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """Commanded positions, no further than `lag` from the measured ones and within the ends.
+    """Limit commanded positions to a distance of `lag` from the measured ones, and to a range.
 
-    An arm that starts beyond an end may move back, but not further out.
+    An arm that is outside the range may move back, but not further out.
     """
     goal = np.clip(goal, here - lag, here + lag)
     return np.clip(goal, np.minimum(lower, here), np.maximum(upper, here))

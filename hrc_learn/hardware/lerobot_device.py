@@ -22,11 +22,11 @@ _STATUS_REGISTERS = ("Status", "Hardware_Error_Status")
 
 
 def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -> Any:
-    """A connected robot or teleoperator of LeRobot.
+    """Connect to a robot or teleoperator of LeRobot.
 
     Args:
         kind: Robot or teleoperator.
-        settings: LeRobot's settings, such as type, port and id, without their prefix.
+        settings: LeRobot's settings, such as type, port and id, without the prefix of the kind.
 
     Raises:
         ValueError: There is no such type or setting, or one is missing.
@@ -61,7 +61,7 @@ def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -
 
 
 def _connected(make: Callable[[Any], Any], config: Any) -> Any:
-    """Device after at most three attempts: LeRobot gives up at the first lost reply."""
+    """Connect in at most three attempts: LeRobot gives up at the first lost reply."""
     for attempt in range(_ATTEMPTS):
         device = make(config)
         try:
@@ -76,8 +76,8 @@ def _connected(make: Callable[[Any], Any], config: Any) -> Any:
 
 
 def _config(kind: str, settings: Mapping[str, Any]) -> Any:
-    """Configuration of a device by LeRobot's own classes."""
-    import_module("lerobot")  # or the name of the missing library is another one
+    """Configuration of a device, as an instance of LeRobot's own class."""
+    import_module("lerobot")  # without LeRobot, the error should name it
     draccus = import_module("draccus")
     folder = "robots" if kind == "robot" else "teleoperators"
     package = import_module(f"lerobot.{folder}")
@@ -85,7 +85,7 @@ def _config(kind: str, settings: Mapping[str, Any]) -> Any:
     wanted = settings.get("type")
     if not isinstance(wanted, str):
         raise ValueError(f"--{kind}.type is missing: such as --{kind}.type=so101_follower")
-    # LeRobot registers a type when its module is imported, some of which need an SDK.
+    # LeRobot registers a type when its module is imported; some modules need an SDK.
     for module in pkgutil.iter_modules(package.__path__):
         if wanted in base.get_known_choices():
             break
@@ -102,7 +102,7 @@ def _config(kind: str, settings: Mapping[str, Any]) -> Any:
     values = {k: str(v) if k == "id" else v for k, v in settings.items()}
     try:
         return draccus.decode(base, values)
-    except Exception as error:  # draccus has several kinds for one mistake
+    except Exception as error:  # draccus raises several kinds for the same mistake
         raise ValueError(f"--{kind}.*: {in_words(error)}") from error
 
 
@@ -118,7 +118,7 @@ class JointUnits:
     keys: tuple[str, ...]
     """Names of the values in LeRobot, in the order of the arm's joints."""
     scale: Float[np.ndarray, " joints"]
-    """Radians in one unit of each value."""
+    """Radians per unit of each value."""
     zero: Float[np.ndarray, " joints"]
     """Position where the value is 0 [rad]."""
     span: Float[np.ndarray, " joints"]
@@ -135,17 +135,17 @@ class JointUnits:
         zeros: Mapping[str, float] | None = None,
         reversed_joints: Sequence[str] = (),
     ) -> JointUnits:
-        """Units of a device by its calibration.
+        """Take the units from the calibration of a device.
 
         Args:
             device: Robot or teleoperator of LeRobot.
-            joint_names: Joints of the arm, by the names or in the order of the device's.
+            joint_names: Joints of the arm: either with the device's names or in its order.
             unit: Unit of values without a calibration, "deg" or "rad".
-            zeros: Positions of joints that LeRobot calls 0 [rad].
-            reversed_joints: Joints that turn against those of the description.
+            zeros: Joint positions at which LeRobot's values are 0 [rad].
+            reversed_joints: Joints whose direction is opposite to that in the description.
 
         Raises:
-            ValueError: The joints do not fit together, or their unit is unknown.
+            ValueError: The joints of arm and device differ, or their unit is unknown.
         """
         named = [name for name, kind in device.action_features.items() if kind is float]
         motors = [name for name in named if name.endswith(".pos") and name != GRIPPER]
@@ -175,7 +175,7 @@ class JointUnits:
         )
 
     def observed(self, values: Mapping[str, Any]) -> tuple[Float[np.ndarray, " joints"], float]:
-        """Joint positions [rad] and the fraction that the gripper is open by."""
+        """Joint positions [rad], and opening of the gripper as a fraction."""
         raw = np.array([float(values[key]) for key in self.keys])
         share = float(values[GRIPPER]) / 100 if self.gripper else 0.0
         return self.zero + self.scale * raw, share
@@ -183,13 +183,13 @@ class JointUnits:
     def action(
         self, joint_position: Float[np.ndarray, " joints"], share: float
     ) -> dict[str, float]:
-        """LeRobot's action for joint positions [rad] and a fraction of the opening."""
+        """LeRobot's action for joint positions [rad] and a gripper opening (fraction)."""
         raw = (joint_position - self.zero) / self.scale
         action = dict(zip(self.keys, map(float, raw), strict=True))
         return action | ({GRIPPER: 100 * share} if self.gripper else {})
 
     def alarms(self, device: Any) -> dict[str, int]:
-        """Status of the servos by name, 0 without a fault; empty if they report none."""
+        """Status of the servos by name, 0 without a fault; empty if they have no status."""
         bus = getattr(device, "bus", None)
         tables = getattr(bus, "model_ctrl_table", {})
         models = {motor.model for motor in getattr(bus, "motors", {}).values()}
@@ -201,10 +201,10 @@ class JointUnits:
 
 
 def forget_late_replies(device: Any) -> None:
-    """Discard what a serial bus has received: replies that came after their time."""
+    """Discard late replies that a serial bus has received."""
     serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)
     if serial is not None:
-        with suppress(Exception):  # a cable that was pulled
+        with suppress(Exception):  # the cable was pulled
             serial.reset_input_buffer()
 
 
@@ -212,21 +212,21 @@ class LeaderArm:
     """A teleoperator of LeRobot with the joints of an arm, such as the SO-101 leader."""
 
     def __init__(self, settings: Mapping[str, Any], joint_names: Sequence[str]):
-        """Connect; a leader's own calibration gives its units.
+        """Connect; the units come from the leader's own calibration.
 
         Args:
             settings: LeRobot's settings of the teleoperator: type, port, id and others.
-            joint_names: Joints of the arm that it leads.
+            joint_names: Joints of the arm that follows it.
 
         Raises:
-            ValueError: There is no such type, or its joints are others.
-            ConnectionError: It cannot be reached, or is not calibrated.
+            ValueError: There is no such type, or its joints are different.
+            ConnectionError: The leader cannot be reached, or is not calibrated.
         """
         self._device = open_device("teleop", settings)
         self._units = JointUnits.of(self._device, joint_names)
 
     def read(self) -> tuple[Float[np.ndarray, " joints"], float]:
-        """Joint positions [rad], and the fraction that the gripper's handle is open by.
+        """Joint positions [rad], and opening of the gripper's handle as a fraction.
 
         Raises:
             ConnectionError: The leader does not answer.
@@ -235,12 +235,12 @@ class LeaderArm:
 
     def close(self) -> None:
         """Disconnect."""
-        with suppress(Exception):  # a bus that has gone
+        with suppress(Exception):  # the bus is gone
             self._device.disconnect()
 
 
 def _rad_per_unit(device: Any, key: str, unit: str) -> tuple[float, float]:
-    """Radians in one unit of a joint's value, and half of its calibrated range [rad]."""
+    """Radians per unit of a joint's value, and half of its calibrated range [rad]."""
     if unit:
         return (math.pi / 180 if unit == "deg" else 1.0), math.inf
     bus = getattr(device, "bus", None)
@@ -250,12 +250,12 @@ def _rad_per_unit(device: Any, key: str, unit: str) -> tuple[float, float]:
     resolution = getattr(bus, "model_resolution_table", {}).get(getattr(motor, "model", ""))
     half = math.inf
     if calibration is not None and resolution:
-        # As LeRobot counts a turn: the resolution less one.
+        # LeRobot counts resolution - 1 steps per turn.
         half = (calibration.range_max - calibration.range_min) * math.pi / (resolution - 1)
     if mode == "DEGREES":
         return math.pi / 180, half
     if mode == "RANGE_M100_100" and calibration is not None and math.isfinite(half):
-        # LeRobot turns only shares of the range round by the drive mode, not degrees.
+        # In LeRobot, the drive mode reverses percentages of the range, but not degrees.
         return (-half if calibration.drive_mode else half) / 100, half
     raise ValueError(
         f"{device.name}: the unit of {key} is in no calibration: give --config "

@@ -1,5 +1,5 @@
-"""Real cameras behind the protocol `Camera`: devices, streams and files that OpenCV opens, and
-the delay of their images.
+"""Cameras, streams and video files that OpenCV opens, as a `Camera`, and the delay of their
+images.
 
 Neither lens nor camera pose has to be known. Each image carries its time, from which the
 controller finds the arm's position at exposure.
@@ -27,25 +27,25 @@ from hrc_learn.protocols import Arm, Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, centre
 
 type RGB = UInt8[np.ndarray, "height width 3"]
-"""An image."""
+"""RGB image."""
 
 _FIRST_IMAGE = 5.0
-"""Additional time allowed for the first image [s]: cameras adjust their exposure, and streams
-send complete pictures only now and then.
+"""Additional time allowed for the first image [s]: cameras adjust their exposure first, and
+streams send complete pictures (key frames) only now and then.
 """
 _CLOSING = 2.0
 """Longest wait for the reading thread on closing [s]."""
 
 
 class CameraError(RuntimeError):
-    """A camera cannot be opened, or sends no images or none that can be used."""
+    """A camera cannot be opened, or sends no usable images."""
 
 
 class CaptureCamera(Connected, TimedCamera):
     """A camera, stream or video file; a thread reads it and keeps only the newest image.
 
-    The backend buffers several images, so a reader slower than the camera would receive ever
-    older ones. A file plays at its own rate from the first reading on.
+    The backend buffers several images, so a reader slower than the camera would otherwise
+    receive older and older images. A file plays at its own rate from the first `read` on.
     """
 
     def __init__(
@@ -55,18 +55,18 @@ class CaptureCamera(Connected, TimedCamera):
         delay: float = 0.0,
         timeout: float = 1.0,
     ):
-        """Open it, and wait for the first image.
+        """Open the source, and wait for the first image.
 
         Args:
-            source: Number of a device ("0" too), path of one (/dev/video0), URL of a stream
+            source: Device number (0 or "0"), device path (/dev/video0), URL of a stream
                 (rtsp://..., http://...), or path of a video file.
             delay: Time between exposure and arrival of an image [s], in addition to what the
                 backend reports; see `measure_delay`.
-            timeout: Longest time without an image [s].
+            timeout: Longest time without a new image [s].
 
         Raises:
             FileNotFoundError: There is no such file.
-            CameraError: It cannot be opened, or sends no image.
+            CameraError: The source cannot be opened, or sends no usable image.
             ValueError: The delay is negative, or the timeout is not positive.
         """
         if not delay >= 0:
@@ -80,8 +80,8 @@ class CaptureCamera(Connected, TimedCamera):
         self._delay, self._timeout, self._age = delay, timeout, 0.0
         self._capture = _opened(name, self._name, timeout)
         self._arrived = threading.Condition()
-        # Time at which it was taken as far as is known [s], and the image, BGR. Times of a file
-        # count from its first reading.
+        # Time at which the newest image was taken, as far as known [s], and the image (BGR).
+        # Times of a file count from its first reading.
         self._newest: tuple[float, np.ndarray] | None = None
         self._begun: float | None = None if self._is_file else 0.0
         self._failure, self._closing = "", False
@@ -95,14 +95,14 @@ class CaptureCamera(Connected, TimedCamera):
 
     @property
     def age(self) -> float:
-        """Age of the newest image when it was read [s]."""
+        """Age of the image that `read` returned last, at that time [s]."""
         return self._age
 
     def read(self) -> RGB:
         """Return the newest image, RGB.
 
         Raises:
-            CameraError: None has come for the timeout, or not one that can be used.
+            CameraError: No image has come within the timeout, or the image is not usable.
         """
         with self._arrived:
             newest, failure, now = self._newest, self._failure, time.monotonic()
@@ -118,12 +118,12 @@ class CaptureCamera(Connected, TimedCamera):
         return _as_rgb(newest[1], self._name)
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
         with self._arrived:
             self._closing = True
             self._arrived.notify_all()
         self._thread.join(_CLOSING)
-        # Of a backend that still waits for an image nothing may be taken away.
+        # A capture must not be released while its backend still waits for an image.
         if not self._thread.is_alive():
             self._capture.release()
         with self._arrived:
@@ -184,9 +184,9 @@ def taken_by(capture: Any, now: float, oldest: float) -> float:
     """Time at which the image just grabbed was taken, on `time.monotonic` [s].
 
     Linux drivers stamp their buffers with that clock, and OpenCV reports the stamp as the
-    position of the video (CAP_PROP_POS_MSEC, backend V4L2). A position that is not shortly
-    before now is a time since the start of the stream, or nothing; then the time of arrival
-    counts.
+    position of the video (CAP_PROP_POS_MSEC, backend V4L2). Any other position, not
+    shortly before now, counts from the start of the stream or is undefined: then the time of
+    arrival is used.
 
     Args:
         capture: OpenCV's capture.
@@ -200,7 +200,7 @@ def taken_by(capture: Any, now: float, oldest: float) -> float:
 
 
 def _opened(source: str, name: str, timeout: float) -> Any:
-    """A capture of OpenCV's that is open."""
+    """Open a capture of OpenCV."""
     advice = "pip install opencv-python-headless, or hrc-learn[hardware]"
     cv2 = imported("cv2", f"{name} needs OpenCV: {advice}")
     if "://" in source:
@@ -220,17 +220,17 @@ def _opened(source: str, name: str, timeout: float) -> Any:
     else:
         if not Path(source).is_file():
             raise FileNotFoundError(f"no video file {source}: give a path, a number or a URL.")
-        capture, hint = cv2.VideoCapture(source), "is it a video, and whole?"
+        capture, hint = cv2.VideoCapture(source), "is it a video, and complete?"
     if not capture.isOpened():
         raise CameraError(f"{name} cannot be opened: {hint}")
     return capture
 
 
 def _as_rgb(image: np.ndarray, name: str) -> RGB:
-    """RGB image of a BGR one.
+    """Convert a BGR image to RGB.
 
     Raises:
-        CameraError: It is no colour image of 8 bits.
+        CameraError: It is not an 8-bit colour image.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise CameraError(
@@ -240,26 +240,26 @@ def _as_rgb(image: np.ndarray, name: str) -> RGB:
     return np.ascontiguousarray(image[..., ::-1])
 
 
-# Rates at which the joint turns back and forth at the beginning and at the end [Hz]: of one
-# rate alone delays that are a period apart would fit alike.
+# Frequencies of the joint's oscillation at the beginning and at the end [Hz]: with a single
+# frequency, delays that differ by a period would fit equally well.
 _SLOWEST, _FASTEST = 0.4, 1.0
-# Fastest turn [rad/s]: of a hand at 0.5 m, 75 mm/s, by 3 cm to each side.
+# Largest joint velocity [rad/s]: a marker at 0.5 m moves at 75 mm/s, by 3 cm to each side.
 _SPEED = 0.15
-# Time from one reading of arm and camera to the next, and the longest delay looked for [s].
+# Period of the readings of arm and camera, and the longest delay searched [s].
 _DT, _LONGEST = 0.01, 0.5
-# Powers of the joint position in the fit of a pixel: perspective bends its line.
+# Degree of the polynomial that is fitted to the pixels: perspective makes it nonlinear.
 _POWERS = 3
-# Between the delays that are tried [s]; the smallest rest is found between them.
+# Step between the delays tried [s]; the minimum is interpolated between them.
 _STEP = 2e-3
 # Fewest images, and smallest explained fraction of the pixels' motion, for a valid delay.
 _FEWEST, _EXPLAINED = 30, 0.9
-# Decay rate of the way back to where the joint was, what is left of it, and the longest that it
-# may take [1/s, rad, s].
+# Return of the joint to its start: decay rate [1/s], position error at which it ends [rad], and
+# longest duration [s].
 _RETURN, _BACK, _LONGEST_WAY_BACK = 2.0, 1e-3, 3.0
 
 
 def turning_velocity(passed: float, duration: float) -> float:
-    """Joint velocity some time after the start [rad/s]: rising frequency, smooth at both ends.
+    """Joint velocity [rad/s]: an oscillation of rising frequency, smooth at both ends.
 
     Args:
         passed: Time since the start [s].
@@ -279,9 +279,9 @@ class MeasuredDelay(NamedTuple):
     reports.
     """
     deviation: float
-    """Standard deviation of the delay, by the rest of the fit [s]."""
+    """Standard deviation of the delay, from the residuals of the fit [s]."""
     images: int
-    """In which the marker was seen."""
+    """Number of images used, in all of which the marker was seen."""
 
 
 def measure_delay(
@@ -293,14 +293,13 @@ def measure_delay(
     joint: int = 1,
     duration: float = 8.0,
 ) -> MeasuredDelay:
-    """Measure a camera's delay by moving the arm in front of it; it ends where it began.
+    """Measure a camera's delay by moving the arm in front of it; the arm ends where it began.
 
-    What is measured belongs into the camera's `delay`, and with it into
-    `LatencyConfig(delay=...)` of the work cell.
+    Use the result as `delay` of the camera and of the work cell (`LatencyConfig(delay=...)`).
 
     Args:
-        arm: Moves a marker, alone: nothing else may move the camera or the marker.
-        camera: Looks at it, from anywhere.
+        arm: Arm with the marker; nothing else may move the marker or the camera.
+        camera: Camera that sees the marker, from anywhere.
         marker: ArUco number on the arm.
         advance: Lets a given time pass [s].
         joint: Joint that turns, counted from 1; its motion must move the marker across the
@@ -309,8 +308,8 @@ def measure_delay(
 
     Raises:
         ValueError: The arm has no such joint, or the duration is not positive.
-        CameraError: The marker is hardly seen, does not move with the joint, or the delay is
-            longer than looked for.
+        CameraError: The marker is seen in too few images or does not move with the joint, or
+            the delay is not between 0 and 0.5 s.
     """
     home = arm.read().joint_position
     if not 1 <= joint <= len(home):
@@ -327,7 +326,7 @@ def measure_delay(
             times.append(state.time)
             positions.append(float(turned @ state.joint_position))
             image = camera.read()
-            # An image that is read again is no new one.
+            # Skip an image that was read before.
             if last is not None and np.array_equal(image, last):
                 continue
             last, seen = image, detector.detect(image).get(marker)
@@ -346,7 +345,7 @@ def measure_delay(
     if len(taken) < _FEWEST:
         raise CameraError(
             f"the camera saw marker {marker} in {len(taken)} different images, and at least "
-            f"{_FEWEST} are needed: put the arm where it is seen, and light it."
+            f"{_FEWEST} are needed: move the arm into the view, and light it."
         )
     return fit_delay(
         np.array(times), np.array(positions), np.array(taken), np.array(pixels), _LONGEST
@@ -360,19 +359,20 @@ def fit_delay(
     pixel: Float[np.ndarray, "images 2"],
     longest: float,
 ) -> MeasuredDelay:
-    """The delay by which pixels follow a joint.
+    """Fit the delay with which pixels follow a joint.
 
     Args:
-        time: Of the readings of the joint [s].
-        position: Of the joint [rad].
-        taken: When each image is believed to have been taken [s].
-        pixel: Of the marker in it [px].
-        longest: Delay tried [s].
+        time: Times of the joint readings [s].
+        position: Joint positions [rad].
+        taken: Supposed time of exposure of each image [s].
+        pixel: Position of the marker in each image [px].
+        longest: Longest delay tried [s].
 
     Raises:
-        CameraError: The pixels do not follow the joint, or later than that.
+        CameraError: The pixels do not follow the joint, or the delay is not between 0 and
+            `longest`.
     """
-    # Of images of before the first reading nothing is known.
+    # Skip images that may have been taken before the first joint reading.
     known = taken - longest >= time[0]
     taken, pixel = taken[known], pixel[known]
     delays = np.arange(-1, math.ceil(longest / _STEP) + 2) * _STEP  # and one beyond each end
@@ -392,13 +392,13 @@ def fit_delay(
             f"the delay is not between 0 and {longest:g} s: look for a longer one, or see "
             "whether the arm's clock is that of its readings."
         )
-    # A parabola through the smallest rest and its neighbours.
+    # Minimum of a parabola through the smallest residual and its neighbours.
     bend = rest[k - 1] - 2 * rest[k] + rest[k + 1]
     between = 0.5 * (rest[k - 1] - rest[k + 1]) / bend
     variance = rest[k] / (2 * len(pixel) - 2 * (_POWERS + 1) - 1)
     return MeasuredDelay(
         delay=float(delays[k] + _STEP * between),
-        # Of least squares: the inverse of half the curvature, times the variance of a pixel.
+        # Least squares: the variance of a pixel divided by half the curvature.
         deviation=float(np.sqrt(2 * variance / bend) * _STEP),
         images=len(pixel),
     )
@@ -407,7 +407,7 @@ def fit_delay(
 def _rest(
     position: Float[np.ndarray, " images"], pixel: Float[np.ndarray, "images 2"]
 ) -> float:
-    """Squared distances of pixels from a polynomial of the joint's position [px^2]."""
+    """Sum of squared residuals of a polynomial fit from joint positions to pixels [px^2]."""
     powers = np.vander(position - position.mean(), _POWERS + 1)
     fitted, *_ = np.linalg.lstsq(powers, pixel, rcond=None)
     return float(((pixel - powers @ fitted) ** 2).sum())

@@ -29,8 +29,8 @@ _LATE = 0.01
 machine.
 """
 _SIGN_OF_LIFE = 0.05
-"""A driver that has heard nothing for 1 s takes its connection for lost (libfranka). While
-whoever advances the time is busy, a cycle goes by after each of these [s]."""
+"""Period of cycles while `advance` is not called [s]: a driver that receives nothing for 1 s
+assumes that its connection is lost (libfranka)."""
 _BRIDGED = 20
 """Cycles without an answer, in a row, after which a control box stops the arm (libfranka,
 network requirements)."""
@@ -45,17 +45,18 @@ class ArmServer:
                 arm.command(velocity)
             server.advance(0.01)
 
-    The clock is the world's: within `advance` each cycle waits for the driver's answer to the
-    last one. Outside `advance` the world stands still, apart from keep-alive messages, so that
-    it may be inspected. Driver calls that may wait for the next cycle belong within `running`.
+    Time is the world's: within `advance`, each cycle waits for the driver's answer. Outside
+    `advance`, the world stands still so that it may be inspected, apart from rare cycles that
+    keep the connection alive. Driver calls that may wait for the next cycle belong within
+    `running`.
 
-    In a cycle without an answer the arm keeps its acceleration, as a control box does for
+    In a cycle without an answer, the arm keeps its acceleration, as with a real control box and
     velocity commands.
 
     Attributes:
         world: The world.
         address: Network address of the arm, for its driver.
-        robot: The arm, as the protocol knows it.
+        robot: The arm, as a robot of franky-sim.
         link: Server of the protocol, from franky-sim.
         cycles: Number of cycles so far.
         missed: Number of cycles of a motion that the driver did not answer in time.
@@ -80,9 +81,9 @@ class ArmServer:
         self.link = served.PunctualServer(self.robot, loopback_addresses())
         self.link.init()
         self.address: str = self.link.hostname
-        self.link.process_commands()  # none yet, but a step needs a command before it
+        self.link.process_commands()  # there are none yet, but a step requires this call
         self._due = world.time
-        # Until when the thread may go on; None: as long as calls of the driver take.
+        # World time until which the thread may advance; None: no limit, during driver calls.
         self._until: float | None = world.time
         self._sent = 0
         self._error: BaseException | None = None
@@ -93,23 +94,24 @@ class ArmServer:
 
     @property
     def clock_offset(self) -> float:
-        """Offset of the world's clock from the arm's, which starts as a driver connects [s]."""
-        # Cycles are numbered from 0, and the number of the last is the driver's time.
+        """Offset of the world's clock from the arm's, which starts with a connection [s]."""
+        # Cycles are numbered from 0; the number of the last one is the driver's time.
         return self.world.time - (self._sent - 1) * CYCLE
 
     def begin(self) -> None:
-        """Count the time that `advance` lets pass from now on, not what connecting took."""
+        """Restart the time of `advance` here, so that connecting does not count."""
         self._due = self.world.time
 
     def advance(self, duration: float) -> None:
-        """Let time pass: until so long after the last call has been over [s].
+        """Advance the world until `duration` after the end of the previous call [s].
 
-        What the driver's calls took in between is part of it, as of a loop at a fixed rate.
+        World time that passed during driver calls in between counts, as in a loop with a fixed
+        rate.
 
         Raises:
             PhysicsError: The simulation diverged.
         """
-        # Late by more than a period, a loop lets go what is lost.
+        # A loop that is late by more than a period does not catch up.
         self._due = max(self._due + duration, self.world.time)
         with self._turn:
             self._until = self._due
@@ -119,7 +121,7 @@ class ArmServer:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Let the world go on in real time, at most, while the driver is called."""
+        """Let the world advance while the driver is called, at most in real time."""
         with self._turn:
             self._until = None
             self._turn.notify_all()
@@ -164,12 +166,12 @@ class ArmServer:
                     return
                 try:
                     self._cycle()
-                except Exception as error:  # of the physics, or a mode that is not served
+                except Exception as error:  # from the physics, or an unsupported motion
                     self._error = error
                 in_real_time = self._until is None
                 self._turn.notify_all()
                 if self._error is not None:
-                    self._hang_up()  # or its driver would wait for a minute
+                    self._hang_up()  # otherwise its driver would wait for a minute
                     return
             if in_real_time:
                 time.sleep(max(0.0, CYCLE - (time.monotonic() - started)))
@@ -205,9 +207,9 @@ class ArmServer:
 
 @final
 class ServedArm:
-    """The driver of an arm whose server stands still between calls.
+    """Driver of an arm that an `ArmServer` serves, whose world stands still between calls.
 
-    Times are the world's.
+    Times are those of the world's clock.
     """
 
     def __init__(self, arm: Any, server: ArmServer):
@@ -244,7 +246,7 @@ class ServedArm:
 
 
 def loopback_addresses() -> list[str]:
-    """Some of this machine's own addresses, at random, so that servers do not meet."""
+    """Random loopback addresses of this machine, so that servers do not collide."""
     chance = random.Random()
     return [
         f"127.{chance.randrange(1, 255)}.{chance.randrange(256)}.{chance.randrange(1, 255)}"
@@ -254,11 +256,11 @@ def loopback_addresses() -> list[str]:
 
 @contextmanager
 def serve_world(world: World) -> Iterator[ArmServer]:
-    """A server of a world's arm, until the block ends.
+    """Serve a world's arm until the block ends.
 
     Args:
-        world: The world, at rest, and not to be reset meanwhile. Its physics runs in steps of
-            1 ms meanwhile.
+        world: The world, at rest; it must not be reset within the block. There, its physics
+            runs in steps of 1 ms.
 
     Raises:
         ImportError: The package franky-sim is not installed.

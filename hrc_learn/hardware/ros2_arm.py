@@ -1,7 +1,7 @@
-"""An arm behind topics of ROS 2: joint states in, commands of its stock controllers out.
+"""An arm behind ROS 2 topics: it publishes joint states, and stock controllers take commands.
 
-Run over real middleware against our simulated arm; NOT RUN ON HARDWARE. ROS 2 is that of the
-system where its set-up has been sourced, or that of the wheels of `hrc-learn[ros2]`.
+Run over real middleware against our simulated arm; NOT RUN ON HARDWARE. If the system's ROS 2
+has been sourced, it is used, otherwise the wheels of `hrc-learn[ros2]`.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from hrc_learn.protocols import ArmState
 from hrc_learn.watchdog import Watchdog
 
 _CLOCK_RESET = 1.0
-"""Step back of the stamps beyond which a clock was set anew, not a message reordered [s]."""
+"""Backward step of the stamps above which the clock was reset, not a message reordered [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ros2Config:
-    """Topics of an arm, and how it is led."""
+    """Topics and settings of an arm."""
 
     joint_states: str = "/joint_states"
     """Topic of the joint states. Joints are found by name."""
     base: str = "base_link"
-    """Frame of goals and markers of `hrc serve --ros2`; empty: of any frame."""
+    """Frame of goals and markers of `hrc serve --ros2`; empty: goals of any frame are taken."""
     command: str = "/forward_velocity_controller/commands"
-    """Topic of the controller."""
+    """Topic of the commands to the controller."""
     interface: Literal["velocity", "position", "trajectory"] = "velocity"
     """Commands: velocities or positions (Float64MultiArray), or short trajectories that end at
     rest (JointTrajectory)."""
     timeout: float = 0.15
-    """Longest time that a velocity holds without another command [s]."""
+    """Longest time for which a velocity holds without another command [s]."""
     silence: float = 0.2
     """Largest age of the newest joint state [s]."""
     startup: float = 10.0
-    """Longest wait for the first one [s]."""
+    """Longest wait for the first joint state, and for controllers [s]."""
     lag: float = 0.35
     """Largest distance of commanded positions from the measured ones [rad]."""
     gripper: str = ""
@@ -71,30 +71,30 @@ class Ros2Config:
 
 
 class Ros2Arm(Connected):
-    """An arm of ros2_control, or any with its topics, driven by velocities.
+    """An arm of ros2_control, or one with the same topics, driven by velocities.
 
-    A velocity holds for at most the config's `timeout`. Joint states that are old, reordered
-    or incomplete are not used; once the newest is older than `silence`, every call raises
-    `ArmFaultError` until they come again. A trajectory ends at rest by itself, and a position
-    is held. A velocity controller would hold its last command for ever if this process died:
-    a guard, in a process of its own, then sends zeros.
+    A velocity holds for at most the config's `timeout`. Reordered or incomplete joint states
+    are ignored; once the newest is older than `silence`, `read` and `command` raise
+    `ArmFaultError` until new ones come. A trajectory ends at rest by itself, and a position is
+    held. A velocity controller would hold its last command for ever if this process died: in
+    that case, a guard in a process of its own sends zeros.
 
     Attributes:
         session: The node.
-        ignored: Number of joint states that were reordered or incomplete.
-        received: Time at which the newest came, by this machine's monotonic clock [s].
+        ignored: Number of joint states that were reordered or not finite.
+        received: Arrival time of the newest one, by this machine's monotonic clock [s].
     """
 
     def __init__(self, chain: SerialChain, config: Ros2Config | None = None):
-        """Wait for the joint states.
+        """Wait for joint states and controllers.
 
         Args:
             chain: Kinematics and limits of the arm.
-            config: Topics.
+            config: Topics and settings.
 
         Raises:
             ModuleNotFoundError: ROS 2 is not installed.
-            ConnectionError: No joint state with all joints has come.
+            ConnectionError: No joint state with all joints has come, or no controller listens.
         """
         self.config = config = config or Ros2Config()
         self._chain, self._names, self.ignored = chain, chain.joint_names, 0
@@ -143,7 +143,7 @@ class Ros2Arm(Connected):
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
 
     def _await_controllers(self) -> None:
-        """Wait until commands arrive somewhere: the first ones would be lost."""
+        """Wait until a controller subscribes: earlier commands would be lost."""
         end = time.monotonic() + self.config.startup
         for publisher in filter(None, (self._commands, self._hand)):
             while not publisher.get_subscription_count():
@@ -187,16 +187,16 @@ class Ros2Arm(Connected):
             gripper_width=float(width),
         )
         with self._changed:
-            # The quickest message so far tells how the robot's clock differs from ours.
+            # The fastest message so far determines the offset of the robot's clock.
             self._offset = min(self._offset, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()
 
     def read(self) -> ArmState:
-        """Return the newest state; `time` is that of its message [s].
+        """Return the newest state; `time` is the stamp of its message [s].
 
         Raises:
-            ArmFaultError: It is older than the config's `silence`.
+            ArmFaultError: The state is older than the config's `silence`.
         """
         with self._changed:
             state, offset = self._state, self._offset
@@ -210,7 +210,7 @@ class Ros2Arm(Connected):
         return state
 
     def wait(self, after: float, timeout: float) -> bool:
-        """Wait for a newer state than one of a time; False after the timeout [s]."""
+        """Wait for a state newer than a given time; False after the timeout [s]."""
         with self._changed:
             newer = lambda: self._state is not None and self._state.time > after  # noqa: E731
             return self._changed.wait_for(newer, timeout)
@@ -251,7 +251,7 @@ class Ros2Arm(Connected):
             self._commands.publish(Float64MultiArray(data=values.tolist()))
 
     def _trajectory(self, goal: np.ndarray, velocity: np.ndarray, elapsed: float) -> Any:
-        """Trajectory that goes on with the velocity and ends at rest."""
+        """Trajectory that continues with the velocity and then comes to rest."""
         from rclpy.duration import Duration
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -284,17 +284,17 @@ class Ros2Arm(Connected):
         self._hand.publish(Float64MultiArray(data=[config.gripper_closed + share * travel]))
 
     def stop(self) -> None:
-        """Bring the arm to rest: by zero velocities, or by the last position."""
+        """Bring the arm to rest, by zero velocities or by holding the last position."""
         with self._lock:
             state = self._state
             if state is not None:
                 self._send(np.zeros(len(self._names)), state)
 
     def recover(self) -> None:
-        """Go on from where the arm is, once joint states come again.
+        """Continue from where the arm is, once joint states come again.
 
         Raises:
-            ArmFaultError: They do not.
+            ArmFaultError: The newest joint state is still too old.
         """
         self.read()
         with self._lock:

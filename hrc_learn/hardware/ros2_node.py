@@ -34,21 +34,21 @@ from hrc_learn.store import read_toml
 PARAMETERS: dict[str, list] = read_toml(Path(__file__).with_name("ros2_parameters.toml"))
 """Parameters of the node, read at `configure`: default, range and meaning."""
 _REPORTS = 0.1
-"""Time between markers, and ten times between diagnostics [s]."""
+"""Period of the markers [s]; that of the diagnostics is ten times as long."""
 _RECENT = 500
-"""Commands whose latency the diagnostics report."""
+"""Number of newest commands whose latency the diagnostics report."""
 _HISTORY = 500
-"""Joint states that are kept to find that of an image."""
+"""Number of joint states kept, to find the one at the time of an image."""
 _PATH = 500
-"""Points of the shown path of the tool."""
+"""Number of points of the tool path in the markers."""
 
 
 class ControllerNode:
-    """A node that holds the arm's tool in regions of space and image.
+    """A node that keeps the arm's tool in regions of space and image.
 
-    It configures itself on `configure`, holds the tool where it is on `activate`, and brings
-    the arm to rest on `deactivate`. Old joint states, a missing heartbeat and faults of the arm
-    deactivate it; `activate` goes on from where the arm is.
+    `configure` builds the controller, `activate` holds the tool where it is and then follows
+    goals, and `deactivate` brings the arm to rest. Old joint states, a missing heartbeat and
+    faults of the arm deactivate the node.
 
     Attributes:
         session: The node.
@@ -68,8 +68,9 @@ class ControllerNode:
         Args:
             chain: Kinematics of the arm.
             config: Topics of the arm.
-            safety: Limits of the arm, whose cap on the tool's speed is a parameter.
-            make_runner: Makes the step, compiled or not.
+            safety: Settings of the safety filter; the parameter `tcp_speed` replaces its cap on
+                the tool's speed.
+            make_runner: Creates the runner of the controller's step, compiled or not.
         """
         from rclpy.lifecycle import LifecycleNode, ManagedEntity, TransitionCallbackReturn
 
@@ -115,7 +116,7 @@ class ControllerNode:
         return self.node.get_parameter(name).value
 
     def _connect(self) -> None:
-        """Topics of tasks, people and monitors."""
+        """Subscribe to the topics of tasks and people; create those of monitors."""
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PointStamped, PoseStamped
         from sensor_msgs.msg import CompressedImage, Image
@@ -194,7 +195,7 @@ class ControllerNode:
             self._arm.stop()
 
     def cleanup(self) -> None:
-        """Leave the arm."""
+        """Bring the arm to rest and disconnect."""
         self.deactivate()
         if self._arm is not None:
             self._arm.close()
@@ -211,7 +212,7 @@ class ControllerNode:
                 try:
                     arm.wait(last, self._config.silence / 4)
                     last = self._step(arm, last)
-                except Exception as error:  # of any kind: the arm is to stop
+                except Exception as error:  # whatever its kind, the arm must stop
                     self.stopped = str(error)
                     self.node.get_logger().error(f"deactivated: {error}")
                     self._active.clear()
@@ -274,7 +275,7 @@ class ControllerNode:
             self._see(pixel, stamp_of(message))
 
     def _see(self, pixel: np.ndarray, stamp: float) -> None:
-        """Pair a feature with the joint positions of its image."""
+        """Pair a feature with the joint positions at the time of its image."""
         values, visible = self._runner.observation, np.isfinite(pixel).all()
         values["feature_visible"][...] = values["feature_new"][...] = visible
         if visible and self._states:
@@ -316,7 +317,7 @@ class ControllerNode:
             self._markers.publish(MarkerArray(markers=self._drawn(stamp)))
 
     def _drawn(self, stamp: Any) -> list[Any]:
-        """Box of the goal, and path of the tool."""
+        """Markers for the box of the goal and the path of the tool."""
         from geometry_msgs.msg import Point
         from visualization_msgs.msg import Marker
 
@@ -335,13 +336,13 @@ class ControllerNode:
         return [box, path]
 
     def start(self) -> bool:
-        """Configure and activate; False if that failed, which the log explains."""
+        """Configure and activate; False if that failed, as explained in the log."""
         done = self._done.SUCCESS
         return self.node.trigger_configure() == done and self.node.trigger_activate() == done
 
     def figures(self, recent: int = 0) -> dict[str, float]:
-        """Number of commands, steps in which each limit of the safety filter acted, and latency
-        from joint state to command [ms].
+        """Number of commands, numbers of steps in which each limit of the safety filter acted,
+        and latency from joint state to command [ms].
 
         Args:
             recent: Number of newest commands whose latency counts; 0: all.

@@ -1,7 +1,7 @@
-"""The graph of ROS 2: which installation is used, a node of our own, qualities of service.
+"""Access to ROS 2: the installation in use, a node with a thread, and quality of service.
 
-Run as a program, it guards a velocity controller: see `guard_velocities`. So it imports nothing
-of this package: the guard is ready in half a second.
+Run as a program, this module guards a velocity controller: see `guard_velocities`. It imports
+nothing of this package, so that the guard is ready in half a second.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _STARTUP = 10.0
 
 
 _FAREWELL = 1.0
-"""Time for which the guard sends zeros after its process has died [s]."""
+"""Time for which the guard sends zeros after the process that started it has died [s]."""
 
 
 def ros2_origin() -> str:
@@ -40,7 +40,7 @@ def ros2_origin() -> str:
 
 
 class Ros2Session:
-    """A node with a thread of its own that takes the messages.
+    """A node, and a thread of its own that receives the messages.
 
     Attributes:
         node: The node.
@@ -51,7 +51,7 @@ class Ros2Session:
 
         Args:
             name: Name of the node.
-            make: Creates another node than a plain one.
+            make: Creates the node; None: a plain node.
         """
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -82,12 +82,12 @@ class Ros2Session:
 
 
 def quality(*, reliable: bool = False, latched: bool = False) -> Any:
-    """Quality of service with the newest message alone.
+    """Quality of service that keeps the newest message only.
 
     Args:
-        reliable: Repeat lost messages, as for commands. States are best effort, which takes
-            both kinds of publishers: a repeated state would be an old one.
-        latched: Keep the last message for those that come later, as for descriptions.
+        reliable: True resends lost messages, for commands. States use best effort, which
+            accepts both kinds of publishers: a resent state would be outdated.
+        latched: True keeps the last message for later subscribers, for descriptions.
     """
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -97,10 +97,10 @@ def quality(*, reliable: bool = False, latched: bool = False) -> Any:
 
 
 def read_description(topic: str = "/robot_description", timeout: float = _STARTUP) -> str:
-    """Description (URDF) that a robot publishes.
+    """Read the description (URDF) that a robot publishes.
 
     Raises:
-        ConnectionError: None has come within the time [s].
+        ConnectionError: No description has come within the timeout [s].
     """
     from std_msgs.msg import String
 
@@ -120,7 +120,8 @@ def read_description(topic: str = "/robot_description", timeout: float = _STARTU
 
 
 def found_description(name: str) -> str:
-    """File with the description that a robot publishes on a topic, or the name of an arm.
+    """Save the description that a robot publishes on a topic, and return the name of the file.
+    Any other name is returned unchanged.
 
     Args:
         name: Topic, such as /robot_description or /robot_description:TIP, or any other name.
@@ -139,16 +140,17 @@ def stamp_of(message: Any) -> float:
 
 
 def start_guard(topic: str, joints: int, timeout: float, controllers: int) -> subprocess.Popen:
-    """The process of `guard_velocities`, once it hears the commands and is heard.
+    """Start the process of `guard_velocities`, and wait until it receives the commands and
+    reaches the controllers.
 
     Args:
         topic: Topic of the velocity controller.
         joints: Number of its joints.
-        timeout: Longest silence after a velocity [s].
-        controllers: Number of subscriptions that the commands reach.
+        timeout: Longest time without a command after a nonzero velocity [s].
+        controllers: Number of controllers that subscribe to the topic.
 
     Raises:
-        ConnectionError: It does not start.
+        ConnectionError: The guard does not start.
     """
     numbers = map(str, (joints, timeout, controllers))
     words = [sys.executable, str(Path(__file__)), topic, *numbers]
@@ -160,9 +162,9 @@ def start_guard(topic: str, joints: int, timeout: float, controllers: int) -> su
 
 
 def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) -> None:
-    """Send zeros once a velocity was the last command for too long.
+    """Send zeros once the last command is a nonzero velocity and older than the timeout.
 
-    It outlives the process that started it by a second of zeros.
+    After the death of the process that started the guard, it sends zeros for another second.
     """
     from std_msgs.msg import Float64MultiArray
 
@@ -175,7 +177,7 @@ def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) 
     session.node.create_subscription(Float64MultiArray, topic, take, quality(reliable=True))
     zeros = session.node.create_publisher(Float64MultiArray, topic, quality(reliable=True))
     end = time.monotonic() + _STARTUP
-    # Each time itself and others: all controllers, and the process that commands them.
+    # Both counts include this process; the others are the controllers and the commander.
     while (
         zeros.get_subscription_count() < controllers + 1
         or session.node.count_publishers(topic) < 2
@@ -190,7 +192,7 @@ def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) 
         time.sleep(timeout / 5)
         if newest["moving"] and time.monotonic() - newest["time"] > timeout:
             zeros.publish(rest)
-    # This process hears its own zeros at once. A controller that has not taken them yet loses
+    # Receiving its own zeros proves nothing: a controller that has not received them yet loses
     # them when the publisher leaves the graph.
     end = time.monotonic() + _FAREWELL
     while time.monotonic() < end:

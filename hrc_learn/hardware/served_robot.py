@@ -1,4 +1,4 @@
-"""A simulated arm as a robot of franky-sim, which speaks the protocol of a Franka arm.
+"""A simulated arm as a robot of franky-sim, which implements the protocol of a Franka arm.
 
 Imported on demand: it needs the package franky-sim.
 """
@@ -19,7 +19,7 @@ from hrc_learn.sim.world import World
 class ServedRobot(BaseRobot):
     """The world's arm and gripper, commanded by joint velocities in each cycle.
 
-    Its servos are the world's own, so commands of torque come to nothing.
+    The world's own servos drive the arm, so torque commands have no effect.
 
     Attributes:
         answered: True once a command has come in this cycle.
@@ -40,7 +40,7 @@ class ServedRobot(BaseRobot):
     def _get_state(self) -> InnerRobotState:
         read = self.reading
         assert read.external_torque is not None
-        # franky-sim tells of one kind of torque only: what drivers ask for is the external.
+        # franky-sim reports only one kind of torque; drivers need the external torques.
         return InnerRobotState(
             q=tuple(read.joint_position.tolist()),
             dq=tuple(read.joint_velocity.tolist()),
@@ -48,12 +48,12 @@ class ServedRobot(BaseRobot):
         )
 
     def begin_cycle(self) -> None:
-        """Begin a cycle in which no command has come yet."""
+        """Begin a cycle, for which no command has come yet."""
         self.answered = False
         self._before, self._last = self._last, self.velocity
 
     def go_on(self) -> None:
-        """Keep the acceleration of the last two cycles, for want of an answer."""
+        """Continue with the acceleration of the last two cycles, without an answer."""
         self.velocity = 2 * self._last - self._before
         self.joint_velocity_control(self.velocity, has_new_command=False)
 
@@ -62,7 +62,7 @@ class ServedRobot(BaseRobot):
         if not has_new_command:
             target_dq = self.velocity
         super().joint_velocity_control(target_dq, has_new_command)
-        # The package tells a smoothed acceleration; a control box knows what it commands.
+        # franky-sim reports a smoothed acceleration, a control box the commanded one.
         self._tracked_state_components["ddq_d"].set(
             vars(self)["_BaseRobot__t"], (self.velocity - self._last) / CYCLE
         )
@@ -74,10 +74,8 @@ class ServedRobot(BaseRobot):
 
     def _joint_position_control(self, target_q: np.ndarray) -> None:
         if self.server is not None and self.server.current_motion_id:
-            raise NotImplementedError(
-                "the simulated arm takes motions by joint velocities only"
-            )
-        # Without a motion its own servos hold the arm where it is.
+            raise NotImplementedError("the simulated arm accepts joint velocity motions only")
+        # Without a motion, the servos hold the arm where it is.
         self._joint_velocity_control(np.zeros(7))
 
     def _torque_control(self, torques: np.ndarray) -> None:
@@ -104,7 +102,7 @@ class ServedRobot(BaseRobot):
         self._world.arm.move(self._width_now)
 
     def step(self) -> None:
-        """Advance the world by one cycle, and take its reading."""
+        """Advance the world by one cycle, and read its arm."""
         self._pre_step()
         self._world.advance(CYCLE)
         self.reading = self._world.arm.read()
@@ -112,13 +110,13 @@ class ServedRobot(BaseRobot):
 
 
 class PunctualServer(FrankaRobotServer):
-    """Server that takes no answer to an earlier state.
+    """Server that drops answers to earlier states.
 
-    Taken for this cycle's, each answer would be a cycle late from then on.
+    If one were accepted in this cycle, all later answers would be a cycle late, too.
     """
 
     def _handle_udp_command(self, command_data: bytes) -> None:
-        # An answer names its state; the package has counted on since it was sent.
+        # An answer has the number of its state; the counter is one ahead after sending that.
         counted = self._FrankaServer__message_id  # pyright: ignore[reportAttributeAccessIssue]
         if int.from_bytes(command_data[:8], "little") == counted - 1:
             super()._handle_udp_command(command_data)

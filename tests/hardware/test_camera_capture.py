@@ -126,7 +126,7 @@ def test_a_stream_is_given_its_timeouts_in_milliseconds(backend):
         (3, "camera 3 cannot be opened: is it plugged in"),
         ("/dev/video3", "camera /dev/video3 cannot be opened: is it plugged in"),
         ("http://c/1", "camera http://c/1 cannot be opened: is its server running"),
-        (__file__, f"video {__file__} cannot be opened: is it a video, and whole"),
+        (__file__, f"video {__file__} cannot be opened: is it a video, and complete"),
     ],
 )
 def test_what_does_not_open_is_named_with_a_hint(backend, source, hint):

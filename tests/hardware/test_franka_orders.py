@@ -111,12 +111,12 @@ def test_a_loop_that_does_not_begin_is_killed_and_says_why(loop, ends):
             loop.publish(phase=Phase.ENDED)
 
     loop.turn = turn
-    text = "cannot connect: the process that has the loop has ended. NetworkException: refused."
+    text = "cannot connect: the process of the loop has ended. NetworkException: refused."
     with pytest.raises(DriverError) as raised:
         FrankaArm("arm", fr3, CONFIG)
     if ends:
         assert str(raised.value).startswith(text)
-        assert str(raised.value).endswith("make sure of that, and connect again.")
+        assert str(raised.value).endswith("make sure that it is at rest, and connect again.")
     else:
         assert str(raised.value) == "cannot connect within 60 s. "
         assert loop.now == pytest.approx(begun + 60, abs=0.03)
@@ -225,7 +225,7 @@ def test_a_stop_that_does_not_come_is_an_error_and_a_stopped_clock_is_none(loop,
     arm.stop()
     assert loop.now == pytest.approx(before, abs=0.03)
     loop.publish(phase=Phase.ENDED)
-    with pytest.raises(DriverError, match="cannot stop: the process that has the loop has"):
+    with pytest.raises(DriverError, match="cannot stop: the process of the loop has"):
         arm.stop()
 
 
