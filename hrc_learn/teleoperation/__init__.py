@@ -1,7 +1,7 @@
 """Human input: scripted, by keys, gamepad or browser; hand guiding; recorded demonstrations.
 
-Devices are in `teleoperation.devices`, the browser page in `teleoperation.page`; scenarios and
-scripted demonstrations, which need the simulator, in modules of their own.
+Devices are in `teleoperation.devices`, the browser page in `teleoperation.page`. Scenarios and
+scripted demonstrations need the simulator and have modules of their own.
 """
 
 from hrc_learn.teleoperation.hand_guiding import CombinedInput as CombinedInput

@@ -1,7 +1,7 @@
 """Dashboards in a browser: Rerun's viewer and recordings, served through the gate.
 
-Rerun's own servers ask for no secret and answer to any host name. They serve no data here: one
-hands over the files of the viewer once, and the gate serves these.
+Rerun's own servers require no secret and accept any host name. They serve no data here: one of
+them provides the files of the viewer once, and the gate serves these.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ else:
 _CLIENT = Path(__file__).parent / "dashboard_client"
 _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 _START = 60.0
-"""Longest time that Rerun's viewer may take to start [s]."""
+"""Timeout for starting Rerun's viewer [s]."""
 _EVERY = 0.1
-"""Time between two looks for new data [s]."""
+"""Period of checking for new data [s]."""
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def serve_stream(port: int | None = 9090) -> Iterator[tuple[RecordingStream, str
         port: Port of the page; None: the first free one from 8080 on.
 
     Raises:
-        ValueError: The port is taken.
+        ValueError: The port is in use.
     """
     import rerun
 
@@ -62,12 +62,12 @@ def serve_stream(port: int | None = 9090) -> Iterator[tuple[RecordingStream, str
     with _served(port, data) as url:
         yield stream, url
         data()
-        time.sleep(2 * _EVERY)  # pages that are open receive the end
+        time.sleep(2 * _EVERY)  # until open pages have received the end
 
 
 @contextmanager
 def serve_recordings(files: Sequence[Path], port: int | None = None) -> Iterator[str]:
-    """Serve recordings in Rerun's viewer, and return the address of the page.
+    """Serve recordings in Rerun's viewer, and yield the address of the page.
 
     Args:
         files: Recordings (`.rrd`).
@@ -80,7 +80,7 @@ def serve_recordings(files: Sequence[Path], port: int | None = None) -> Iterator
 
 @contextmanager
 def _served(port: int | None, data: Callable[[], Sequence[bytes]]) -> Iterator[str]:
-    """Serve the viewer and the parts of a recording, which grow at their end."""
+    """Serve the viewer and the parts of a recording, to which new parts are appended."""
     looking = asyncio.Lock()
 
     async def session(connection: Any, visitor: Visitor) -> None:
@@ -123,7 +123,7 @@ def _viewer_contents() -> dict[str, Content]:
 
 
 def _fetched_viewer() -> dict[str, bytes]:
-    """Files of the viewer, which Rerun's program hands over by HTTP only."""
+    """Files of the viewer, which Rerun's program provides by HTTP only."""
     ports = []
     for _ in range(2):
         with socket.create_server(("127.0.0.1", 0)) as free:

@@ -1,4 +1,4 @@
-"""Authenticated entrance for browsers: address and secrets, TLS and schemas."""
+"""Authenticated access for browsers: address and secrets, TLS and message schemas."""
 
 from hrc_learn.teleoperation.gate.address import Address as Address
 from hrc_learn.teleoperation.gate.address import AddressConfig as AddressConfig

@@ -16,10 +16,10 @@ import numpy as np
 
 from hrc_learn.store import cache_home
 
-_FIRST_PORTS = range(8080, 8180)  # tried in turn where none was asked for
+_FIRST_PORTS = range(8080, 8180)  # tried in turn if no port is given
 _NO_ADDRESS = {errno.EADDRNOTAVAIL, socket.EAI_NONAME, socket.EAI_AGAIN, socket.EAI_FAIL}
 _VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
-_LEAST = 7 * 24 * 3600  # seconds that one of our own lasts still when it is used again
+_LEAST = 7 * 24 * 3600  # remaining validity for using our own certificate again [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,25 +27,25 @@ class AddressConfig:
     """Host, port, certificate and client limit of a page."""
 
     host: str = "127.0.0.1"
-    """Address to serve at: this machine only, unless it is one of the network. There the page
-    is served by TLS."""
+    """Address to serve at. By default, only this machine can reach it. At a network address,
+    the page uses TLS."""
     port: int | None = None
-    """Port to serve at, which must be free; 0: any that is. None: the first free one from 8080
-    on."""
+    """Port to serve at, which must be free. 0: any free port; None: the first free one from
+    8080 on."""
     name: str = ""
-    """Name by which browsers reach this machine on the network; its own address if empty."""
+    """Name by which browsers reach this machine on the network; empty: its address."""
     certificate: Path | None = None
-    """Certificate for TLS (PEM); one of our own, which browsers ask about once, if None."""
+    """Certificate for TLS (PEM); None: a self-signed one, which browsers warn about once."""
     key: Path | None = None
     """Private key of that certificate (PEM)."""
     most_clients: int = 32
-    """Largest number of browsers that are connected at once."""
+    """Largest number of browsers connected at once."""
 
     def __post_init__(self) -> None:
         if self.port is not None and not 0 <= self.port <= 65535:
             raise ValueError(f"port must be 0 to 65535, but is {self.port}.")
         if (self.certificate is None) != (self.key is None):
-            raise ValueError("a certificate and its key are given together, or neither.")
+            raise ValueError("certificate and key must be given together, or neither.")
         if self.most_clients < 1:
             raise ValueError(f"most_clients must be at least 1, but is {self.most_clients}.")
 
@@ -85,7 +85,8 @@ class Address:
 
         Args:
             path: Path of the page.
-            watch: Read-only. Anyone with a link that is not can move the arm.
+            watch: True for a link for watching only. With any other link, a person can move
+                the arm.
         """
         return f"{self.origin}{path}#token={self.watch_token if watch else self.token}"
 
@@ -94,8 +95,8 @@ def network_name(config: AddressConfig) -> str:
     """Name or address by which browsers reach the page."""
     if config.name or config.local or config.host not in ("0.0.0.0", "::"):
         return config.name or config.host
-    # A datagram socket that is connected sends nothing: it only chooses the address that this
-    # machine would use. The one it would go to is reserved for documentation (RFC 5737).
+    # Connecting a datagram socket sends nothing; it only selects the address that this machine
+    # would use. The destination is reserved for documentation (RFC 5737).
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))
@@ -105,10 +106,10 @@ def network_name(config: AddressConfig) -> str:
 
 
 def listening_socket(config: AddressConfig) -> socket.socket:
-    """A socket at the configured port, or at the first free one from 8080 on.
+    """Socket that listens at the configured port, or at the first free one from 8080 on.
 
     Raises:
-        ValueError: The port is not free, or the host is none of this machine's addresses.
+        ValueError: No such port is free, or the host is not an address of this machine.
     """
     family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
     ports = _FIRST_PORTS if config.port is None else (config.port,)
@@ -132,14 +133,14 @@ def listening_socket(config: AddressConfig) -> socket.socket:
 
 
 def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
-    """TLS for a page on the network; None for one that this machine alone can reach.
+    """TLS context of a page on the network; None if only this machine can reach the page and
+    no certificate is configured.
 
-    Without a certificate one is made by `openssl`, kept in the cache folder and used again as
-    long as it lasts, so that browsers ask about it once.
+    If none is configured, `openssl` makes a certificate, which is kept in the cache folder and
+    used again while it is valid, so that browsers warn about it once.
 
     Raises:
-        ValueError: There is neither a certificate nor a program that makes one, or it is no
-            good.
+        ValueError: There is neither a certificate nor `openssl`, or the certificate is invalid.
     """
     if config.local and config.certificate is None:
         return None
@@ -195,13 +196,13 @@ def _lasts(certificate: Path) -> bool:
 
 
 def qr_code(text: str) -> str:
-    """A QR code for a terminal: two rows of it in each line, dark on light.
+    """QR code for a terminal, dark on light, with two rows of the code per line.
 
     Args:
         text: Encoded text.
 
     Returns:
-        Lines of text; empty where OpenCV cannot encode.
+        Lines of text; empty if OpenCV cannot encode it.
     """
     try:
         import cv2
@@ -209,7 +210,7 @@ def qr_code(text: str) -> str:
         code = cv2.QRCodeEncoder.create().encode(text)
     except (ImportError, AttributeError):
         return ""
-    # A code has an odd number of rows; on a dark terminal it needs light on either side.
+    # A code has an odd number of rows; on a dark terminal it needs light borders.
     light = np.pad(code // 255, ((0, 1), (1, 1)), constant_values=1)
     blocks = np.array([[" ", "▄"], ["▀", "█"]])
     return "\n".join("".join(row) for row in blocks[light[::2], light[1::2]].tolist())

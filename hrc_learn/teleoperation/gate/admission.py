@@ -13,14 +13,14 @@ from hrc_learn.teleoperation.gate.address import Address, AddressConfig, network
 Right = Literal["act", "watch"]
 """Right of a client: to act on the arm or the data, or only to watch."""
 
-_WRONG_SECRETS, _FORGIVEN = 20.0, 1.0  # at once, then one a second: 144 bits cannot be guessed
+_WRONG_SECRETS, _FORGIVEN = 20.0, 1.0  # at once, and per second: 144 bits cannot be guessed
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data:; frame-ancestors 'none'; form-action 'none'"
 )
-"""The page loads from, sends to and is framed by its own origin only."""
+"""The page may load from and send to its own origin only, and may not be framed."""
 
 HEADERS = {
     "Content-Security-Policy": _POLICY,
@@ -88,7 +88,7 @@ class Admission:
         names = {self.address.host.lower(), "localhost", "127.0.0.1", "::1"}
         hosts = {f"[{name}]" if ":" in name else name for name in names}
         self._hosts = {f"{host}:{port}" for host in hosts}
-        if port == _DEFAULT_PORTS[scheme]:  # which browsers leave out
+        if port == _DEFAULT_PORTS[scheme]:  # browsers omit default ports
             self._hosts |= hosts
         self._wrong = Bucket(rate=_FORGIVEN, burst=_WRONG_SECRETS)
 
@@ -107,7 +107,7 @@ class Admission:
         """Right of a client with this secret.
 
         Raises:
-            RefusedError: There is none, or it is wrong.
+            RefusedError: The secret is empty or wrong.
         """
         if not secret:
             raise RefusedError(
@@ -128,7 +128,8 @@ def same_secret(given: str, secret: str) -> bool:
     """Compare two strings in constant time.
 
     Args:
-        given: Text sent by a client; may hold bytes that are not valid text, as headers may.
+        given: Text sent by a client; it may contain bytes that are not valid text, as headers
+            may.
         secret: ASCII characters other than `?`.
     """
     return hmac.compare_digest(given.encode(errors="replace"), secret.encode())

@@ -1,8 +1,8 @@
-"""Entrance for all browser traffic: page, headset, curation and dashboards.
+"""Gate for all browser traffic: page, headset, curation and dashboards.
 
 The gate serves files and sockets in a thread of its own. Files of a page are public; its data
-and sockets need a secret (see `Admission`). Every socket belongs to a client that its page
-draws at random, and an error of one client closes the sockets of that client only.
+and sockets need a secret (see `Admission`). Every socket belongs to a client, whose name
+its page draws at random, and an error of a client closes the sockets of that client only.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ else:
 _LARGEST = 16_384  # bytes of a message: the longest of ours has 1.5 kB
 _RATE, _BURST = 400.0, 800.0  # messages a second and at once: a mouse makes 2 x 125
 _HANDSHAKE = 30.0
-"""Longest time from connecting to the answer [s]; the slowest is a block of images."""
+"""Longest time from connecting to the answer [s]; the slowest answer is a block of images."""
 _SESSION_WAIT = 3.0
 """Longest time that another socket waits for the session of its client [s]."""
-_POLL = 0.05  # s between looks for that session
+_POLL = 0.05  # period of checking for that session [s]
 _FAREWELL, _CLOSING = 0.5, 1.0  # longest times to send the last message, and to close [s]
 _PING, _PONG = 5.0, 10.0  # time between pings, and longest time to the answer [s]
 _TOO_MUCH, _FAILED, _FULL = 1008, 1011, 1013  # codes of the WebSocket protocol (RFC 6455)
@@ -70,7 +70,7 @@ class Content:
 
 
 def folder_contents(folder: Path, prefix: str = "/static/") -> dict[str, Content]:
-    """Files of a folder, by path; an index is the page itself as well."""
+    """Files of a folder, by path; index.html is also at the path "/"."""
     contents = {
         f"{prefix}{file.name}": Content.of(file.name, file.read_bytes())
         for file in sorted(folder.iterdir())
@@ -85,7 +85,7 @@ class Visitor:
     """Client of a page."""
 
     client: str
-    """Random name that its page has drawn."""
+    """Random name, drawn by its page."""
     right: Right
 
 
@@ -129,8 +129,8 @@ class Gate:
             contents: Public content by path.
             routes: Conversations by the first part of the path of a socket. "session" needs the
                 secret; the others need an open session of the same client.
-            data: Content of a path for clients with the secret, None if there is none; called
-                in threads.
+            data: Returns the content of a path for clients with a secret, or None; called in
+                threads.
 
         Raises:
             ValueError: The page cannot be served at this address, or not securely.
@@ -153,7 +153,7 @@ class Gate:
         """Accept clients.
 
         Raises:
-            Exception: The gate's thread cannot serve.
+            Exception: The gate's thread could not start to serve.
         """
         self._thread.start()
         self._ready.wait()
@@ -246,7 +246,7 @@ class Gate:
         """Check a socket that asks to be opened.
 
         Raises:
-            RefusedError: It may not be.
+            RefusedError: It may not be opened.
         """
         if not self._admission.from_ours(request.headers.get("Origin", "")):
             raise RefusedError(403, "Another site may not connect.")
@@ -270,7 +270,7 @@ class Gate:
         route, client = _place(request)
         table = self._open[route]
         if client in table or len(table) >= self._most_clients:
-            await connection.close(_FULL, "as many people are here as may be")
+            await connection.close(_FULL, "too many clients are connected")
             return
         table[client] = connection
         try:
@@ -295,7 +295,7 @@ class Gate:
 
 
 async def first_of(*work: Awaitable[None]) -> None:
-    """Wait until one ends, and end the others."""
+    """Wait until one of several ends, and cancel the others."""
     tasks = [asyncio.ensure_future(one) for one in work]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

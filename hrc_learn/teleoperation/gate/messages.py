@@ -1,7 +1,7 @@
 """Schemas of the messages that browsers may send: those of our own clients, and of viser's
 page.
 
-A message that fits no schema raises `MessageError`. Decoders go no deeper than the schema does.
+A message that fits no schema raises `MessageError`. Decoders parse no deeper than the schema.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _Positive = Annotated[float, Meta(gt=0, le=REACH)]
 
 
 class MessageError(ValueError):
-    """A message that no client of ours sends."""
+    """A message that our own clients would never send."""
 
 
 class _Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
@@ -65,7 +65,7 @@ class Lead(_Message, tag="lead"):
 
 
 class Ask(_Message, tag="ask"):
-    """Start, stop, save, ..."""
+    """Request such as start, stop or save."""
 
     request: Request
 
@@ -77,7 +77,7 @@ class Task(_Message, tag="task"):
 
 
 class Gripper(_Message, tag="gripper"):
-    """Open or close."""
+    """Request to open or close the gripper."""
 
     # The widest of our parallel grippers opens by 0.14 m.
     width: Annotated[float, Meta(ge=0, le=0.3)]
@@ -85,7 +85,7 @@ class Gripper(_Message, tag="gripper"):
 
 
 class Region(_Message, tag="region"):
-    """The box drawn."""
+    """Drawn box."""
 
     centre: Point
     half_size: tuple[_Positive, _Positive, _Positive]
@@ -93,7 +93,7 @@ class Region(_Message, tag="region"):
 
 
 class Target(_Message, tag="target"):
-    """The point marked; None: there is none."""
+    """Marked point; None: no target."""
 
     point: Point | None
 
@@ -119,11 +119,11 @@ class Grip(_Message):
 
 
 class TrackedHand(_Message):
-    """Tracked pose of a hand, holding an object or not."""
+    """Tracked pose of a hand, whether it holds something or not."""
 
     hand: Literal["left", "right"]
     position: Point
-    """Between thumb and index finger, or of the controller, in the base frame [m]."""
+    """Point between thumb and index finger, or of the controller, in the base frame [m]."""
     orientation: Quaternion
     """Orientation of the hand's grip (wxyz, base frame)."""
 
@@ -132,18 +132,18 @@ class TrackedHand(_Message):
 
 
 class Hands(_Message, tag="hands"):
-    """All that is held now; anything not named is released."""
+    """Everything that is held now; whatever is not listed is released."""
 
     grips: Annotated[tuple[Grip, ...], Meta(max_length=_MOST_GRIPS)]
     tracked: Annotated[tuple[TrackedHand, ...], Meta(max_length=2)] = ()
     """Hands that are seen now."""
     sent: _Time = 0.0
-    """Clock of the client, returned with the status: to measure the round trip."""
+    """Clock of the client, returned with the status to measure the round-trip time."""
 
     def __post_init__(self) -> None:
         for hands in (self.grips, self.tracked):
             if len({one.hand for one in hands}) < len(hands):
-                raise ValueError("a hand holds one thing and is in one place.")
+                raise ValueError("each hand may be listed only once.")
 
 
 Message = Beat | Hello | Lead | Ask | Task | Gripper | Region | Target | Hands
@@ -154,11 +154,11 @@ class Decide(_Message, tag="decide"):
 
     episode: int
     verdict: Literal["accept", "cut", "reject"] | None
-    """None takes an earlier decision back."""
+    """None withdraws an earlier decision."""
     start: int = 0
     """First frame of the part that is kept."""
     stop: int = 0
-    """Frame after the last."""
+    """Frame after the last one that is kept."""
 
 
 class Write(_Message, tag="write"):
@@ -169,7 +169,7 @@ CurationMessage = Decide | Write
 
 
 # Messages of viser's page, with its own names and fields. A field that a later version adds is
-# refused until it is listed here, which tests in a browser show.
+# refused until it is listed here; the browser tests then fail.
 
 
 class _Camera(_Message, tag="ViewerCameraMessage"):
@@ -194,7 +194,7 @@ class _StoredItem(_Message, tag="LocalStorageGetItemResponseMessage"):
 
 
 class GuiUpdate(_Message, tag="GuiUpdateMessage"):
-    """A control of the panel that has been used."""
+    """Change of a control of the panel by a person."""
 
     uuid: str
     updates: dict[str, bool | _Number | str]
@@ -257,16 +257,16 @@ def acts(message: Any) -> bool:
 
 
 def _decoded(decoder: Any, raw: str | bytes) -> Any:
-    """Message of a client.
+    """Decode a message of a client.
 
     Raises:
-        MessageError: It fits no schema.
+        MessageError: The message fits no schema.
     """
     try:
         return decoder.decode(raw)
     # TypeError: text where viser's page sends bytes.
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, TypeError) as error:
-        words = " ".join(str(error).split())  # they may quote line breaks of the client
+        words = " ".join(str(error).split())  # the error may quote line breaks of the client
         raise MessageError(f"not a message of this page: {words}") from error
 
 
