@@ -49,7 +49,7 @@ class LeRobotConfig:
     timeout: float = 0.15
     """Longest time for which a velocity holds without another command [s]."""
     silence: float = 0.4
-    """Longest time without a reading [s]; LeRobot waits 50 ms for a reply, up to three times."""
+    """Longest time without a reading [s]; LeRobot waits 50 ms for a reply, three times."""
     lag: float = 0.35
     """Largest distance of the commanded positions from the measured ones [rad]."""
     blocked: float = 1.0
