@@ -1,9 +1,9 @@
 """Devices that move the end effector: a gamepad, the keys of a terminal, and a haptic device
 with force feedback like the paper's Omega.
 
-A device is whatever has `Human.read`: it returns at each step what the person asks for. The
-haptic device was not run on hardware: `forcedimension-core`, the extra `haptic`, drives it
-where the maker's SDK is installed; tests drive the same interface without a device.
+A device implements `Human.read`, which returns the person's input at each step. The haptic
+device has not been run on hardware: it needs `forcedimension-core` (the extra `haptic`) and the
+maker's SDK; tests drive the same interface without a device.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OPEN = 0.08
 # SDL's layout of a game controller, the same for every make (CONTROLLER_AXIS_*, _BUTTON_*).
 _LEFT_X, _LEFT_Y, _RIGHT_Y = 0, 1, 3
 _A, _B, _X, _Y, _BACK, _START, _LEFT_SHOULDER, _RIGHT_SHOULDER = 0, 1, 2, 3, 4, 6, 9, 10
-_FULL = 32767.0  # an axis at its end
+_FULL = 32767.0  # value of an axis at its end
 
 BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
     {_A: "start", _B: "stop", _X: "save", _Y: "discard", _BACK: "home", _START: "finish"}
@@ -51,14 +51,14 @@ BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
 # Rumble: the slow motor reports contact and nearby people, the quick one an input that the arm
 # does not follow. Pulses are easier to notice than motors that run continuously.
 PULSE_EVERY, _PULSE = 0.25, 0.12  # [s]
-_LEAST_RUMBLE = 0.1  # of 1: motors hardly turn below
+_LEAST_RUMBLE = 0.1  # fraction of full strength; motors hardly turn below
 _CONTACT = (20.0, 60.0)
-"""Contact force from which on there are pulses, and that of the strongest [N]. Friction of the
+"""Contact forces at which pulses begin, and at which they are strongest [N]. Friction of the
 simulated joints feels like 17 N; a scripted person pulls with 60 N at most."""
 
 
 def rumble_strength(feedback: Feedback) -> tuple[float, float]:
-    """Strengths of the slow and of the quick motor of a gamepad, 0 to 1.
+    """Strengths of a gamepad's slow and quick motors, 0 to 1.
 
     Args:
         feedback: Feedback of the arm.
@@ -73,14 +73,14 @@ def rumble_strength(feedback: Feedback) -> tuple[float, float]:
 _DEAD_ZONE = 0.12
 """Fraction of its range in which a stick has no effect: worn sticks do not return to 0."""
 _CURVE = 2.0
-"""Power of the deflection: above 1 it is finer near the middle."""
+"""Exponent of the deflection; above 1, control is finer near the middle."""
 
 
 def deflection(stick: Float[np.ndarray, " axes"]) -> Float[np.ndarray, " axes"]:
-    """A stick's effect, 0 to 1 in length, in the direction of the stick.
+    """Effect of a stick: a vector of length 0 to 1 in the direction of the stick.
 
-    Zero in the dead zone, and from its edge on without a jump: the zone is a ball, as one for
-    each axis by itself would bend slow motions towards the axes.
+    It is zero in the dead zone and rises from its edge without a jump. The zone is a ball:
+    separate zones of the axes would bend slow motions towards the axes.
 
     Args:
         stick: Deflection of the stick, each axis -1 to 1.
@@ -93,11 +93,12 @@ def deflection(stick: Float[np.ndarray, " axes"]) -> Float[np.ndarray, " axes"]:
 
 
 class Gamepad(Human):
-    """Moves the end effector by the sticks: left one level, right one up and down.
+    """Moves the end effector by sticks: the left one horizontally, the right one vertically.
 
-    Shoulder buttons open and close the gripper, the others ask what `BUTTONS` says. The end
-    effector turns by the coarse orientation rule. A gamepad that is unplugged asks for nothing.
-    It rumbles where the arm meets something, slows down for people or does not follow.
+    Shoulder buttons open and close the gripper, the others send the requests of `BUTTONS`. The
+    end effector turns by the coarse orientation rule. An unplugged gamepad requests nothing.
+    The gamepad rumbles when the arm touches something, slows down for people or does not
+    follow.
     """
 
     def __init__(
@@ -122,15 +123,15 @@ class Gamepad(Human):
 
     @classmethod
     def open(cls, chain: SerialChain) -> Gamepad:
-        """Open the first gamepad by pygame, which the extra `gamepad` brings.
+        """Open the first gamepad with pygame, which the extra `gamepad` installs.
 
         Args:
             chain: The arm that is guided.
 
         Raises:
-            ValueError: There is none.
+            ValueError: There is no gamepad.
         """
-        # No window is opened, so events must come without one in front.
+        # There is no window, so events must come even without a focused one.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -147,7 +148,7 @@ class Gamepad(Human):
         return cls(chain, library.Controller(found[0]), pygame.event.pump)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the end effector, gripper and requests, as sticks and buttons are now."""
+        """Motion of the end effector, gripper and requests, from present sticks and buttons."""
         self._update()
         if not self._controller.attached():
             self._held = set()
@@ -163,7 +164,7 @@ class Gamepad(Human):
         )
 
     def tell(self, feedback: Feedback) -> None:
-        """Rumble, a pulse every now and then; a gamepad without motors stays still."""
+        """Rumble in pulses, one per `PULSE_EVERY`; a gamepad without motors stays still."""
         now = self._clock()
         if now < self._next_pulse:
             return
@@ -181,7 +182,7 @@ class Gamepad(Human):
         return steering_twist(self._chain, state, deflection(stick))
 
     def _pressed(self) -> set[int]:
-        """Buttons that have gone down since the last reading."""
+        """Buttons pressed since the last reading."""
         buttons = (*BUTTONS, _LEFT_SHOULDER, _RIGHT_SHOULDER)
         held = {button for button in buttons if self._controller.get_button(button)}
         pressed, self._held = held - self._held, held
@@ -202,7 +203,7 @@ DIRECTIONS = MappingProxyType(
 
 
 _KEY_HOLDS = 0.3
-"""Time that a press of a key counts [s]."""
+"""Time for which a key press counts [s]."""
 
 
 class KeyboardState:
@@ -223,12 +224,12 @@ class KeyboardState:
         self._until = dict.fromkeys(DIRECTIONS, float("-inf"))
 
     def press(self, key: str) -> None:
-        """Note a press or repeat; other keys than those of `DIRECTIONS` have no effect."""
+        """Note a press or repeat; keys that are not in `DIRECTIONS` have no effect."""
         if key in self._until:
             self._until[key] = self._clock() + _KEY_HOLDS
 
     def direction(self) -> Float[np.ndarray, "3"]:
-        """The direction asked for now: a unit vector, or zero."""
+        """Direction requested now: a unit vector, or zero."""
         now = self._clock()
         held = [DIRECTIONS[key] for key, until in self._until.items() if now < until]
         return capped(np.sum([(0.0, 0.0, 0.0), *held], axis=0), 1.0)
@@ -243,9 +244,9 @@ _GRIPPER = {"[": OPEN, "]": 0.0}
 
 
 class TerminalKeyboard(Human):
-    """Moves the end effector by keys: i k away and back, j l left and right, u o up and down.
+    """Moves the end effector by keys: i, k away and back; j, l left, right; u, o up, down.
 
-    [ opens the gripper, ] closes it; `KEYS` has the rest. The end effector turns by the
+    [ opens the gripper, ] closes it; `KEYS` has the requests. The end effector turns by the
     coarse orientation rule.
     """
 
@@ -256,7 +257,7 @@ class TerminalKeyboard(Human):
 
         Args:
             chain: The arm that is guided.
-            typed: Characters typed since it was last asked; does not wait.
+            typed: Returns the characters typed since its last call, without waiting.
             keys: State of the keys.
         """
         self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
@@ -267,7 +268,7 @@ class TerminalKeyboard(Human):
         """Read the terminal this process runs in, key by key, until the process ends.
 
         Raises:
-            ValueError: Standard input is no terminal.
+            ValueError: Standard input is not a terminal.
         """
         if not sys.stdin.isatty():
             raise ValueError("the keyboard needs a terminal: standard input is none.")
@@ -275,7 +276,7 @@ class TerminalKeyboard(Human):
         return cls(chain, _typed_in_terminal)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the end effector, gripper and requests, by the keys typed lately."""
+        """Motion of the end effector, gripper and requests, from keys typed lately."""
         requests = []
         for key in self._typed():
             if key in KEYS:
@@ -292,7 +293,7 @@ class TerminalKeyboard(Human):
 
 
 def _take_terminal() -> None:
-    """Let characters come without a line's end and unseen, and give the terminal back."""
+    """Receive characters at once and without echo; restore the terminal at exit."""
     import atexit
     import termios
     import tty
@@ -314,9 +315,9 @@ def _typed_in_terminal() -> str:
 
 
 _HAPTIC_SCALE = 2.5
-"""Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
+"""Motion of the end effector per motion of the hand: an Omega's workspace is 0.16 m wide."""
 _HAPTIC_STIFFNESS = 120.0
-"""Stiffness of the spring that pulls the device to where the arm has followed it [N/m]."""
+"""Stiffness of the spring that pulls the device back to the arm's position [N/m]."""
 _HAPTIC_DAMPING = 4.0
 """Damping of the hand's motion while the clutch is closed [N s/m]."""
 _HAPTIC_CONTACT = 0.1
@@ -324,7 +325,7 @@ _HAPTIC_CONTACT = 0.1
 _HAPTIC_MAX_FORCE = 6.0
 """Largest force on the hand [N]; an Omega can hold 12."""
 _HAPTIC_PERIOD = 0.001
-"""Time between two forces [s]."""
+"""Period of the force [s]."""
 _HAPTIC_STALE = 0.1
 """Time without feedback from the control loop after which the force vanishes [s]."""
 _HAPTIC_CLUTCH = 0
@@ -335,15 +336,14 @@ class HapticDevice(Human):
     """Guides the end effector while the clutch is held, and renders the tracking error as a
     force.
 
-    When the clutch closes, the pointer is at the end effector. It then moves with the device,
-    scaled by 2.5, and the end effector follows it like a gizmo. The person feels what the
-    arm does not follow:
+    When the clutch closes, a virtual pointer starts at the end effector. It moves with the
+    device, scaled by 2.5, and the end effector follows it like a gizmo. The person feels how
+    far the arm is behind:
 
         f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
 
     with x_arm the device position at which the pointer would be at the end effector. The axes
-    of the device are those of the base for a person that faces the arm: x towards the person, z
-    up.
+    of the device are those of the base if the person faces the arm: x towards the person, z up.
 
         with HapticDevice.open(panda) as device:
             HandGuidedArm(panda, arm, device)
@@ -369,18 +369,18 @@ class HapticDevice(Human):
         """
         self._chain, self._device, self._number = chain, device, number
         self._forces, self._clock = InteractionForceConfig(), clock
-        # Positions of hand and tool at which the clutch was closed.
+        # Positions of hand and tool when the clutch was closed.
         self._clutched: tuple[np.ndarray, np.ndarray] | None = None
         self._tool = np.zeros(3)
-        # For the thread of forces, as one reference: position at which the device would rest
-        # [m], force of what the arm meets [N], and the time at which both are stale [s].
+        # For the force thread, exchanged as one reference: rest position of the device [m],
+        # rendered contact force [N], and the time at which both expire [s].
         self._pull: tuple[np.ndarray, np.ndarray, float] | None = None
         self._closing = Event()
         self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
 
     @classmethod
     def open(cls, chain: SerialChain) -> HapticDevice:
-        """Open the first device by forcedimension-core, which the extra `haptic` brings.
+        """Open the first device with forcedimension-core, which the extra `haptic` installs.
 
         Args:
             chain: Kinematics of the guided arm.
@@ -394,7 +394,7 @@ class HapticDevice(Human):
             raise ValueError(
                 f"a haptic device needs the extra `haptic` and Force Dimension's SDK: {error}"
             ) from error
-        connect = dhd.open  # a device, no file
+        connect = dhd.open  # opens a device, not a file
         number = connect()
         if number < 0:
             raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
@@ -413,7 +413,7 @@ class HapticDevice(Human):
         self._device.close(self._number)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the end effector as the hand is now."""
+        """Motion of the end effector, from the present position of the hand."""
         hand = self._vector(self._device.getPosition)
         tool = self._chain.forward(torch.from_numpy(state.joint_position))
         self._tool = tool.position.numpy()
@@ -428,7 +428,7 @@ class HapticDevice(Human):
         return HumanInput(twist=guiding_twist(tool, velocity, self._forces))
 
     def tell(self, feedback: Feedback) -> None:
-        """Let the hand feel how far the arm is behind, and what it meets."""
+        """Update the forces by which the hand feels the arm's lag and contacts."""
         if self._clutched is None:
             self._pull = None
             return
@@ -440,7 +440,7 @@ class HapticDevice(Human):
         self._pull = rest, push, self._clock() + _HAPTIC_STALE
 
     def force(self) -> Float[np.ndarray, "3"]:
-        """Force on the hand now [N]; none where the clutch is open or the loop is silent."""
+        """Force on the hand now [N]; zero if the clutch is open or the loop is silent."""
         pull = self._pull
         hand = self._vector(self._device.getPosition)
         velocity = self._vector(self._device.getLinearVelocity)
@@ -455,6 +455,6 @@ class HapticDevice(Human):
         return None if read(out, self._number) < 0 else np.array(out)
 
     def _push_back(self) -> None:
-        with contextlib.suppress(OSError):  # it has been unplugged
+        with contextlib.suppress(OSError):  # the device was unplugged
             while not self._closing.wait(_HAPTIC_PERIOD):
                 self._device.setForce(self.force().tolist(), self._number)

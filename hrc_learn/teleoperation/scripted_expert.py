@@ -1,5 +1,5 @@
-"""Scripted people: one pulls the arm at given times, the expert guides the end effector along
-way points.
+"""Scripted people: one pulls the arm at given times, an expert guides the end effector
+along way points.
 """
 
 import math
@@ -21,9 +21,9 @@ class ScriptedForce:
     """A pull at a joint towards a point during an interval, with soft start and end."""
 
     start: float
-    """[s]"""
+    """Start of the pull [s]."""
     duration: float
-    """[s]"""
+    """Duration of the pull [s]."""
     towards: tuple[float, float, float]
     """Position of the person's hand, in the base frame [m]."""
     stiffness: float = 100.0
@@ -33,11 +33,11 @@ class ScriptedForce:
     joint: int = 4
     """Index of the pulled joint, counted from 1."""
     ramp: float = 0.4
-    """Time to full strength, and back to none [s]."""
+    """Time to rise to full strength, and to fall from it [s]."""
 
     @property
     def end(self) -> float:
-        """[s]"""
+        """End of the pull [s]."""
         return self.start + self.duration
 
     def strength(self, time: float) -> float:
@@ -55,24 +55,24 @@ class ScriptedForce:
 
 
 _PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
-"""Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
-half that."""
+"""Ranges of the pause between two pulls and of the duration of a pull [s]. The paper's drags of
+joint 4 last 4 to 7 s."""
 _FAR_AWAY = 10.0
-"""Distance of the point towards which a pull goes [m]: its direction stays."""
+"""Distance of the point that a pull is directed to [m]: far, so that its direction stays."""
 _SLOPE = math.radians(30.0)
-"""Largest angle of a pull against the horizontal [rad]: people pull an elbow aside."""
+"""Largest angle of a pull to the horizontal [rad]: people pull an elbow aside."""
 _FORCE = 60.0
-"""Largest force [N], as where the person is waited for."""
+"""Largest force [N], as in the scripted interaction of a collaboration trial."""
 
 
 def random_pulls(
     rng: np.random.Generator, duration: float = 600.0
 ) -> tuple[ScriptedForce, ...]:
-    """Pulls at random moments, each to another side.
+    """Pulls at random times, each in a random direction.
 
     Args:
-        rng: Source of moments, durations and sides.
-        duration: Duration of the pulls [s].
+        rng: Source of times, durations and directions.
+        duration: Time within which pulls begin [s].
     """
     pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
     while time < duration:
@@ -92,7 +92,7 @@ def random_pulls(
 
 
 class ScriptedPerturbation(Human):
-    """Person that only pulls the arm, at given times."""
+    """Person whose only input is pulling the arm at given times."""
 
     def __init__(
         self,
@@ -104,15 +104,15 @@ class ScriptedPerturbation(Human):
 
         Args:
             chain: The arm.
-            forces: Times, places and forces of the pulls.
-            begin: Time from which their intervals count [s]; None: once `begin` is called.
+            forces: Pulls to exert.
+            begin: Time from which their intervals count [s]; None: from the call of `begin`.
         """
         self._chain = chain
         self.forces = tuple(forces)
         self._begin = begin
 
     def begin(self, time: float) -> None:
-        """Start the script now [s]."""
+        """Start the script at this time [s]."""
         self._begin = time
 
     def read(self, state: ArmState) -> HumanInput:
@@ -132,7 +132,7 @@ class ScriptedPerturbation(Human):
 
 
 class GuidedPath:
-    """A smooth path through way points, run through once from rest to rest."""
+    """A smooth path through way points, traversed once from rest to rest."""
 
     def __init__(
         self, waypoints: Float[np.ndarray, "points 3"], duration: float, start: float = 0.0
@@ -140,15 +140,15 @@ class GuidedPath:
         """Fix the path.
 
         Args:
-            waypoints: Positions to pass, no two the same in a row [m].
-            duration: Time from the first to the last [s].
-            start: Time at the first [s].
+            waypoints: Positions to pass [m]; successive ones must differ.
+            duration: Time from the first to the last way point [s].
+            start: Time at the first way point [s].
         """
         chords = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-        from scipy.interpolate import PchipInterpolator  # a quarter of a second
+        from scipy.interpolate import PchipInterpolator  # takes a quarter of a second
 
         length = np.concatenate([[0.0], np.cumsum(chords)])
-        # Monotone between way points: a hand that overshoots would hit the boards.
+        # Monotone between way points: an overshooting end effector would hit the boards.
         self._curve = PchipInterpolator(length / length[-1], waypoints)
         self._slope = self._curve.derivative()
         self._start, self.duration = start, duration
@@ -159,12 +159,12 @@ class GuidedPath:
         return self._start + self.duration
 
     def position(self, time: float) -> Float[np.ndarray, "3"]:
-        """[m]"""
+        """Position at a time [m]."""
         s, _ = self._progress(time)
         return self._curve(s)
 
     def velocity(self, time: float) -> Float[np.ndarray, "3"]:
-        """[m/s]"""
+        """Velocity at a time [m/s]."""
         s, rate = self._progress(time)
         return self._slope(s) * rate
 
@@ -175,28 +175,28 @@ class GuidedPath:
 
 
 class Tremor:
-    """The shaking of a hand: a slow random drift and an 8 Hz tremor, in velocity [m/s]."""
+    """Shaking of a hand: a slow random drift and a tremor of 8 Hz."""
 
     def __init__(self, amplitude: float, rng: np.random.Generator):
         """Draw the phases.
 
         Args:
-            amplitude: Amplitude of the tremor [m]; the drift's is three times as large.
+            amplitude: Amplitude of the tremor [m]; that of the drift is three times as large.
             rng: Source of the phases.
         """
-        # Two tremors (Elble and Koller 1990: 8 to 12 Hz), and a drift of two slow waves.
+        # Two frequencies of tremor (Elble and Koller 1990: 8 to 12 Hz) and two of drift.
         self._omega = 2 * np.pi * np.array([8.0, 7.2, 0.35, 0.22])
         self._amplitude = amplitude * np.array([1.0, 0.7, 3.0, 3.0])
         self._phase = rng.uniform(0, 2 * np.pi, size=(3, 4))
 
     def velocity(self, time: float) -> Float[np.ndarray, "3"]:
-        """[m/s]"""
+        """Velocity at a time [m/s]."""
         return (self._amplitude * self._omega * np.cos(self._omega * time + self._phase)).sum(
             axis=1
         )
 
 
-# How fast the expert corrects an error of pose by eye [1/s].
+# Gain with which the expert corrects an error of the pose by eye [1/s].
 _GAIN = 4.0
 
 Orientation = Callable[[Float[torch.Tensor, "3"], float], Float[torch.Tensor, "4"]]
@@ -231,7 +231,7 @@ class ScriptedExpert(Human):
         """Motion of the end effector at the state's time."""
         pose = self._chain.forward(torch.from_numpy(state.joint_position))
         wanted = torch.from_numpy(self.path.position(state.time))
-        # The rule turns the end effector where it is, not where it should be.
+        # The rule gives the orientation at the actual position, not at the wanted one.
         goal = Pose(wanted, self.orientation(pose.position, state.time))
         twist = _GAIN * pose.twist_to(goal).numpy()
         twist[:3] += self.path.velocity(state.time)

@@ -1,7 +1,7 @@
 """Touch of the arm itself, estimated from the external torques of its joints.
 
-A push at the elbow moves the body in the null space, a push at the end effector pauses the
-task, and a sudden contact stops it. The arm needs no device other than torque estimates.
+A push at the elbow moves the arm in the null space, a push at the end effector pauses the task,
+and a sudden contact stops the arm. This needs no device, only estimates of external torques.
 
 A wrench W at the end effector causes joint torques J^T W without a null-space component.
 Torques in the null space therefore come from further up the arm: from the person, regardless of
@@ -25,11 +25,11 @@ from hrc_learn.teleoperation.hand_guiding import check_positive
 Place = Literal["nothing", "elbow", "hand"]
 """Place of a touch; the elbow stands for all links above the wrist."""
 
-# Joint whose origin is the elbow, counted from 1: joints after it feel nothing of it.
+# Joint whose origin is the elbow, counted from 1: forces there do not load later joints.
 _ELBOW = 4
-# For which errors of the torques last: a filter's lag, and servos that settle [s].
+# Correlation time of torque errors, which come from filter lag and settling servos [s].
 _CORRELATED = 0.1
-# Joint velocity from which on friction has its whole size [rad/s].
+# Velocity scale of dry friction: well above it, friction has its full size [rad/s].
 _SLIDES = 0.02
 
 
@@ -42,30 +42,30 @@ class TouchConfig:
     """
 
     elbow_force: float = 7.0
-    """Dead band of the elbow: force up to which it is not felt [N]. Half of it lets it go, and
-    twice as much counts whole."""
+    """Force above which a touch of the elbow begins [N]. It ends below half of this force, and
+    counts fully from twice this force on."""
     gain: float = 2.0
-    """Null-space input per torque that is felt there. With a damping of 3 N m s/rad, 20 N at an
-    elbow that moves by 0.1 m a radian make 0.13 m/s."""
+    """Null-space input per null-space torque. With a damping of 3 N m s/rad, 20 N at an elbow
+    that moves by 0.1 m per radian cause 0.13 m/s."""
     evidence: float = 16.0
-    """Log evidence for a touch over that for none, as a threshold. Friction reached 15 in
+    """Threshold of the log evidence for a touch minus that for none. Friction reached 15 in
     undisturbed jobs; 20 N give 25 to 600.
     """
     hand_force: float = 10.0
-    """Force at the hand from which on the task pauses [N]; half of it lets it go on."""
+    """Force at the end effector above which the task pauses; the touch ends below half [N]."""
     released: float = 0.4
     """Time without a push at the end effector until the task resumes [s]."""
     collision_rise: float = 30.0
-    """Change of the force within `collision_time` that no hand makes [N]."""
+    """Change of force within `collision_time` that is too large for a pushing hand [N]."""
     collision_time: float = 0.04
     """[s]"""
     collision_force: float = 110.0
-    """Force that stops the arm however slowly it came [N]: the smallest quasi-static limit of
-    ISO 10218-2:2025, Annex M (ISO/TS 15066:2016, table A.2), but for face and head."""
+    """Force that stops the arm however slowly it rises [N]: the smallest quasi-static limit of
+    ISO 10218-2:2025, Annex M (ISO/TS 15066:2016, table A.2), except for face and head."""
     torque_deviation: float = 0.3
-    """Standard deviation of what no bias explains of each joint's torque [N m]."""
+    """Standard deviation of the part of each joint's torque that no bias explains [N m]."""
     smoothing: float = 0.03
-    """Time constant of the torques in which a touch is looked for [s]."""
+    """Time constant of the filter of the torques, before a touch is detected in them [s]."""
     longest_touch: float = 20.0
     """Duration after which a touch is taken for a load [s]."""
     gripper_settles: float = 0.5
@@ -82,19 +82,19 @@ class TorqueBias:
     with the direction of motion. A Kalman filter estimates them; each is a random walk.
     """
 
-    # Standard deviations at first, of w [N], o and F [N m]: of a load of 0.5 kg, and of
-    # friction of 0.3 to 1.3 N m, as identified by Gaz et al. (2019).
+    # Initial standard deviations of w [N], o and F [N m]: for a load of 0.5 kg, and for the
+    # friction of 0.3 to 1.3 N m that Gaz et al. (2019) identified.
     _FIRST = (5.0, 1.0, 0.5)
     _FRICTION = 0.8
-    # By which they wander within a second: loads are taken up, and the error of a model of
-    # gravity changes with the posture [N, N m].
+    # Standard deviations of their change within a second [N, N m]: loads are picked up, and the
+    # error of the gravity model changes with the posture.
     _DRIFT = (0.3, 0.1, 0.03)
     # Standard deviation of the friction of a joint at rest, relative to its size: it may take
     # any value up to it, in either direction.
     _STICKS = 0.7
 
     def __init__(self, joints: int, deviation: float):
-        """Begin with what is usual.
+        """Start with typical values.
 
         Args:
             joints: Number of joints of the arm.
@@ -121,7 +121,7 @@ class TorqueBias:
         return H @ self.state, H @ self._covariance @ H.T + np.diag(self._unknown(velocity))
 
     def _unknown(self, velocity: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
-        """Variances of what no bias explains: friction of joints at rest may be anything."""
+        """Variances of the torques that no bias explains, such as friction at rest."""
         friction = self.state[1 + self._joints :] / np.cosh(velocity / _SLIDES)
         return self._deviation**2 + (self._STICKS * friction) ** 2
 
@@ -142,7 +142,7 @@ class TorqueBias:
         """
         H = self._rows(jacobian, velocity)
         self._covariance += np.diag(self._drift**2 * dt)
-        # Errors of one reading are those of the next, for a while.
+        # Errors of successive readings are correlated.
         noise = np.diag(self._unknown(velocity)) * max(_CORRELATED / dt, 1.0)
         PH = self._covariance @ H.T
         K = np.linalg.solve(H @ PH + noise, PH.T).T
@@ -163,9 +163,9 @@ class Explanation:
     """Force at one place that best explains the torques, and its evidence."""
 
     force: Float[np.ndarray, "3"]
-    """Most likely one, in the base frame [N]."""
+    """Most likely force, in the base frame [N]."""
     evidence: float
-    """Logarithm of the torques' probability density, whatever the force."""
+    """Logarithm of the torques' probability density for an unknown force at this place."""
 
     @property
     def size(self) -> float:
@@ -199,27 +199,28 @@ def explain(
 def log_density(
     torque: Float[np.ndarray, " joints"], covariance: Float[np.ndarray, "joints joints"]
 ) -> float:
-    """Logarithm of the normal density of torques [N m], but for its constant."""
+    """Logarithm of the normal density of torques [N m], without its constant term."""
     _, size = np.linalg.slogdet(covariance)
     return -0.5 * float(torque @ np.linalg.solve(covariance, torque) + size)
 
 
-# Forces of people, and moments that they have about the tool centre point: of a hand that
-# grasps the gripper up to 10 cm off its centre [N, N m].
+# Standard deviations of a person's force and of its moment about the tool centre point: a hand
+# may push the gripper up to 10 cm off its centre [N, N m].
 _PUSHES, _MOMENTS = 25.0, 2.5
-# By how much the logarithm of its evidence must be larger for the hand to be what is pushed:
-# the task waits for nothing if it is not.
+# Margin of the log evidence above which a push counts as one at the end effector: a wrong guess
+# would pause the task for nothing.
 _SURE = 2.0
-# By how much, for what begins like a push at one place to turn out as one at the other: while a
-# force rises, friction hides where it acts. In simulation the hand's evidence is at most 2 more
-# for a push at the elbow, and soon 10 to 400 more for one at the hand.
+# Margin of the log evidence at which a push changes its place: while a force rises, friction
+# hides where it acts. In simulation, the evidence for the end effector exceeds that for the
+# elbow by at most 2 during a push at the elbow, and soon by 10 to 400 during one at the end
+# effector.
 _CHANGES = 8.0
-# Loads of the end effector by what the task meets: force and moment [N, N m].
+# Standard deviations of the loads in contacts of the task: force and moment [N, N m].
 _MET = np.array([60.0] * 3 + [10.0] * 3)
 
 
-# Change of the gripper's opening from one reading to the next at which the fingers move [m]: of
-# 10 mm/s, half a gripper's slowest.
+# Change of the gripper's opening between two readings above which the fingers move [m]: 10 mm/s
+# at 100 Hz, half the slowest speed of a gripper.
 _FINGERS_MOVE = 1e-4
 
 
@@ -249,7 +250,7 @@ class _Posture:
         torque: Float[np.ndarray, " joints"],
         unknown: Float[np.ndarray, "joints joints"],
     ) -> tuple[Explanation, Explanation]:
-        """Torques [N m] by a force at the elbow, and by one at the hand."""
+        """Explain torques [N m] by a force at the elbow, and by a load of the end effector."""
         forces, moments = np.full(3, _PUSHES), np.full(3, _MOMENTS)
         return (
             explain(torque, self.elbow.T, forces, unknown),
@@ -265,14 +266,14 @@ def touched_place(
     Args:
         before: Place that was touched last.
         above: Force at the elbow.
-        hand: Force at the hand.
+        hand: Force at the end effector.
         none: Evidence that nothing is touched.
         config: Thresholds.
     """
     likelier = hand.evidence - above.evidence
     evidence = max(above, hand).evidence - none
-    # Once touched, half of the force is enough, as long as something tells of it and it is
-    # not far likelier to be elsewhere.
+    # A touch lasts down to half of the force, as long as there is evidence for a touch and the
+    # other place is not far likelier.
     stays = {
         "nothing": False,
         "elbow": likelier < _CHANGES and above.size > 0.5 * config.elbow_force,
@@ -318,7 +319,7 @@ class Touch(Human):
         self._expected, self._why = False, ""
 
     def tell(self, feedback: Feedback) -> None:
-        """Learn whether the task feels its way."""
+        """Note whether the task expects contact."""
         self._expected = feedback.contact_expected
 
     def read(self, state: ArmState) -> HumanInput:
@@ -327,7 +328,7 @@ class Touch(Human):
         if state.external_torque is None:
             return HumanInput(nullspace_input=still)
         dt = state.time - self._time
-        if dt < 0:  # a simulation that begins anew
+        if dt < 0:  # the simulation was restarted
             self._restart()
             dt = math.inf
         if math.isinf(dt):
@@ -339,7 +340,7 @@ class Touch(Human):
         free = state.external_torque - bias
         self._felt += min(dt / config.smoothing, 1.0) * (free - self._felt)
         self._time, meets = state.time, self._meets_objects(state)
-        if meets:  # whatever the hand meets says nothing of the elbow
+        if meets:  # loads of the end effector say nothing about the elbow
             unknown = unknown + arm.jacobian.T @ np.diag(_MET**2) @ arm.jacobian
         above, hand = arm.explained(self._felt, unknown)
         none = log_density(self._felt, unknown)
@@ -360,7 +361,7 @@ class Touch(Human):
         """True if the arm has been untouched long enough to update the bias."""
         if self.place != "nothing":
             self._let_go = self._time
-        # When it stops, friction turns, and may hide the hand for a while that stopped it.
+        # When the arm stops, friction may hide the hand that has stopped it for a while.
         if self._time - self._let_go > self._config.released:
             self._alone = self._time
         since = self._time - self._alone
@@ -388,7 +389,7 @@ class Touch(Human):
         now: Explanation,
         meets: bool,
     ) -> None:
-        """Note what meets the arm, too suddenly or too hard for a hand that pushes it."""
+        """Detect contacts that are too sudden or too hard for a pushing hand."""
         config, time = self._config, self._time
         self._lately = [old for old in self._lately if old[0] > time - config.collision_time]
         rise = torque - self._lately[0][1] if self._lately else np.zeros_like(torque)
@@ -400,7 +401,7 @@ class Touch(Human):
             self._why = f"something holds the arm with {now.size:.0f} N"
             self._collided = time
         elif sudden > config.collision_rise and not meets:
-            self._why = f"something has met the arm, with {sudden:.0f} N at once"
+            self._why = f"something has hit the arm, with {sudden:.0f} N at once"
             self._collided = time
         elif self.place == "nothing" and time - self._collided > config.released:
             self._why = ""

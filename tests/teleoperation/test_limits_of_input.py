@@ -202,7 +202,7 @@ def test_a_change_that_no_hand_makes_stops_the_arm(sizes, met):
     pushes = [size * HAND[1] for size in (*slow, *[sizes[0]] * 20, sizes[1])]
     _, asked = felt(pushes)
     assert not any(one.stop for one in asked[:-1])
-    assert asked[-1].stop.startswith("something has met the arm, with ") == met
+    assert asked[-1].stop.startswith("something has hit the arm, with ") == met
     if met:
         number = float(asked[-1].stop.split("with ")[1].split()[0])
         assert number == pytest.approx(abs(sizes[1] - sizes[0]), abs=3)

@@ -232,7 +232,7 @@ def test_a_push_that_begins_like_one_at_the_elbow_turns_out_as_one_at_the_hand()
 
 def test_a_collision_stops_the_arm_for_good():
     world, cell, _ = at_work(3, [("hand", (0.0, 70.0, 0.0), 1.0, 5.0, 0.02)])
-    with pytest.raises(StoppedByPersonError, match=r"something has met the arm, with \d+ N"):
+    with pytest.raises(StoppedByPersonError, match=r"something has hit the arm, with \d+ N"):
         along_a_path(cell)
     assert 1.0 < cell.time < 1.6
     assert np.abs(world.data.qvel[:7]).max() < 0.01
