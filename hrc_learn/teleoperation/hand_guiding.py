@@ -1,5 +1,5 @@
-"""Hand guiding: pulls at the arm's body become null-space input d, a held end effector is
-guided, several sources are combined and filtered, and a hand-guided arm follows them.
+"""Hand guiding: pulls at the arm's links become null-space input d, a held end effector is
+guided, several inputs are combined and filtered, and a hand-guided arm follows them.
 
 This is the mixed interface of the paper. There, the displacement of a joint's gizmo commands a
 proportional velocity, mapped to the joints by the pseudo-inverse of that joint's Jacobian
@@ -54,15 +54,15 @@ class InteractionForceConfig:
     rate: float = 2.0
     """Speed per displacement [1/s]."""
     speed: float = 0.25
-    """Largest speed that a gizmo asks for [m/s]."""
+    """Largest speed that a gizmo requests [m/s]."""
     stiffness: float = 150.0
-    """Force per displacement [N/m], where a gizmo is a spring."""
+    """Force per displacement [N/m], if a gizmo is a spring."""
     max_force: float = 45.0
     """Largest force [N]."""
     damping: float = 3.0
     """c_d: null-space input per velocity [N m s/rad]."""
     max_nullspace_input: float = 20.0
-    """Bound on d of each joint; the direction is kept [N m]."""
+    """Bound on d of each joint [N m]; d is scaled as a whole."""
     turn_rate: float = 4.0
     """Decay rate of the end effector's orientation error [1/s]."""
     turn_speed: float = 0.8
@@ -71,12 +71,12 @@ class InteractionForceConfig:
     __post_init__ = check_positive
 
 
-# The floor only keeps a division by zero out; it is far below any length that matters.
+# Floor of divisors, against a division by zero; far below any length that matters.
 TINY = 1e-12
 
 
 def capped(vector: Float[np.ndarray, " n"], most: float) -> Float[np.ndarray, " n"]:
-    """The vector, shortened to a length of `most` where it is longer."""
+    """The vector, shortened to a length of `most` if it is longer."""
     return vector * min(1.0, most / max(float(np.linalg.norm(vector)), TINY))
 
 
@@ -105,8 +105,8 @@ def force_to_nullspace_input(
         chain: The arm.
         joint_position: Joint positions [rad].
         joint: Index of the pulled joint, from 1.
-        force: Force in the base frame [N]; with "pinv" it stands for the velocity that a gizmo
-            displaced as far asks for.
+        force: Force in the base frame [N]; with "pinv", it stands for the velocity
+            `rate / stiffness * force`, capped at `speed`.
         config: Mapping of the force to the joints; None: the defaults.
         point: Point at which the link is pulled, in the base frame [m]; the joint's origin if
             None.
@@ -170,8 +170,8 @@ def guiding_twist(
 
     Args:
         pose: Pose of the end effector.
-        velocity: Asked for [m/s]; capped with its direction kept.
-        config: Speeds.
+        velocity: Requested velocity [m/s]; capped, with its direction kept.
+        config: Gains and largest speeds.
         turn: Rotation added to the rule's orientation (wxyz); None: none.
     """
     orientation = coarse_orientation(pose.position)
@@ -252,10 +252,11 @@ class GuidedStep:
 
 
 class HandGuidedArm:
-    """Executes at each step what a person asks, within the safety filter's limits.
+    """Executes a person's input at each step, within the safety filter's limits.
 
-    u = J^+ (v + attraction) + N c_d^-1 d: the law of the paper (eq. globalControl) with the
-    person's own end-effector motion v in place of the camera's.
+    u = J^+ v + N c_d^-1 d is the law of the paper (eq. globalControl), with the end-effector
+    motion v from the person instead of the camera. Without a motion of the person, v is the
+    attraction to the drawn region and target.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
@@ -295,10 +296,10 @@ class HandGuidedArm:
         self._arm.command(np.zeros(len(self._chain.joint_names)))
 
     def move_to(self, joint_position: Float[torch.Tensor, " joints"]) -> None:
-        """Move there in a straight line in joint space, until the person moves the arm.
+        """Move to a posture in a straight line in joint space, until the person moves the arm.
 
         Args:
-            joint_position: [rad]
+            joint_position: Joint positions of the posture [rad].
         """
         self._posture = joint_position
 
@@ -366,14 +367,14 @@ class HandGuidedArm:
 
 
 class CombinedInput(Human):
-    """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
+    """Combines several sources, such as the haptic device and headset of the paper's interface.
 
-    Null-space inputs and twists add up. Of gripper, region, target and turn the first source
-    that sets them is used; requests of all are passed on, and any of them pauses or stops.
+    Null-space inputs and twists add up. Gripper, region, target and turn come from the first
+    source that sets them. All requests are passed on, and any source can pause or stop.
     """
 
     def __init__(self, *sources: Human):
-        """Join them."""
+        """Combine sources."""
         self._sources = sources
 
     def read(self, state: ArmState) -> HumanInput:
@@ -395,7 +396,7 @@ class CombinedInput(Human):
         )
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell all sources."""
+        """Pass the feedback to all sources."""
         for source in self._sources:
             source.tell(feedback)
 
@@ -407,12 +408,12 @@ _ELBOW = 4
 class LinkGuide(Human):
     """Pulls a link in the null space with a device that otherwise guides the end effector.
 
-    The device's speed, as a fraction of its largest, is that fraction of the largest force on
-    the link. The end effector is left alone.
+    The force on the link is proportional to the speed that the device requests: the largest
+    force at the largest speed. The end effector does not move.
     """
 
     def __init__(self, human: Human, chain: SerialChain):
-        """Take a device.
+        """Use a device.
 
         Args:
             human: The device.
@@ -421,9 +422,9 @@ class LinkGuide(Human):
         self._human, self._chain, self._config = human, chain, InteractionForceConfig()
 
     def read(self, state: ArmState) -> HumanInput:
-        """The null-space input now."""
+        """Present null-space input."""
         asked, config = self._human.read(state), self._config
-        # A gizmo with the largest force at the largest speed of the device.
+        # Displacement of a gizmo: the largest force at the largest speed of the device.
         displacement = config.max_force / config.stiffness / config.speed * asked.twist[:3]
         d = gizmo_nullspace_input(
             self._chain, state.joint_position, _ELBOW, None, displacement, config
@@ -435,7 +436,7 @@ class LinkGuide(Human):
         )
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell the person at the device."""
+        """Pass the feedback to the device."""
         self._human.tell(feedback)
 
 
@@ -444,18 +445,18 @@ class InputFilterConfig:
     """Bounds on the acceleration of the end effector."""
 
     linear: float = 1.5
-    """[m/s^2]: from rest to a gizmo's full speed, and back, in a sixth of a second."""
+    """Linear bound [m/s^2]: from rest to a gizmo's full speed in a sixth of a second."""
     angular: float = 5.0
-    """[rad/s^2]"""
+    """Angular bound [rad/s^2]."""
 
     __post_init__ = check_positive
 
 
 class InputFilter(Human):
-    """Passes human input on with the acceleration of the end effector bounded.
+    """Bounds the acceleration of the end effector in human input.
 
-    A key that is pressed asks for full speed at once, and a gizmo that is released for none:
-    unfiltered, the arm would jerk, and so would what is learned from it.
+    A pressed key requests full speed at once, and a released gizmo none: without the filter,
+    the arm would jerk, and so would motions learned from it.
     """
 
     def __init__(self, human: Human, config: InputFilterConfig | None = None):
@@ -470,7 +471,7 @@ class InputFilter(Human):
         self._twist, self._time = np.zeros(6), np.inf
 
     def read(self, state: ArmState) -> HumanInput:
-        """The filtered input now."""
+        """Present input, filtered."""
         human_input, config = self._human.read(state), self._config
         dt = max(state.time - self._time, 0.0)
         change = human_input.twist - self._twist
@@ -481,5 +482,5 @@ class InputFilter(Human):
         return replace(human_input, twist=self._twist)
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell the person whose input it is."""
+        """Pass the feedback to the source."""
         self._human.tell(feedback)

@@ -34,14 +34,14 @@ class HeldGizmo:
     joint: int | None
     """Joint that moves the link held, counted from 1; None: the end effector is held."""
     held_at: Float[np.ndarray, "3"]
-    """Point of the link that is held, in the frame of the link; of the end effector: that point
-    less the tool centre point, in the base frame [m]."""
+    """Held point, in the frame of the link; for the end effector: offset of the held point from
+    the tool centre point, along the base axes [m]."""
     pointer: Float[np.ndarray, "3"]
     """Position to which the gizmo has been dragged, in the base frame [m]."""
 
 
 Key = tuple[Hashable, str]
-"""Holder, which tells two clients apart, and name of the gizmo held."""
+"""Holder, which distinguishes clients, and name of the held gizmo."""
 
 
 class HeldGizmos:
@@ -60,7 +60,7 @@ class HeldGizmos:
         """Start without held gizmos.
 
         Args:
-            changed: Callback for gizmos taken, dragged or released.
+            changed: Called when a gizmo is taken, dragged or released.
             links: Present frames of the arm (see `SerialChain.link_poses`); None before the arm
                 is known.
         """
@@ -80,9 +80,9 @@ class HeldGizmos:
 
         Args:
             key: Holder and gizmo.
-            held: Place at which it is held; None: it is only turned.
-            turned_from: Present orientation of its rings, whose rotation is added (wxyz); None:
-                it has none.
+            held: Joint and point held; None: the gizmo is only turned.
+            turned_from: Present orientation of its rings, from which their rotation counts
+                (wxyz); None: no rings are held.
         """
         with self._lock:
             if held is not None:
@@ -117,7 +117,7 @@ class HeldGizmos:
         pointer: Float[np.ndarray, "3"],
         orientation: Float[np.ndarray, "4"] | None = None,
     ) -> None:
-        """Drag and turn a gizmo on; one that is not held (any more) stays where it is."""
+        """Drag and turn a held gizmo; a gizmo that is not held (any more) stays in place."""
         with self._lock:
             if (held := self._held.get(key)) is not None:
                 self._held[key] = replace(held, pointer=pointer)
@@ -129,9 +129,9 @@ class HeldGizmos:
         self._changed()
 
     def release(self, holder: Hashable = None, name: str | None = None) -> None:
-        """Let go of a gizmo: one by its name, or all of a holder, or all that are held.
+        """Release one gizmo of a holder, all gizmos of a holder, or all that are held.
 
-        A connection that comes back has to take its gizmo anew.
+        After a lost connection has returned, its gizmo must be taken again.
         """
 
         def chosen(key: Key) -> bool:
@@ -147,7 +147,7 @@ class HeldGizmos:
             self._changed()
 
     def held(self) -> dict[Key, HeldGizmo]:
-        """All of them."""
+        """All held gizmos."""
         with self._lock:
             return dict(self._held)
 
@@ -157,7 +157,7 @@ class HeldGizmos:
         return self._turning is not None
 
     def clear_turn(self) -> None:
-        """Take the rotation back."""
+        """Remove the added rotation."""
         with self._lock:
             self._turn = self._turn_before = _NO_TURN
 
@@ -181,9 +181,9 @@ _AT_REST = np.array([1.0, 0.0, 0.0, 0.0])  # unit quaternion (wxyz)
 
 
 class HeadsetHands:
-    """Turns what two hands hold into held gizmos, by the rules of the mouse.
+    """Converts what two hands hold into held gizmos, with the same rules as for the mouse.
 
-    A message names all that is held; what an earlier one named and this one does not is let go.
+    A message lists everything that is held; whatever is no longer listed is released.
 
     Attributes:
         tracked: Tracked hands that are visible now, by name.
@@ -197,15 +197,15 @@ class HeadsetHands:
             guides: True if the end effector can be held.
         """
         self._held, self._guides = held, guides
-        # None: the next message tells what is held already, and moves nothing.
+        # None: the next message only states what is held already, and moves nothing.
         self._grips: dict[str, Grip] | None = None
         self.tracked: Mapping[str, TrackedHand] = {}
 
     def hear(self, hands: Hands) -> None:
-        """Take a message over.
+        """Handle a message.
 
         Raises:
-            MessageError: It holds a joint that the arm does not have.
+            MessageError: The message names a joint that the arm does not have.
         """
         self.tracked = {seen.hand: seen for seen in hands.tracked}
         links = self._held.links()
@@ -238,11 +238,11 @@ class HeadsetHands:
 
 
 class PageHuman(Human):
-    """Hands what a person asks for from the page's thread to the loop, without a lock.
+    """Passes a person's input from the page's thread to the control loop, without a lock.
 
-    `read` costs the loop about a microsecond: references are exchanged, nothing is computed.
-    What has been posted holds for a moment only (the dead man's switch): where the page falls
-    silent, the person asks for no motion.
+    `read` takes about a microsecond: it exchanges references and computes nothing. Posted
+    input expires after `holds_for` (the dead man's switch): if the page falls silent, no motion
+    is requested.
 
     Attributes:
         state: The newest reading of the arm; None before the first.
@@ -271,15 +271,15 @@ class PageHuman(Human):
         self.feedback = Feedback()
 
     def post(self, asked: HumanInput) -> None:
-        """Renew what the person asks for; its requests are left to `request`."""
+        """Renew the person's input; requests are passed to `request` instead."""
         self._posted = (asked, self._clock() + self._holds_for)
 
     def request(self, request: Request) -> None:
-        """Ask once for something other than motion."""
+        """Make a request, which the next `read` returns once."""
         self._requests.append(request)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Current input of the person; what was drawn stays in force after the rest."""
+        """Present input of the person. Region, target and turn remain when the rest expires."""
         self.state = state
         asked, deadline = self._posted
         if self._clock() > deadline or not self._present():
@@ -290,13 +290,13 @@ class PageHuman(Human):
         return replace(asked, requests=requests)
 
     def tell(self, feedback: Feedback) -> None:
-        """Hand over what the arm tells, for the page's thread to show."""
+        """Keep the feedback of the arm, for the page's thread to show."""
         self.feedback = feedback
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GizmoCommand:
-    """Null-space input and motion, and the arrows that show where they come from."""
+    """Null-space input and end-effector motion, and the arrows that show the pulls."""
 
     nullspace_input: Float[np.ndarray, " joints"]
     """d [N m]."""

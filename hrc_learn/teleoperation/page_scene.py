@@ -1,5 +1,5 @@
-"""The page's 3D scene: the arm, its virtual twin and the furniture as meshes, and the mouse on
-them: links, knobs and the end effector's gizmo.
+"""The page's 3D scene: meshes of the arm, its virtual twin and the furniture, and the
+dragging of links, knobs and the end effector's gizmo by the mouse.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 if TYPE_CHECKING:
     from viser import ViserServer as ViserServer
 else:
-    ViserServer = Any  # for what checks annotations while the program runs
+    ViserServer = Any  # for type checks at run time
 
 
 def in_loop[Event](callback: Callable[[Event], object]) -> Callable[[Event], Any]:
-    """A callback that viser calls in its event loop, not in a thread of its pool: its handles
-    may be changed in that loop only.
+    """Make viser call a callback in its event loop rather than in a pool thread: only in that
+    loop may viser's handles be changed.
     """
 
     async def called(event: Event) -> None:
@@ -37,17 +37,17 @@ def in_loop[Event](callback: Callable[[Event], object]) -> Callable[[Event], Any
 
 
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-# An edge goes up along one axis, from -1 to 1.
+# An edge runs along one axis, from -1 to 1.
 _EDGES = np.array([(a, b) for a in _CORNERS for b in _CORNERS if sorted(b - a) == [0, 0, 2]])
 
 
 def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 3"]:
-    """Both ends of each edge of a box about the origin [m]."""
+    """End points of the edges of a box that is centred at the origin [m]."""
     return _EDGES * np.array(half_size)
 
 
 _KNOBS = (2, 4, 6)
-"""Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
+"""Joints marked by a knob: shoulder, elbow, wrist. Links can be held, too."""
 
 
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
@@ -63,10 +63,10 @@ def _held(body: Body) -> bool:
 
 
 class PageScene:
-    """Bodies where they are, once as the arm and once as its twin, and the mouse on them.
+    """Draws the bodies at their poses, as the arm and as its twin, and reacts to the mouse.
 
-    Callbacks are coroutines: the browser's messages then come in their order, and in viser's
-    event loop. Handles of viser send a property only if it has changed.
+    Callbacks are coroutines, so that viser calls them in its event loop and in the order of the
+    browser's messages. Handles of viser send a property only if it has changed.
     """
 
     def __init__(
@@ -87,11 +87,11 @@ class PageScene:
             boxes: Fixed boxes.
             held: Record of held gizmos.
             guides: True if the end effector can be held and has a gizmo.
-            turns: True if its gizmo has rings even where it cannot be held.
+            turns: True if the end effector has a gizmo with rings even if it cannot be held.
         """
         self._scene, self._held, self._guides = server.scene, held, guides
         self._twin = self._scene.add_frame("/twin", position=_TWIN_AT, show_axes=False)
-        # Objects that are carried have no twin: what matters is what can be held.
+        # Carried objects have no twin, as they cannot be held.
         self._frames = [
             [self._draw(parent, body) for parent in _PARENTS if not parent or _held(body)]
             for body in bodies
@@ -136,7 +136,7 @@ class PageScene:
         orientations: Float[np.ndarray, "bodies 4"],
         links: Pose,
     ) -> None:
-        """Put everything where it is.
+        """Update all poses.
 
         Args:
             positions: Positions of the bodies [m].
@@ -160,7 +160,7 @@ class PageScene:
         self._twin.visible = visible
 
     def show_region(self, region: DrawnRegion | None) -> None:
-        """Show the region to which a controller takes the end effector; None: there is none."""
+        """Show the region into which a controller moves the end effector; None: no region."""
         self._region.visible = region is not None
         if region is not None:
             self._region.points = box_edges(region.half_size) + np.array(region.centre)
@@ -175,7 +175,7 @@ class PageScene:
         colour: str = PERSON,
         held: Collection[int | None] = (),
     ) -> None:
-        """Show where from and where to the arm is pulled, and how far it follows.
+        """Show the pulls as arrows; the colour shows how far the arm follows.
 
         Args:
             arrows: Arrows from the points held to the pointers, in the base frame [m].
@@ -251,7 +251,7 @@ class PageScene:
 
     def _surroundings(self, server: ViserServer) -> None:
         self._scene.world_axes.visible = False
-        # Shadows cost a machine without a GPU half its frames, an environment map 40 %.
+        # Without a GPU, shadows halve the frame rate and an environment map reduces it by 40 %.
         self._scene.configure_default_lights(cast_shadow=False)
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere(
@@ -284,14 +284,14 @@ class PageScene:
 
 
 _CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)
-_ASPECT = 1.2  # of a view at which cabinet and twin are both in it
+_ASPECT = 1.2  # smallest aspect ratio at which both cabinet and twin are in view
 
 
 async def _step_back(client: Any) -> None:
-    """Let a camera stand back whose view is narrow, as a phone's is: what is seen stays."""
+    """Move the camera back if its view is narrow, as on a phone, so that it sees the same."""
     aspect = client.camera.aspect
     if aspect < _ASPECT:
         look_at = np.array(_LOOK_AT)
-        # Its position takes along what it looks at.
+        # Setting the position also shifts the point that it looks at.
         client.camera.position = look_at + _ASPECT / aspect * (np.array(_CAMERA) - look_at)
         client.camera.look_at = _LOOK_AT

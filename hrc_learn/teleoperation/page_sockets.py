@@ -1,9 +1,9 @@
-"""Clients of the page: control by one at a time, and the sockets of each.
+"""Clients of the page: one of them has control, and each has two sockets.
 
-A client has a session, and a view, which viser serves.
+The sockets are a session and a view, which viser serves.
 
 viser accepts any client that reaches its port and trusts what it receives. Its port therefore
-asks for a secret, and messages reach it through the gate alone.
+requires a secret, and messages reach it only through the gate.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from hrc_learn.teleoperation.page_scene import ViserServer
 
 _STATUS_EVERY = 0.1  # [s]
 _SCENE_EVERY = {"leads": 1 / 60, "watches": 1 / 20}
-"""Time between two scenes for the leader, and for each of many who watch [s]."""
+"""Period of scenes for the controlling client, and for each of many that watch [s]."""
 _SECRET_HEADER = "X-Page-Secret"
 
 _MOST_IDLE = 10.0
 """Idle time after which a waiting client gets control [s]."""
 _REMEMBERED = 3.0
-"""Time for which the cause of a slow browser is shown [s], enough to read a sentence."""
+"""Time for which the page shows why a browser is slow [s], enough to read a sentence."""
 
 
 @dataclass
@@ -80,7 +80,7 @@ class Control:
                 motion [s].
             timeout: Time without a sign of life after which the client releases what it holds,
                 and an unresponsive page counts as gone [s].
-            changed: Callback for each change of the leader.
+            changed: Called whenever another client gets control.
             clock: Monotonic clock [s].
 
         Raises:
@@ -110,8 +110,8 @@ class Control:
         with self._lock:
             self._clients.pop(client, None)
             if client == self._leader:
-                # The only client left leads, as the first to come does: a page that is loaded
-                # anew may come before the old one has left.
+                # The only client left gets control, like the first one to join: a reloaded page
+                # may join before its old session has left.
                 able = [name for name, one in self._clients.items() if one.may_lead]
                 self._give(self._waiting() or (able[0] if len(able) == 1 else None))
 
@@ -120,8 +120,8 @@ class Control:
 
         Args:
             client: Client that gives it.
-            lag: Time since its page last responded [s]; the worker may run on when the page
-                hangs.
+            lag: Time since its page last responded [s]: the worker gives signs of life even if
+                the page hangs.
         """
         with self._lock:
             if (one := self._clients.get(client)) is None:
@@ -149,13 +149,13 @@ class Control:
             return True
 
     def keep(self) -> None:
-        """Note that the leader holds something, which they may without saying so."""
+        """Note that the controlling client holds something: a pointer at rest sends nothing."""
         with self._lock:
             self._acted = self._clock()
 
     def ask(self, client: str) -> None:
-        """Request control. A client gets it at once if it is free, else when the holder hands
-        over.
+        """Request control. The client gets it at once if it is free, else when the controlling
+        client hands over or is idle.
         """
         with self._lock:
             one = self._clients.get(client)
@@ -271,7 +271,7 @@ class PageSockets:
         """
         Args:
             control: Control of the arm.
-            heard: Receives what the controlling client asks for.
+            heard: Receives the messages of the controlling client.
             fits: True if a control of viser's panel accepts a value.
             status: Status sent to all clients ten times a second.
             viser_port: Port of viser's socket on this machine.
@@ -283,7 +283,7 @@ class PageSockets:
         self.scene: msgspec.Raw | None = None
 
     async def session(self, connection: ServerConnection, visitor: Visitor) -> None:
-        """Serve our own clients: signs of life, control requests and hands in, status out."""
+        """Serve a session: receive signs of life, requests and hands, send status and scene."""
         self._control.join(visitor.client, may_lead=visitor.right == "act")
         wants_scene = False
 
@@ -325,13 +325,13 @@ class PageSockets:
             case messages.Lead():
                 self._control.hand_over(client)
             case _:
-                # A watching client may have had control when it sent this: no error.
+                # Not an error: a watching client may have had control when it sent this.
                 idle = isinstance(message, messages.Hands) and not message.grips
                 if self._control.act(client, idle=idle):
                     self._heard(message)
 
     async def view(self, connection: ServerConnection, visitor: Visitor) -> None:
-        """Pass on the messages between viser and its page that fit."""
+        """Relay messages between viser and its page, after checking those of the page."""
         from websockets.asyncio.client import connect
         from websockets.typing import Subprotocol
 
@@ -361,14 +361,14 @@ class PageSockets:
 
 
 def page_contents(viser: Path) -> dict[str, Content]:
-    """The page of viser with our part of it.
+    """The page of viser, with our scripts.
 
     Args:
-        viser: Folder of the package.
+        viser: Folder of the package viser.
     """
     page = (viser / "client" / "build" / "index.html").read_bytes()
-    # Our scripts come first: they keep the secret, say which socket viser's client opens, and
-    # how it draws.
+    # Our scripts come first: they keep the secret, and determine which socket viser's client
+    # opens and how it draws.
     scripts = (b"door.js", b"session.js", b"prompt.js")
     ours = b"".join(b'<script src="/static/%s"></script>' % name for name in scripts)
     page = page.replace(b"<head>", b"<head>" + ours, 1)
@@ -377,19 +377,19 @@ def page_contents(viser: Path) -> dict[str, Content]:
 
 
 def guarded_viser() -> tuple[ViserServer, str]:
-    """Start a server of viser whose port asks for a secret, and return both."""
+    """Start a server of viser whose port requires a secret; return server and secret."""
     import viser
 
     secret = secrets.token_urlsafe(18)
-    # viser prints its own address, which is of no use to people.
+    # viser prints its own address, which is of no use here.
     with _guarded_sockets(secret), contextlib.redirect_stdout(io.StringIO()):
         return viser.ViserServer("127.0.0.1", 0, verbose=False), secret
 
 
 @contextmanager
 def _guarded_sockets(secret: str):
-    """Make servers of `websockets` created within this block ask for a secret; viser has no
-    hook for that.
+    """Make servers of `websockets` that start within this block require a secret; viser has
+    no hook for that.
     """
     import websockets.asyncio.server as server
 
