@@ -32,13 +32,13 @@ from hrc_learn.teleoperation.gate.gate import Visitor, incoming
 from hrc_learn.teleoperation.gate.messages import CurationMessage, Decide, curation_message
 
 _BLOCK = 32
-"""Images sent at once: a second of a video, few enough to be shown soon."""
+"""Number of images sent at once: about a second of video, few enough to be shown soon."""
 _TALLEST = 360
 """Images are scaled down to this height [px]."""
 _MOST_LINES = 12
-"""Largest number of curves of a column that is not one of the known quantities."""
+"""Largest number of curves of a column that is drawn although its meaning is unknown."""
 _MOST_POINTS = 2000
-"""Points of a curve; of longer ones the extremes of every stretch are sent."""
+"""Largest number of points of a curve; longer ones are reduced to extremes of sections."""
 _CLIENT = Path(__file__).parent / "curation_client"
 
 
@@ -97,10 +97,10 @@ class CurationPage:
         self._gate.wait()
 
     def answer(self, path: str) -> Content | None:
-        """Content at a path; None: there is nothing.
+        """Content at a path; None: there is no content.
 
         Raises:
-            RefusedError: It cannot be read.
+            RefusedError: The content cannot be read.
         """
         try:
             match path.strip("/").split("/"):
@@ -151,11 +151,11 @@ class CurationPage:
             return {"decisions": self.decisions, "written": written}
 
     def curves(self, episode: int) -> dict[str, Any]:
-        """All that moves in an episode, over time."""
+        """Curves of all quantities of an episode over time."""
         source = open_demos(self.ranking.path, [episode])
         (demo,) = source
         charts = [*demonstration_charts(demo, source.units)]
-        for key, values in demo.extra.items():  # columns without a meaning, by their own names
+        for key, values in demo.extra.items():  # columns of unknown meaning, by their names
             if 0 < values.shape[1] <= _MOST_LINES:
                 names = map(self._features[key].component, range(values.shape[1]))
                 charts.append(Chart(key, key, "", dict(zip(names, values.T, strict=True))))
@@ -175,7 +175,7 @@ class CurationPage:
         }
 
     def images(self, episode: int, camera: int, first: int) -> Content:
-        """A block of images: how many, the length of each in bytes, and then they."""
+        """A block of images: their number, the length of each in bytes, then the images."""
         key = self._images.cameras[camera]
         if episode not in self._lengths or not 0 <= first < self._lengths[episode]:
             raise RefusedError(404, "There is no such image.")
@@ -186,7 +186,7 @@ class CurationPage:
         return Content(body=head + b"".join(found), kind="application/octet-stream")
 
     async def _session(self, connection: Any, visitor: Visitor) -> None:
-        """Take decisions, and answer each with the state or the reason of its refusal."""
+        """Receive messages, and answer each with the new state or the reason of a refusal."""
         async for _, message in incoming(connection, curation_message):
             try:
                 await asyncio.to_thread(self.act, message)
@@ -196,10 +196,10 @@ class CurationPage:
             await connection.send(json_text(told, indent=False))
 
     def act(self, message: CurationMessage) -> None:
-        """Take a decision, or begin to write the cleaned dataset.
+        """Apply a decision, or begin to write the cleaned dataset.
 
         Raises:
-            ValueError: It makes no sense.
+            ValueError: The decision is invalid, or the dataset is already being written.
         """
         with self._lock:
             if isinstance(message, Decide):
@@ -237,8 +237,8 @@ def _json(content: Any) -> Content:
 
 
 def _points(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and values of a curve; of a long one its extremes within every stretch, so that no
-    spike is lost.
+    """Frames and values of a curve; a long curve is reduced to the extremes of its sections, so
+    that no spike is lost.
     """
     frames = np.arange(len(values))
     if len(values) <= _MOST_POINTS:

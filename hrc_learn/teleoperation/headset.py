@@ -34,27 +34,29 @@ PEDESTAL = Box(
 """Pedestal of the arm."""
 
 _TRIANGLES = 1500
-"""Most triangles for each colour of a body. The Panda then has 29,000 rather than 135,000, and
-a browser without a graphics processor draws it in half the time.
+"""Largest number of triangles per colour of a body. The Panda then has 29,000 rather than
+135,000, and a browser without a graphics processor draws it in half the time.
 """
 _AGGRESSION = 5
-"""Aggression of fast-simplification, 0 to 10. At the triangles above, 99 % of the Panda's
-surfaces stay within 1 mm, sockets of cables within 8 mm; at 7, its default, within 3 mm.
+"""Aggression of fast-simplification, 0 to 10. With `_TRIANGLES`, 99 % of the Panda's
+surfaces stay within 1 mm, and cable sockets within 8 mm. With its default of 7, 99 % stay
+within 3 mm.
 """
 
 _OFF = 0.002
-"""Farthest that simplifying may move a side of the box around a mesh [m]. Of the UR5e and the
-Sawyer it would take away whole parts: such meshes stay as they are."""
+"""Largest change of a mesh's bounding box by simplification [m]. In the UR5e and the Sawyer, it
+would remove whole parts: such meshes stay as they are."""
 
 
 CLIENT = Path(__file__).parent / "xr_client"
-"""Sources of the client for headsets and phones; what is built of them lies in `built`."""
+"""Sources of the client for headsets and phones; the built client is in `built`."""
 BUILD = "make xr"
-"""Builds it."""
+"""Command that builds the client."""
 
 
 def held_joint(body: Body) -> int | Literal["nothing"] | None:
-    """Joint that moves a link, from 1; None for bodies of the end effector.
+    """Joint that moves a link, counted from 1; None for bodies of the end effector, "nothing"
+    for bodies that cannot be held.
 
     Args:
         body: Body, identified by its name.
@@ -132,9 +134,9 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
 
 
 def _held(body: Body) -> dict[str, Any]:
-    """Name, joint and capsules of a body, for picking it."""
+    """Name and joint of a body, and capsules for picking it."""
     capsules = [[*c.start, *c.end, c.radius] for c in body.capsules]
-    # A box is held as the ball around it.
+    # A box is picked by its bounding sphere.
     capsules += [
         [*box.centre, *box.centre, float(np.linalg.norm(box.half_size))] for box in body.boxes
     ]
@@ -142,7 +144,7 @@ def _held(body: Body) -> dict[str, Any]:
 
 
 def capsule_mesh(capsule: Capsule, segments: int = 20) -> Trimesh:
-    """A cylinder with round ends, of so many segments around and along it."""
+    """Mesh of a capsule with the given number of segments around and along it."""
     import trimesh
 
     start, end = np.array(capsule.start), np.array(capsule.end)
@@ -157,7 +159,7 @@ def capsule_mesh(capsule: Capsule, segments: int = 20) -> Trimesh:
 
 
 def box_mesh(box: Box) -> Trimesh:
-    """A box along the axes of its body; every face has corners of its own, for sharp edges."""
+    """Mesh of a box along its body's axes; each face has its own vertices, for sharp edges."""
     import trimesh
 
     mesh = trimesh.creation.box(extents=2 * np.array(box.half_size))
@@ -167,8 +169,8 @@ def box_mesh(box: Box) -> Trimesh:
 
 
 def body_meshes(body: Body) -> dict[Colour, Trimesh]:
-    """All that a body looks like, one mesh for each colour: its own meshes, simplified, and the
-    boxes with a name, or else its capsules and boxes in the colour of the first.
+    """Meshes that show a body, one per colour: its own meshes, simplified, and its named boxes.
+    A body without meshes is shown by its capsules and boxes, in the colour of the first.
     """
     import trimesh
 
@@ -179,7 +181,7 @@ def body_meshes(body: Body) -> dict[Colour, Trimesh]:
     for file in body.meshes:
         for part in (part.placed(file) for part in read_mesh(file.path)):
             assert part.colour is not None  # a placed part has one
-            # Corners are not merged: edges that have corners of their own stay sharp.
+            # Vertices are not merged, so that sharp edges stay sharp.
             mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
             parts.setdefault(part.colour, []).append(mesh)
     for box in body.boxes:
@@ -194,14 +196,14 @@ def body_shape(body: Body) -> Trimesh:
 
 
 def simplified(mesh: Trimesh) -> Trimesh:
-    """The same surface, nearly, of as few triangles as a browser draws quickly.
+    """Approximate a surface by at most `_TRIANGLES` triangles, which browsers draw quickly.
 
-    A mesh that would lose whole parts comes back as it is.
+    A mesh that would lose whole parts is returned unchanged.
     """
     if len(mesh.faces) <= _TRIANGLES:
         return mesh
     shape = mesh.copy()
-    shape.merge_vertices(merge_norm=True)  # or edges with two normals would tear
+    shape.merge_vertices(merge_norm=True)  # otherwise, edges with two normals would tear
     shape.update_faces(shape.nondegenerate_faces())
     few = shape.simplify_quadric_decimation(face_count=_TRIANGLES, aggression=_AGGRESSION)
     if np.abs(few.bounds - shape.bounds).max() > _OFF:

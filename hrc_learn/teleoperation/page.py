@@ -1,4 +1,4 @@
-"""The page in a browser from which a person guides the arm: a stand-in for an AR headset."""
+"""The browser page from which a person guides the arm: a substitute for an AR headset."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class PageConfig(AddressConfig):
-    """The page's own settings."""
+    """Settings of the page."""
 
     forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
     """Gains and bounds of gizmos."""
@@ -83,14 +83,14 @@ class PageConfig(AddressConfig):
             )
 
 
-# Between touched points: 1 cm off at 10 cm turns the arm by 6 degrees [m].
+# Smallest extent of the touched points [m]: 1 cm off at 10 cm turns the arm by 6 degrees.
 _APART = 0.1
 _PERIOD = 0.04
-"""Time between two looks at the arm, at which efforts are computed anew [s]."""
-_PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
+"""Period of refreshes, which compute the efforts and draw the scene anew [s]."""
+_PANEL_EVERY = 5  # refreshes of the scene per refresh of the panel: text may be slower
 _MOST_FAILURES = 25
-"""Refreshes in a row that may fail before the page ends: one second of them. Each failure asks
-for no motion, as nothing is posted."""
+"""Number of successive failed refreshes after which the page ends: one second. A failed refresh
+posts no input, so it requests no motion."""
 
 _logger = logging.getLogger("hrc_learn.page")
 
@@ -105,8 +105,9 @@ class Page:
                 page.place()
                 page.show(status)
 
-    The control loop pays for `human.read`, `place` and `show` only, which exchange references.
-    viser's objects are changed in viser's own event loop only, as its queues break otherwise.
+    The control loop spends time only in `human.read`, `place` and `show`, which exchange
+    references.
+    viser's objects are changed only in viser's own event loop, as its queues break otherwise.
 
     Attributes:
         human: Combined input of the people at the page.
@@ -131,7 +132,7 @@ class Page:
         """Serve the page; it follows the arm within the `with` block.
 
         Args:
-            world: World to show. "link1", "link2", ... of its bodies can be held; "hand",
+            world: World to show. Its bodies "link1", "link2", ... can be held; "link7", "hand",
                 "finger_left" and "finger_right" move the end effector.
             config: Settings of the page.
             boxes: Fixed boxes beyond those of the world.
@@ -143,7 +144,7 @@ class Page:
         """
         import viser
 
-        # With MuJoCo, which nothing else of the page needs.
+        # Imports MuJoCo, which the rest of the page does not need.
         from hrc_learn.sim import MovingBodies
 
         self._config = config = config or PageConfig()
@@ -214,7 +215,7 @@ class Page:
             raise self._error
 
     def _stop_viewer(self) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):  # suppresses its banner
+        with contextlib.redirect_stdout(io.StringIO()):  # suppresses viser's banner
             self._server.stop()
 
     @property
@@ -237,11 +238,11 @@ class Page:
         return self._error is None
 
     def place(self, world: World | None = None) -> None:
-        """Show where the bodies are now; called after each step.
+        """Show the present poses of the bodies; called after each step.
 
         Args:
-            world: World with the same bodies that has taken the place of the last one; None: it
-                is the same.
+            world: World with the same bodies, which replaces the last one; None: the same
+                world.
         """
         from hrc_learn.sim import MovingBodies
 
@@ -250,7 +251,7 @@ class Page:
         self._poses = self._bodies.poses()
 
     def show(self, status: PageStatus) -> None:
-        """Tell how the session stands."""
+        """Show the status of the session."""
         self._status = status
 
     def _links(self) -> Pose | None:
@@ -260,7 +261,7 @@ class Page:
         return self._chain.link_poses(torch.from_numpy(state.joint_position))
 
     def _guarded(self) -> None:
-        """Follow the arm, and renew what is asked of it: at once when hands have moved."""
+        """Refresh input and scene, periodically and at once when hands have moved."""
         due, ticks, failures = 0.0, 0, 0
         while not self._closing.is_set():
             self._wake.wait(max(due - time.monotonic(), 0.0))
@@ -276,13 +277,13 @@ class Page:
             except Exception as error:
                 failures, due = failures + 1, time.monotonic() + _PERIOD
                 _logger.exception("the page could not follow the arm")
-                if failures >= _MOST_FAILURES:  # handed over to the thread that closes
+                if failures >= _MOST_FAILURES:  # raised by the thread that closes the page
                     self._error = error
                     return
 
     def _refresh(self) -> GizmoCommand | None:
-        """Renew the input and the scene of clients that draw it themselves; None before the arm
-        is known.
+        """Renew the input, and the scene for clients that draw it themselves; None before the
+        first reading of the arm.
         """
         state, links = self.human.state, self._links()
         if state is None or links is None:
@@ -303,10 +304,10 @@ class Page:
         return command
 
     def _draw(self, command: GizmoCommand, *, panel: bool) -> None:
-        """Have viser's event loop draw; a picture that is late is left out.
+        """Let viser's event loop draw, unless it is still drawing the last picture.
 
         Raises:
-            Exception: The last picture failed.
+            Exception: Drawing the last picture failed.
         """
         if self._drawing is not None:
             if not self._drawing.done():
@@ -329,9 +330,9 @@ class Page:
         self._drawing = asyncio.run_coroutine_threadsafe(draw(), loop)
 
     def _command(self, state: ArmState) -> GizmoCommand:
-        """Renew what is asked of the arm.
+        """Renew the person's input.
 
-        The server notices a dropped connection, such as an unplugged cable, much later, and a
+        The server notices a lost connection, as from an unplugged cable, much later, and a
         pointer at rest sends nothing. Signs of life are therefore checked separately.
         """
         control, panel, held = self.control, self._panel, self._held_gizmos
@@ -404,11 +405,11 @@ class Page:
 
 
 def slow_words(silence: float, lag: float, config: PageConfig) -> str:
-    """Why a drag is not followed; empty if it is.
+    """Reason why a drag is not followed; empty if it is.
 
     Args:
-        silence: Time for which nothing was heard of the leader [s].
-        lag: Time for which its page did not react [s].
+        silence: Time without a sign of life from the controlling client [s].
+        lag: Time for which its page did not respond [s].
         config: Settings of the page.
     """
     if lag > config.timeout / 2:
@@ -419,7 +420,7 @@ def slow_words(silence: float, lag: float, config: PageConfig) -> str:
         )
     if silence > config.silence:
         return (
-            f"The link is slow: nothing was heard of this browser for {silence:.2f} s, "
+            f"The link is slow: nothing was heard from this browser for {silence:.2f} s, "
             f"and beyond {config.silence:.2f} s the arm waits."
         )
     return ""

@@ -26,7 +26,7 @@ from hrc_learn.viz.report import page_templates
 
 @dataclass(frozen=True, kw_only=True)
 class PageStatus(RecorderStatus):
-    """Session status shown on the page; `seconds` is the time at work of an autonomous arm."""
+    """Session status shown on the page; `seconds` is the working time of an autonomous arm."""
 
     title: str = ""
     """Name of the guided arm."""
@@ -35,11 +35,11 @@ class PageStatus(RecorderStatus):
     interventions: Mapping[str, int] = field(default_factory=dict)
     """Steps in which each kind of intervention of the safety filter was needed."""
     contacts: int = 0
-    """Touches of the surroundings."""
+    """Number of contacts with the surroundings."""
     region: DrawnRegion | None = None
-    """Region to which a controller takes the end effector; None: there is none."""
+    """Region into which a controller moves the end effector; None: no region."""
     plan: Float[np.ndarray, "points 3"] | None = None
-    """Path that the end effector is about to take [m]; None: it has none."""
+    """Path that the end effector is about to follow [m]; None: no path."""
 
 
 @cache
@@ -49,13 +49,13 @@ def panel_texts() -> Any:
     return templates.get_template("panel.html", globals=vars(palette)).module
 
 
-# Smallest contact force shown [N]: simulated joint friction feels like 17 N. And the smallest
-# change of a gripper's opening that is a slip rather than noise [m].
+# Smallest contact force shown [N]: simulated joint friction feels like 17 N. Smallest change of
+# a gripper's opening that is a slip rather than noise [m].
 _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
 
 
 def felt_words(feedback: Feedback) -> list[str]:
-    """Contact felt by the arm, as text.
+    """Contact, joint limits, slip and the nearest person, as text.
 
     Args:
         feedback: Feedback of the arm.
@@ -76,7 +76,7 @@ def felt_words(feedback: Feedback) -> list[str]:
 
 
 LONGEST_TEXT = 200
-"""Characters that a text typed on the page may have."""
+"""Largest number of characters of a text typed on the page."""
 
 _ICONS: dict[str, Any] = {"start": "player-record", "stop": "player-stop"}
 _KEYS = {"i": "away", "k": "back", "j": "left", "l": "right", "u": "up", "o": "down"}
@@ -86,9 +86,9 @@ class Panel:
     """All controls, and the status above them.
 
     Attributes:
-        gripper: Opening the person wants [m]; None until asked for.
+        gripper: Opening requested by the person [m]; None: not yet requested.
         keys: Keys that are held to move the end effector.
-        editor: Region and target that people draw; None: they cannot.
+        editor: Region and target that people draw; None: they cannot draw.
     """
 
     def __init__(
@@ -110,9 +110,9 @@ class Panel:
             server: Server of the page.
             boxes: Furniture that targets may be marked on.
             forces: Initial gains of gizmos.
-            request: Receives what buttons ask for.
+            request: Receives the requests of buttons.
             scene: Scene, whose twin and gizmo the panel sets.
-            held: Gizmos, and the rotation added by the rings of the end effector's.
+            held: Held gizmos, and the rotation added by the rings of the end effector's gizmo.
             task: Description of the task.
             guides: True if the person guides the end effector and records.
             draws: True if people draw regions, mark targets and turn the end effector.
@@ -171,7 +171,7 @@ class Panel:
         fine = self._gui.add_checkbox(
             "Fine turn",
             False,
-            hint="Rings turn the end effector on top of the rule: down in front of the robot, "
+            hint="Rings turn the end effector away from the rule: down in front of the robot, "
             "level at the end of its reach.",
         )
         fine.on_update(in_loop(lambda _: scene.let_turn(fine.value)))
@@ -196,7 +196,7 @@ class Panel:
         return "" if self._task is None else self._task.value
 
     def hear(self, message: messages.Message) -> None:
-        """Do what a headset asks, as the panel's own controls would."""
+        """Handle a message of a headset, like the panel's own controls."""
         match message:
             case messages.Gripper(width=width):
                 self.gripper = width
@@ -208,7 +208,7 @@ class Panel:
             case messages.Target(point=point) if self.editor:
                 self.editor.mark(None if point is None else np.array(point))
             case _:
-                pass  # what this page does not offer
+                pass  # this page does not offer it
 
     @property
     def forces(self) -> InteractionForceConfig:
@@ -242,7 +242,7 @@ class Panel:
         Args:
             status: Status of the session.
             feedback: Feedback of the arm.
-            nullspace_input: d that is asked for now [N m].
+            nullspace_input: d requested now [N m].
             people: Browsers that show the page.
         """
         texts = panel_texts()
@@ -251,7 +251,7 @@ class Panel:
             self._next = "stop" if status.state == "recording" else "start"
             self._switch.label = self._next.capitalize()
             self._switch.icon = _ICONS[self._next]
-            # Starting over would throw away what waits to be saved.
+            # Starting over would discard the demonstration that waits to be saved.
             self._switch.disabled = status.state == "stopped"
             if self._keep is not None:
                 self._keep.visible = status.state == "stopped"

@@ -23,10 +23,10 @@ def view_ray(
     field_of_view: float,
     aspect: float,
 ) -> Float[np.ndarray, "3"]:
-    """Direction in which a camera sees a place on its screen, as a unit vector.
+    """Unit vector from a camera through a point of its screen.
 
     Args:
-        screen: Place, from (0, 0) at the upper left to (1, 1) at the lower right.
+        screen: Point of the screen, from (0, 0) at the upper left to (1, 1) at the lower right.
         orientation: Orientation of the camera (wxyz): x right, y down, z into the scene.
         field_of_view: Vertical field of view [rad].
         aspect: Width over height of the screen.
@@ -64,9 +64,9 @@ def meet_box(
     centre: Float[np.ndarray, "3"],
     half_size: Float[np.ndarray, "3"],
 ) -> float:
-    """Distance at which a ray enters a box along the base axes, infinity if it does not [m].
+    """Distance at which a ray enters an axis-aligned box [m]; infinity if it misses the box.
 
-    The slabs of Kay and Kajiya (1986).
+    The slab method of Kay and Kajiya (1986).
 
     Args:
         origin: Origin of the ray [m], outside the box.
@@ -74,7 +74,7 @@ def meet_box(
         centre: Centre of the box [m].
         half_size: Half size of the box [m].
     """
-    # A component of zero leaves its slab never or always: both infinities say so.
+    # Parallel to a slab, both distances become huge: of one sign outside it, of two inside.
     safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
     near = (centre - half_size - origin) / safe
     far = (centre + half_size - origin) / safe
@@ -86,13 +86,13 @@ def meet_box(
 def region_over(
     points: Float[np.ndarray, "points 3"], bottom: float, height: float, smallest: float = 0.02
 ) -> DrawnRegion:
-    """The upright box over the rectangle that holds some points, along the base axes.
+    """Axis-aligned box over the bounding rectangle of points, as seen from above.
 
     Args:
-        points: Seen from above [m]; their heights do not matter.
+        points: Points [m]; their heights do not matter.
         bottom: Height of the box's lower face [m].
         height: Height of the box [m].
-        smallest: Half size that no edge falls below [m].
+        smallest: Smallest half size along any axis [m].
     """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     half_size = np.maximum(np.append(high - low, height) / 2, smallest)
@@ -111,22 +111,23 @@ FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.1
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
 _MARK: Any = "target"
-# Half sizes of a region: sliders end at the reach of the arm; a point needs a margin [m].
+# Largest and smallest half sizes of a region [m]: sliders end at the reach of the arm, and even
+# a point needs a margin.
 _LARGEST, _SMALLEST = 0.5, 0.02
-# Height of a target above what was clicked on: an object's height and a little [m].
+# Height of a target above the clicked surface: a little more than an object's height [m].
 _LIFTED = 0.08
 
 
 class RegionEditor:
-    """The box in the scene, its controls in the panel, and the target's mark.
+    """The box in the scene, its controls in the panel, and the mark of the target.
 
     Attributes:
         drawn: The region, active or not.
-        target: The point marked, where there is one [m].
+        target: Marked point [m]; None: no target.
     """
 
     def __init__(self, server: ViserServer, boxes: Sequence[Box]):
-        """Draw the first region, not active.
+        """Draw the initial region, not active.
 
         Args:
             server: Server of the page; controls go into the folder that is open.
@@ -141,11 +142,11 @@ class RegionEditor:
 
     @property
     def region(self) -> DrawnRegion | None:
-        """The region, where it is active."""
+        """The region; None while it is not active."""
         return self.drawn if self._in_force.value else None
 
     def draw(self, region: DrawnRegion, active: bool | None = None) -> None:
-        """Take another region, and let scene and panel follow.
+        """Set the region, and update scene and panel.
 
         Args:
             region: The region.
@@ -157,7 +158,7 @@ class RegionEditor:
         self._update()
 
     def mark(self, point: Float[np.ndarray, "3"] | None) -> None:
-        """Mark the target somewhere [m], or nowhere."""
+        """Mark the target at a point [m]; None: remove it."""
         self._mark.visible = point is not None
         self.target = None if point is None else _triple(point)
         if point is not None:
@@ -215,7 +216,7 @@ class RegionEditor:
         self.drawn = replace(self.drawn, centre=_triple(event.target.position))
 
     async def _corner_dragged(self, event: Any) -> None:
-        # Two sizes follow the pointer; the third, along the view, could only be guessed.
+        # Two sizes follow the pointer; the third, along the view, stays as it is.
         centre = np.array(self.drawn.centre)
         corner, eye = centre + self.drawn.half_size, event.client.camera.position
         view = np.array(event.end_position) - eye
@@ -226,7 +227,7 @@ class RegionEditor:
             self.draw(replace(self.drawn, half_size=_triple(half_size)))
 
     def _resized(self, event: Any) -> None:
-        if event.client is not None:  # otherwise we have moved the slider ourselves
+        if event.client is not None:  # otherwise, the program has moved the slider
             sizes = [slider.value / 2 for slider in self._sizes]
             self.draw(replace(self.drawn, half_size=_triple(sizes)))
 
@@ -241,7 +242,7 @@ class RegionEditor:
             slider.value = round(2 * half, 3)
 
     def _draw_over(self, event: Any) -> None:
-        """Make a rectangle drawn on the screen the region's footprint on the table."""
+        """Use a rectangle drawn on the screen as the region's footprint on the table."""
         (left, top), (right, bottom) = event.screen_min, event.screen_max
         x, y = (left + right) / 2, (top + bottom) / 2
         camera = event.client.camera
@@ -254,8 +255,8 @@ class RegionEditor:
             self.draw(region_over(np.array(points), self.drawn.centre[2] - half, 2 * half))
 
     def _mark_above(self, event: Any) -> None:
-        """Mark the target above the nearest point of the furniture that was clicked, else above
-        that at the height of the table.
+        """Mark the target above the clicked point of the furniture; if none was hit, above the
+        clicked point at the height of the table.
         """
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         distances = [

@@ -73,7 +73,7 @@ def test_what_slowed_the_leader_down_is_told_for_a_while(control, clock):
     assert slow_words(*control.slow, config) == ""
     clock.time += 0.4
     control.hear("a")
-    assert "nothing was heard of this browser for 0.40 s" in slow_words(*control.slow, config)
+    assert "nothing was heard from this browser for 0.40 s" in slow_words(*control.slow, config)
     control.hear("a", lag=0.35)
     assert "busy for 0.3" in slow_words(*control.slow, config)
     for _ in range(31):
