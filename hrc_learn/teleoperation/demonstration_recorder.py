@@ -1,4 +1,4 @@
-"""Recording demonstrations on request: start, stop, then save or discard; quality checks.
+"""Recording of demonstrations on request (start, stop, save or discard), with quality checks.
 
 The page asks the person to confirm before it saves a doubtful demonstration. lerobot-record
 cannot ask, so its robots only warn at the end of an episode.
@@ -23,26 +23,27 @@ from hrc_learn.skills.step_report import contact_force
 from hrc_learn.teleoperation.hand_guiding import Frame
 
 STILL = 0.005
-"""Motion of a joint [rad], or of the gripper [m], below which a person has not begun yet."""
+"""Motion of a joint [rad] or the gripper [m] up to which the demonstration has not begun."""
 _REST = (0.3, 0.7)
-"""Rest that is kept before and after the motion [s]: primitives smooth, and have to arrive."""
+"""Rest kept before and after the motion [s]: primitives smooth motions, and need time to reach
+the goal."""
 _SHORTEST = 0.5
 """Shortest demonstration [s]: a mouse click on a link moves the arm for less."""
 _MOST_LOST, _LONGEST_GAP = 0.05, 0.2
-"""Fraction of lost frames, and longest gap [s], from which a demonstration is doubted. At 0.5
+"""Fraction of lost frames, and gap [s], above which a demonstration is doubted. At 0.5
 m/s the end effector moves 10 cm during such a gap.
 """
 _AT_LIMIT = 0.03
-"""Distance from a joint's limit that counts as being there [rad]: the safety filter stops the
-joint 0.02 before it."""
+"""Distance from its limit up to which a joint counts as being at the limit [rad]: the safety
+filter stops it 0.02 before the limit."""
 _LONGEST_AT_LIMIT = 0.5
-"""Time at a limit from which a demonstration is doubted [s]: a joint that touches it in passing
-does what the person asks for."""
+"""Time at a limit above which a demonstration is doubted [s]: a joint may touch its limit
+briefly."""
 _NAMED = 3
-"""Contacts that are named: a hand in a shelf meets many parts of it."""
+"""Number of contacts named in a doubt: an end effector in a shelf touches many of its parts."""
 _PRESSES = 60.0
-"""Force at the end effector that is a collision [N]: the simulated arm's friction feels like
-17 N, a gripper that sets something down presses with 20 to 40 N."""
+"""Force at the end effector above which a contact is unexpected [N]: the simulated arm's
+friction feels like 17 N, and a gripper that puts something down presses with 20 to 40 N."""
 
 
 class RecordingQuality:
@@ -54,10 +55,10 @@ class RecordingQuality:
     """
 
     def __init__(self, fps: float, chain: SerialChain | None = None):
-        """Begin with nothing.
+        """Start without frames.
 
         Args:
-            fps: Frames a second that there should be.
+            fps: Nominal number of frames per second.
             chain: Kinematics of the arm, for checking joint limits; None skips this check.
         """
         self._period, self._chain = 1 / fps, chain
@@ -99,7 +100,7 @@ class RecordingQuality:
 
     @property
     def pace(self) -> float:
-        """Time that passed for the arm, by that which passed for the person.
+        """Elapsed time of the arm's clock divided by that of the person's clock.
 
         A simulation slower than real time makes the recorded motion faster than the
         demonstrated one.
@@ -108,7 +109,7 @@ class RecordingQuality:
         return self.seconds / passed if passed else 1.0
 
     def late(self, periods: float) -> Float[np.ndarray, " late"]:
-        """Gap before each frame that came later than so many periods [s]."""
+        """Gaps between frames that are longer than a number of periods [s]."""
         gaps = np.diff(self.arrivals)
         return gaps[gaps > periods * self._period]
 
@@ -127,7 +128,7 @@ class RecordingQuality:
         return slice(int(first), int(end))
 
     def worthless(self) -> str:
-        """Why the frames show nothing at all; empty if they show something."""
+        """Reason why the frames show no demonstration; empty if they do show one."""
         if not self._stamps:
             return "the demonstration has no frames"
         if (part := self.moving()) is None:
@@ -152,7 +153,7 @@ class RecordingQuality:
         return ""
 
     def met(self) -> list[str]:
-        """Limits and contacts that a demonstration is doubted for, in words."""
+        """Joint limits and contacts that make a demonstration doubtful, as text."""
         doubts, chain = [], self._chain
         if chain is not None and self.states:
             q, limits = np.stack(self.states)[:, :-1], chain.limits
@@ -170,7 +171,7 @@ class RecordingQuality:
 
 
 def pressed(chain: SerialChain, state: ArmState) -> tuple[str, ...]:
-    """Unexpected contact, detected from external torques."""
+    """Unexpected contact, estimated from external torques, as text; empty if there is none."""
     if state.external_torque is None:
         return ()
     jacobian = chain.jacobian(torch.from_numpy(state.joint_position))
@@ -181,18 +182,18 @@ def pressed(chain: SerialChain, state: ArmState) -> tuple[str, ...]:
 
 
 RecorderState = Literal["ready", "recording", "stopped"]
-"""Stopped: a demonstration waits to be saved or discarded."""
+"""State of a recorder. "stopped": a demonstration waits to be saved or discarded."""
 
 _LATE, _MOST_LATE = 2.0, 0.2
 """Delay in control periods after which a frame counts as late, and the fraction of late frames
-from which a demonstration is doubted. One in five, so that a briefly busy machine raises no
+above which a demonstration is doubted. One in five, so that a briefly busy machine raises no
 warning.
 """
 _SLOWEST = 0.8
-"""Pace of a simulated arm from which a demonstration is doubted: it is a quarter faster in the
-dataset than it was shown, and reproductions that are faster still meet limits."""
+"""Pace of a simulated arm below which a demonstration is doubted: in the dataset, the motion is
+a quarter faster than demonstrated, and even faster reproductions would meet limits."""
 _DRAFT_EVERY = 2.0
-"""Time from one draft of the open demonstration to the next [s]."""
+"""Shortest period of drafts of the open demonstration [s]."""
 
 UNNAMED = "not named"
 """Task of a demonstration that was open when the program ended, without a name."""
@@ -204,7 +205,7 @@ class RecorderStatus:
 
     state: RecorderState = "ready"
     seconds: float = 0.0
-    """Length of the demonstration in hand [s]."""
+    """Duration of the current demonstration [s]."""
     saved: int = 0
     """Demonstrations saved so far."""
     note: str = ""
@@ -212,18 +213,18 @@ class RecorderStatus:
 
 
 class DemonstrationRecorder:
-    """Keeps the frames of one demonstration at a time, and writes those that are worth it.
+    """Records one demonstration at a time, and writes those that are worth saving.
 
-    A person needs seconds from the button to the arm, and back: that rest is left out.
+    A person needs seconds from the button to the arm, and back: this rest is left out.
 
-    Episodes are written by a thread, so that the control loop never waits for the disk. The
-    dataset is complete when the `with` block has ended; without any episode there is none. A
-    demonstration that is still open then is saved: a signal or an error loses none. While it
-    is recorded a draft of it is written every `_DRAFT_EVERY` seconds, which `recover_dataset`
-    makes an episode of after a power cut.
+    A thread writes the episodes, so that the control loop never waits for the disk. The dataset
+    is complete when the `with` block has ended; without an episode, none is written. A
+    demonstration that is still open then is saved, even after a signal or an error. During
+    recording, a draft is written every `_DRAFT_EVERY` seconds, less often if it is long; after
+    a power cut, `recover_dataset` makes an episode of it.
 
     Attributes:
-        state: State of the demonstration in hand.
+        state: State of the current demonstration.
     """
 
     def __init__(
@@ -257,7 +258,7 @@ class DemonstrationRecorder:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self.finish()
         self._thread.shutdown(wait=True)
-        if isinstance(error, SystemExit | KeyboardInterrupt):  # asked to end: nothing failed
+        if isinstance(error, SystemExit | KeyboardInterrupt):  # a request to end, not a failure
             kind = error = trace = None
         empty = contextlib.nullcontext()
         if error is None and not self._writer.episodes:
@@ -266,8 +267,8 @@ class DemonstrationRecorder:
             self._writer.__exit__(kind, error, trace)
 
     def finish(self) -> None:
-        """Keep what is open, unless nothing in it moves, and wait until all is on disk."""
-        if self.state != "ready":  # ended by a signal, say: what was shown is not lost
+        """Save an open demonstration if it has a motion, and wait until all is on disk."""
+        if self.state != "ready":  # as after a signal: do not lose the motion
             self._insists = True
             self._save(task=self._task() or UNNAMED)
         wait(self._writing)
@@ -283,7 +284,7 @@ class DemonstrationRecorder:
         )
 
     def handle(self, request: Request) -> None:
-        """Do what a person asks; what makes no sense now is noted, not done."""
+        """Handle a request; a request that makes no sense now only leaves a note."""
         match request, self.state:
             case "start", "ready" | "stopped":
                 # Starting over is the quickest way to discard.
@@ -319,14 +320,14 @@ class DemonstrationRecorder:
             touching,
         )
         if now >= self._draft_due and self._draft.done():
-            # A long demonstration takes longer to write: drafts of it become rarer.
+            # Long demonstrations take longer to write, so their drafts become rarer.
             self._draft_due = now + max(_DRAFT_EVERY, self._quality.seconds / 10)
             if not self._quality.worthless():
                 frames, task = self._frames[:], self._task() or UNNAMED
                 self._draft = self._thread.submit(self._write_draft, frames, task)
 
     def _forget(self) -> None:
-        """Drop the demonstration in hand, and its draft."""
+        """Discard the current demonstration and its draft."""
         self._clear()
         self._thread.submit(self._writer.discard_draft)
 
@@ -353,7 +354,7 @@ class DemonstrationRecorder:
         self._writing.append(self._thread.submit(self._write, frames, task))
 
     def _doubt(self) -> str:
-        """Why a demonstration should rather be shown again; empty if it is good."""
+        """Reason to repeat the demonstration; empty if it is good."""
         if lost := self._quality.lost():
             return lost
         late, frames = len(self._quality.late(_LATE)), len(self._frames)
@@ -361,7 +362,7 @@ class DemonstrationRecorder:
             return f"the loop was late at {late} of {frames} frames: this machine is busy"
         if (pace := self._quality.pace) < _SLOWEST:
             return (
-                f"the arm moved at {100 * pace:.0f} % of real time, so what was shown is "
+                f"the arm moved at {100 * pace:.0f} % of real time, so its recording is "
                 f"{1 / pace:.1f} times as fast: this machine is busy"
             )
         return ", ".join(self._quality.met())

@@ -34,17 +34,17 @@ from hrc_learn.teleoperation.hand_guiding import (
 from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba
 
-# Of the fields drawn on the boards [m]: thin, but thick enough not to flicker with the board.
+# Half thickness of the fields drawn on the boards [m]: enough not to flicker with the board.
 _THICKNESS = 0.002
 # Control steps between two statuses on the page: ten times a second at 10 ms.
 _SHOW_EVERY = 10
-# Distance of postures checked for contacts along a path: 0.05 rad, 5 cm at 1 m reach.
+# Spacing of the postures at which a path is checked for contacts [rad]: 5 cm at 1 m reach.
 _LOOK = 0.05
 # A recording continues for this long without a client [s]: reloading a page takes less.
 _LEFT_FOR = 5.0
 # Points of a drawn path, enough to look smooth.
 _WAY_POINTS = 24
-# How long what the arm says to the person is shown [s]: two lines are read in half of that.
+# Time for which a remark of the task is shown [s]: two lines are read in half of it.
 _REMARK_STAYS = 6.0
 _INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
 
@@ -63,7 +63,7 @@ sees it).
 
 
 def place_targets(workplace: Workplace) -> list[Box]:
-    """A green field on each board, where the object stands once it is released."""
+    """A green field on each board, at the place for the object."""
     item, (red, green, blue, _) = workplace.scene.objects[0], rgba(GREEN)
     # Grasped from above, an object lies on its side once the end effector is level.
     x, y = item.half_size[0], item.half_size[2]
@@ -205,7 +205,7 @@ class PageSession:
                 f"Finished: {counted(saved, 'demonstration')} saved. You can close this tab."
             )
         elif request == "home":
-            # A demonstration must not contain that.
+            # A demonstration must not contain the motion home.
             if self._recorder.state == "recording":
                 self._recorder.handle("stop")
             self._go_home()
@@ -221,12 +221,12 @@ class PageSession:
         return (*self.world.touched_since(last), *felt)
 
     def _stop_when_left(self) -> None:
-        """End a recording that everybody at the page has left, and keep what was shown."""
+        """Stop a recording after all clients have left the page, and keep the demonstration."""
         if self._recorder.state != "recording":
             self._watched, self._alone = False, 0
         elif self._page.control.people:
             self._watched, self._alone = True, 0
-        elif self._watched:  # not with a gamepad only
+        elif self._watched:  # a page was open: not a recording with a gamepad only
             self._alone += 1
             if self._alone * self._config.guiding.dt > _LEFT_FOR:
                 self._recorder.handle("stop")
@@ -235,7 +235,7 @@ class PageSession:
                 )
 
     def _go_home(self) -> None:
-        """A simulated arm without a driver jumps there, another moves in a straight line."""
+        """Bring the arm home: without a driver it jumps, otherwise it moves straight."""
         if self._jumps:
             self.world.hold(self._workplace.scene.objects[0].name, self._home)
             self.arm.restart()
@@ -265,7 +265,7 @@ class PageSession:
 
 
 def recorded_frame(step: GuidedStep, hands: Mapping[str, TrackedHand]) -> Frame:
-    """Columns of a step, with all that the person asked for.
+    """Columns of a step, including the input of the person.
 
     Args:
         step: Step of the guided arm.
@@ -309,7 +309,7 @@ class TaskPage(Page):
         self.cell: WorkCell | None = None
 
     def tick(self) -> None:
-        """After each control step: show where everything is, and let real time pass."""
+        """Update the page after a control step, and wait until the next one is due."""
         self.place()
         if self._ticks % _SHOW_EVERY == 0 and self.cell is not None:
             self.show(self.status(self.cell))
@@ -337,7 +337,7 @@ class TaskPage(Page):
 
 
 def _way(cell: WorkCell) -> Float[np.ndarray, "points 3"] | None:
-    """The end effector along the path that is being followed, if any [m]."""
+    """Positions of the end effector along the path being followed [m]; None: no path."""
     if cell.plan is None:
         return None
     some = np.linspace(0, len(cell.plan) - 1, min(len(cell.plan), _WAY_POINTS)).astype(int)
@@ -345,7 +345,7 @@ def _way(cell: WorkCell) -> Float[np.ndarray, "points 3"] | None:
 
 
 def _followed(cell: WorkCell) -> DrawnRegion | None:
-    """The region to which the controller took the end effector in the last step, if any."""
+    """Region into which the controller moved the end effector in the last step, if any."""
     if cell.region is None:
         return None
     (x, y, z), (a, b, c) = cell.region.centre.tolist(), cell.region.half_size.tolist()

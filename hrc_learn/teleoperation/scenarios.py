@@ -46,20 +46,20 @@ from hrc_learn.vision import CameraModel, ImageNoise, Marker, SyntheticCamera
 
 _RELEASE = 1.5  # time for the fingers to open [s]
 _REACH = (0.10, 0.08, 0.0)  # largest distance of the object from the middle of the table [m]
-# Phases of a grasp: from above the table to the object, fingers, lift, rest [s].
+# Durations of the phases of a grasp [s]: approach from above, closing fingers, lift, rest.
 _APPROACH, _GRIP, _LIFT, _SETTLE = 4.0, 0.7, 2.0, 0.5
-_HEIGHT = 0.15  # to which the object is lifted [m]
+_HEIGHT = 0.15  # height to which the object is lifted [m]
 _TREMOR = 2e-4  # amplitude of the end effector's tremor while it grasps [m]
 
 
-# The expert of placing, and the time at which it lets go [s].
+# Settings of the placing expert, and the time at which it releases the object [s].
 _PLACING = PlacingDemonstrationConfig()
 _LET_GO = _PLACING.duration + _PLACING.settle
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placing:
-    """Put the object in the gripper on a shelf, and let go."""
+    """Place the object that the gripper holds on a shelf, and release it."""
 
     workplace: Workplace = field(default_factory=Workplace)
     shelf: str = "middle"
@@ -81,7 +81,7 @@ class Placing:
 
 @dataclass(frozen=True, kw_only=True)
 class Grasping:
-    """Take an object that lies at random on the table, and lift it."""
+    """Grasp an object at a random place on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
     task: ClassVar[str] = "grasp the box and lift it"
@@ -90,7 +90,7 @@ class Grasping:
     def begin(self, world: World, rng: np.random.Generator) -> Human:
         item = self.workplace.scene.objects[0]
         pose = self.workplace.random_object_pose(self.workplace.scaled(_REACH), rng)
-        # On the table as it is, of an object as tall as it is.
+        # Actual heights of table and object, which differ from the nominal ones.
         pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
         hover = self.workplace.hover()
         joints = self.workplace.robot.inverse(hover, near=self.workplace.hover_joints())
@@ -148,12 +148,12 @@ class SequencedInput(Human):
         return replace(self._leads.read(state), gripper=width)
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell the one whose turn it is."""
+        """Pass the feedback to the demonstrator whose turn it is."""
         self._leads.tell(feedback)
 
 
 class ScenarioRun:
-    """Simulated world that repeats a scenario, each time from a seed.
+    """Simulated world that repeats a scenario, each time from a given seed.
 
     Time advances with commands only, so the same seed and commands give the same result.
 
@@ -165,7 +165,7 @@ class ScenarioRun:
         servo: Position servo of the arm.
         camera: Fixed camera at its present pose.
         seed: Seed of the present initial configuration.
-        commands: Number of commands since then.
+        commands: Number of commands since the initial configuration.
         visit: Motion of the worker; None: no worker.
     """
 
@@ -181,15 +181,15 @@ class ScenarioRun:
         imperfections: Imperfections | None = None,
         worker: PersonMode | None = None,
     ):
-        """Begin.
+        """Build the world, and set up the first initial configuration.
 
         Args:
             scenario: Task to perform.
-            fps: Commands a second of the world's time.
+            fps: Commands per second of the world's time.
             seed: Seed of the first initial configuration.
-            imperfections: Imperfections of arm, calibration and workplace, drawn anew from each
-                seed; None: none.
-            worker: Reaction of the arm to a worker who comes to the table, another one for each
+            imperfections: Imperfections of arm, calibration and workplace, drawn anew for each
+                seed; None: no imperfections.
+            worker: Reaction of the arm to a worker at the table, who is drawn anew for each
                 seed; None: no worker.
         """
         self._worker, self.visit = worker, None
@@ -201,7 +201,7 @@ class ScenarioRun:
         self.begin(seed)
 
     def begin(self, seed: int) -> None:
-        """Put everything in place as a seed has it."""
+        """Set up the initial configuration of a seed."""
         self.seed, self.commands = seed, 0
         if self._sizes != Imperfections.ideal() or self._worker is not None:
             self._build(np.random.default_rng([seed, 2]))
@@ -211,7 +211,7 @@ class ScenarioRun:
         _reseed(self._tool_noise, [seed, 3])
 
     def _build(self, rng: np.random.Generator) -> None:
-        """World with drawn imperfections, and the servo of its arm."""
+        """Build the world with drawn imperfections, and the servo of its arm."""
         workplace, robot = self.scenario.workplace, self.scenario.workplace.robot
         drawn = self._sizes.draw(rng, robot.joints, robot.hand_size)
         scene, safety = workplace.scene, self._sizes.plant(SafetyConfig())
@@ -235,14 +235,14 @@ class ScenarioRun:
         )
 
     def command(self, joints: Float[np.ndarray, " joints"], width: float) -> np.ndarray:
-        """Send the joints and the gripper on their way, and let time pass.
+        """Command joints and gripper, and advance the world by a control period.
 
         Args:
-            joints: Positions to be reached when the next command is due [rad].
+            joints: Joint positions to reach by the next command [rad].
             width: Opening of the gripper [m].
 
         Returns:
-            Where the joints were sent instead, within their limits [rad].
+            Joint positions commanded instead, within the limits [rad].
         """
         with torch.inference_mode():
             _, sent = self.servo.follow(joints)
@@ -258,14 +258,14 @@ class ScenarioRun:
     def object_pixel(self) -> Float[np.ndarray, "2"]:
         """Pixel (u, v) of the object's marker in the fixed camera.
 
-        It is detected before the arm can hide the marker.
+        It is detected once per configuration, and never hidden by the arm.
 
         Raises:
-            ValueError: The object was not in view.
+            ValueError: The object is not in view.
         """
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
-            sensor = self._sensor  # whose background takes random numbers when it is first made
+            sensor = self._sensor  # first: making its background takes random numbers
             _reseed(self._noise, [self.seed, 1])
             self._pixel = sensor.detect().get(marker)
         if self._pixel is None:
@@ -311,7 +311,7 @@ class ScenarioRun:
         return MarkerSensor(camera, [marker.id])
 
     def move_camera(self, change: CameraChange, rng: np.random.Generator) -> None:
-        """Let the fixed camera stand elsewhere from now on, where it still sees the table.
+        """Move the fixed camera to another pose, from which it still sees the table.
 
         Args:
             change: Displacement from its pose in the scene.
@@ -341,7 +341,7 @@ class ScenarioRun:
 
 
 def _reseed(rng: np.random.Generator, seed: list[int]) -> None:
-    """In place: cameras hold on to their source of noise."""
+    """Reseed a generator in place: cameras keep a reference to their source of noise."""
     rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
 
 
@@ -374,14 +374,14 @@ class ScenarioView:
         )
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """The image now, RGB."""
-        if self._world is not self._run.world:  # built anew, with other imperfections
+        """Present image, RGB."""
+        if self._world is not self._run.world:  # it was rebuilt with other imperfections
             self._open()
         return self._camera.read()
 
 
 def overview(width: int, height: int) -> CameraModel:
-    """A camera in front of the arm that has table, end effector and shelves in view."""
+    """Camera in front of the arm, with table, end effector and shelves in view."""
     focal = 0.9 * min(width / 4 * 3, height)
     middle = ((width - 1) / 2, (height - 1) / 2)
     model = CameraModel(width=width, height=height, focal=(focal, focal), principal=middle)
@@ -408,10 +408,10 @@ SHELVES = ("lower", "middle", "upper")
 
 
 def check_scenario(name: str, shelf: str, pixels: bool) -> None:
-    """Refuse what there is not, before anything heavy is imported.
+    """Check scenario and shelf before anything is built.
 
     Raises:
-        ValueError: There is no such scenario or shelf, or its object has no pixel.
+        ValueError: There is no such scenario or shelf, or pixels are requested for placing.
     """
     if name not in SCENARIOS:
         raise ValueError(f"no scenario {name!r}: there are {', '.join(SCENARIOS)}.")
@@ -422,10 +422,10 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
 
 
 def make_scenario(name: str, shelf: str, robot: Arm) -> Scenario:
-    """A scenario in the workplace of an arm.
+    """Create a scenario in the workplace of an arm.
 
     Raises:
-        UnreachableError: The arm cannot do the work in any layout.
+        UnreachableError: The arm cannot do the task in any layout.
     """
     workplace = Workplace.of(robot)
     if name == "placing":

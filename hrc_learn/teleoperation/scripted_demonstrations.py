@@ -1,5 +1,5 @@
-"""Demonstrations by the scripted expert: of visual servoing, and of placing with the null-space
-posture; and how they are recorded.
+"""Demonstrations by the scripted expert, and their recording: visual servoing, and placing with
+the null-space posture.
 """
 
 import math
@@ -66,13 +66,13 @@ def guided_frames(
     config: DemonstrationConfig,
     observe: Callable[[], Mapping[str, Any]] = dict,
 ) -> Iterator[dict[str, Any]]:
-    """Let a person guide the arm of a world, and yield what is to be recorded.
+    """Let a person guide the arm of a world, and yield the frames to record.
 
     Args:
-        world: World whose arm is where the demonstration starts.
+        world: World with the arm at the start of the demonstration.
         human: Gives end-effector motion and null-space input.
         config: Duration and rate.
-        observe: Further columns of a frame, called when it is recorded.
+        observe: Returns further columns of a frame; called when the frame is recorded.
 
     Yields:
         A frame every `record_every` control steps.
@@ -97,15 +97,16 @@ class ServoDemonstrationConfig(DemonstrationConfig):
     descent: float = 0.06
     """Height from which the end effector finally descends vertically [m]."""
     reach: tuple[float, float, float] = (0.10, 0.08, 0.06)
-    """Largest distances of the points from the middle of the table, and above hovering [m]."""
+    """Largest horizontal distances of points and object from the middle of the table, and
+    largest height of the points above the hover pose [m]."""
     yaw: float = math.pi
     """Largest turn of the object on the table, either way [rad]."""
     wobble: float = 0.12
-    """Amplitude of small rotations on the way, which show their effect in the image [rad]."""
+    """Amplitude of small rotations during the motion, whose effect the images show [rad]."""
     record_every: int = 4
     """Control steps from one recorded frame, and image, to the next."""
     markerless: bool = False
-    """Film a scene without markers in place of recording their pixels."""
+    """True films a scene without markers; False records the pixels of markers."""
 
 
 FILM = "front"
@@ -134,10 +135,10 @@ def servo_expert(
     rates, phases = rng.uniform(0.8, 1.6, 3), rng.uniform(0, 2 * np.pi, 3)
 
     def orientation(_position: torch.Tensor, time: float) -> torch.Tensor:
-        # They fade out before the end, where the end effector is at rest above the object.
+        # The rotations fade out before the end, where the tool rests above the object.
         fading = float(np.clip((0.75 * path.end - time) / 1.0, 0.0, 1.0))
         turn = config.wobble * fading * np.sin(rates * time + phases)
-        # The gripper turns for the object over the middle of the motion.
+        # In the middle of the motion, the gripper turns to the orientation of the object.
         progress, _ = minimum_jerk((time / path.end - 0.2) / 0.5)
         turn[2] += turned * progress
         return quaternion.multiply(quaternion.exp(torch.from_numpy(turn)), gripper_down())
@@ -159,18 +160,18 @@ def demonstrate_servoing(
 ) -> list[Frame]:
     """Demonstrate one motion that ends above an object.
 
-    The object is detected before the arm comes between it and the camera; its pixel is kept in
-    every frame, as the camera saw it then. Where it is not seen it is put elsewhere.
+    The object is detected before the arm can hide it; every frame contains this first pixel.
+    An object that the camera does not see is moved elsewhere.
 
     Args:
-        world: Reset for the demonstration.
+        world: World, which is reset for the demonstration.
         workplace: Workplace of the demonstration.
-        sensor: The camera's markers.
+        sensor: Marker detector of the camera.
         config: Timing and heights.
         rng: Source of objects, paths and tremor.
 
     Raises:
-        ValueError: If the camera does not see the object anywhere.
+        ValueError: The camera does not see the object anywhere.
     """
     expert, target = _arranged(world, workplace, sensor, config, rng)
     last = np.zeros((4, 2))
@@ -200,9 +201,9 @@ def film_servoing(
     """Demonstrate one motion that ends above an object, and film it.
 
     Args:
-        world: Reset for the demonstration.
+        world: World, which is reset for the demonstration.
         workplace: Workplace of the demonstration.
-        sensor: Tells where an object is in view; no pixel of it is recorded.
+        sensor: Detects if the object is in view; its pixels are not recorded.
         camera: Camera that films.
         config: Timing and heights.
         rng: Source of objects, paths and tremor.
@@ -218,7 +219,7 @@ def film_servoing(
         return {"images": {FILM: camera.read()}}
 
     start = torch.from_numpy(world.arm.read().joint_position)
-    # On the way from home the camera sees the object.
+    # On the way from home to the start, the camera still sees the object.
     path = joint_line(workplace.home_joints(), start, _LEAD_SPEED, dt).numpy()
     for k, (q, velocity) in enumerate(zip(path, np.gradient(path, dt, axis=0), strict=True)):
         world.reset(q, {name: pose})
@@ -238,7 +239,7 @@ def _arranged(
     config: ServoDemonstrationConfig,
     rng: np.random.Generator,
 ) -> tuple[ScriptedExpert, Float[np.ndarray, "4 2"]]:
-    """The expert of a demonstration whose world it has reset, and the object's corners."""
+    """Reset the world; return the expert and the corner pixels of the object's marker."""
     item, home = workplace.scene.objects[0], workplace.home_joints().numpy()
     for _ in range(_DRAWS):
         pose = workplace.random_object_pose(workplace.scaled(config.reach), rng, config.yaw)
@@ -260,7 +261,7 @@ def _arranged(
         try:
             q = workplace.robot.inverse(goal, near=workplace.hover_joints())
         except UnreachableError as error:
-            refused = error  # small arms tilt little at the highest of the points
+            refused = error  # small arms can tilt little at the highest points
         else:
             world.reset(q.numpy(), {item.name: pose})
             return expert, target
@@ -269,21 +270,21 @@ def _arranged(
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
-    """Turn of the gripper that closes along an object's x axis, within reach [rad]."""
+    """Turn with which the gripper closes along the object's x axis, within reach [rad]."""
     low, high = workplace.hover_turns
     yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
     return low + (yaw - low) % np.pi if high - low >= np.pi - 1e-9 else yaw
 
 
-# Places for the object before it is said that the camera sees none: a camera that sees half the
-# table shows one of twenty but once in a million.
+# Number of places and paths tried: a camera that sees half of the table misses all of twenty
+# places once in a million.
 _DRAWS = 20
 # Speed of the fastest joint on the way to a filmed demonstration [rad/s].
 _LEAD_SPEED = 1.2
-# Demonstrations begun before one without contact is given up.
+# Number of attempts at a demonstration without contact.
 _ATTEMPTS = 3
-# From its place on the shelf, where a demonstration has arrived [m]: ten times what tremor and
-# the arm's lag leave.
+# Largest final distance from the place on the shelf [m]: ten times the error from tremor and
+# the lag of the arm.
 _ARRIVED = 0.02
 
 # The elbow is pulled around the open door: first away from the cabinet, then over to its side.
@@ -304,8 +305,7 @@ class PlacingDemonstrationConfig(DemonstrationConfig):
     pull_elbow: bool = True
     """True if the expert pulls the elbow past the cabinet's open door."""
     lift: float = 0.03
-    """Height above the final one at which the end effector crosses the board's front edge [m].
-    """
+    """Height of the end effector over the board's front edge, above its final height [m]."""
 
 
 def placing_expert(
@@ -318,9 +318,9 @@ def placing_expert(
     """Reset a world for placing, and return the expert that puts the object on a shelf.
 
     Args:
-        world: World whose arm then stands near home, with the object in its gripper.
+        world: World; afterwards, its arm is near home with the object in the gripper.
         workplace: Workplace with the shelves.
-        shelf: Index of the shelf.
+        shelf: Name of the shelf.
         config: Timing and heights.
         rng: Random source of the tremor and of the initial position.
     """
@@ -349,20 +349,20 @@ def demonstrate_placing(
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
 ) -> tuple[list[Frame], int]:
-    """Carry the object in the gripper from home to a shelf, until it succeeds without contact.
+    """Carry the object in the gripper from home to a shelf; repeat until there is no contact.
 
     Args:
-        world: Reset for each demonstration.
+        world: World, which is reset for each demonstration.
         workplace: Workplace of the demonstration.
         shelf: Name of the shelf.
         config: Timing and heights.
         rng: Source of the tremor and of the initial position.
 
     Returns:
-        The recorded frames, and how many demonstrations were discarded.
+        The recorded frames, and the number of discarded demonstrations.
 
     Raises:
-        TaskFailedError: If something was touched, or the shelf missed, each time.
+        TaskFailedError: Each demonstration touched something or missed its place.
     """
     goal, why = workplace.shelf(shelf).position.numpy(), ""
     for attempt in range(_ATTEMPTS):

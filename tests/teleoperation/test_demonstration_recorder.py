@@ -271,7 +271,7 @@ def test_an_arm_that_is_slower_than_the_person_is_told(folder, gap, good):
             recorder.handle(end)
             now[0] += 60.0
         assert recorder.status.state == ("ready" if good else "stopped")
-        said = "at 79 % of real time, so what was shown is 1.3 times as fast"
+        said = "at 79 % of real time, so its recording is 1.3 times as fast"
         assert good or said in recorder.status.note
     assert recorder.status.saved == 1
 
