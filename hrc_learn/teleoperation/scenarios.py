@@ -189,7 +189,7 @@ class ScenarioRun:
             seed: Seed of the first initial configuration.
             imperfections: Imperfections of arm, calibration and workplace, drawn anew for each
                 seed; None: no imperfections.
-            worker: Reaction of the arm to a worker at the table, who is drawn anew for each
+            worker: Reaction of the arm to a worker at the table, drawn anew for each
                 seed; None: no worker.
         """
         self._worker, self.visit = worker, None

@@ -271,7 +271,7 @@ def test_hands_are_understood():
     assert message.grips[0].pointer == (0.1, 0.2, 0.3)
     assert message.grips[1].joint is None
     assert message.sent == 3.5
-    with pytest.raises(MessageError, match="one thing"):
+    with pytest.raises(MessageError, match="listed only once"):
         session_message(json.dumps({"type": "hands", "grips": [grip, grip]}))
     turned = {**end, "orientation": [1, 1, 0, 0]}
     with pytest.raises(MessageError, match="unit quaternion"):
