@@ -1,4 +1,4 @@
-"""Evidence page: requirements of safety standards beside the values that runs have measured.
+"""Evidence page: requirements of safety standards, with the values that runs have measured.
 
 `evidence.toml` holds the requirements. The page claims no certification.
 """
@@ -14,19 +14,19 @@ from hrc_learn.viz.report import Report, flatten, page_templates
 
 @dataclass(frozen=True, kw_only=True)
 class Clause:
-    """A requirement and how it is kept."""
+    """A requirement, and how the package meets it."""
 
     standard: str
     """Standard with its edition, and the topic or annex."""
     requirement: str
     kept: str
-    """Measure that keeps it."""
+    """Description of how the package meets it."""
     parameters: Sequence[Any]
-    """Ends of the names of settings; on a page each with the values of the runs."""
+    """Settings, by the ends of their names; on a page, each with its values in the runs."""
     test: str
-    """File of the test that shows it."""
+    """File of the test that checks it."""
     measured: Sequence[Any]
-    """Names of the metrics; on a page the measurements of each run."""
+    """Names of the metrics; on a page, the measurements of each run."""
     outside: str
     """Part of the requirement that this package cannot meet."""
 
@@ -46,7 +46,7 @@ def evidence_page(reports: Sequence[Report]) -> str:
     """Page of all requirements with the values of one or several runs, as HTML.
 
     Args:
-        reports: Reports of the runs, in order; that of a batch holds the values of all trials.
+        reports: Reports of the runs, in order; the report of a batch has values over all runs.
 
     Raises:
         ValueError: No run was made near a person.
@@ -83,7 +83,7 @@ def _filled(clause: Clause, reports: Sequence[Report]) -> Clause:
 
 
 def _ending(settings: dict[str, Any], name: str) -> list[Any]:
-    """Values of the settings of the work cell, or of any part, whose names end in a name."""
+    """Values of the settings whose names end in `name`: those of the work cell, if any."""
     found = {key: value for key, value in settings.items() if f".{key}".endswith(f".{name}")}
     cell = [value for key, value in found.items() if "cell." in key]
     return cell or list(found.values())

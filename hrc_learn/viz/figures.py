@@ -57,9 +57,9 @@ def shade(
 
 
 def draw_limits(axes: Axes, lower: float, upper: float) -> None:
-    """Write the limits of a joint, and draw those within the panel, which the motion fills."""
+    """Name the limits of a joint in the title, and draw those near the motion."""
     low, high = axes.dataLim.intervaly
-    around = max(0.25, 0.15 * (high - low))  # of a joint that hardly moves [rad]
+    around = max(0.25, 0.15 * (high - low))  # at least 0.25 rad, if the joint hardly moves
     for limit in (lower, upper):
         axes.axhline(limit, color=palette.LIMIT, lw=0.9)
     axes.set_ylim(low - around, high + around)
@@ -101,7 +101,7 @@ def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
 
 
 def draw_box(axes: Axes3D, box: Box, colour: str) -> None:
-    """The edges of a box."""
+    """Draw the edges of a box."""
     edges = Line3DCollection(list(box.edges()), colors=colour, linewidths=0.6, alpha=0.6)
     axes.add_collection3d(edges)
 
@@ -166,8 +166,8 @@ def joints_figure(run: RunRecording) -> Figure:
 def stack_panels(figure: Figure) -> None:
     """Put the panels of a figure above one another, for the width of a phone.
 
-    Curves keep their height, images and views in space their proportions. Legends come below
-    their panels. The figure has been drawn once, which gives the panels their size.
+    Curves keep their height, images and 3D views keep their proportions. Legends come below
+    their panels. The figure must have been drawn once, which sets the sizes of the panels.
     """
     panels = [axes for axes in figure.axes if axes.axison or axes.name == "3d"]
     if not panels or any(axes.get_subplotspec() is None for axes in panels):
@@ -211,10 +211,10 @@ def plots_figure(
     """Plots of a dashboard on white paper, with a common horizontal axis.
 
     Args:
-        time: Time of the curves [s], or what `axis` names.
+        time: Time of the curves [s], or the quantity that `axis` names.
         plots: Plots; their titles name the units.
         columns: Number of columns.
-        shown: Samples that the time axis has to show; None, or none of them: all.
+        shown: True at samples that the time axis must show; if None or never true: all samples.
         shaded: Samples in which the background is shaded; None: none.
         axis: Title of the horizontal axis.
     """
@@ -236,7 +236,7 @@ def plots_figure(
             axes.margins(x=0)
             if plot.legend:
                 handles, names = axes.get_legend_handles_labels()
-                once = dict(zip(names, handles, strict=True))  # curves may have one name
+                once = dict(zip(names, handles, strict=True))  # names may be repeated
                 beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
                 place = beside if columns == 1 else {"loc": "best", "ncols": 2}
                 axes.legend(once.values(), once, **place)

@@ -25,12 +25,12 @@ Picture = UInt8[np.ndarray, "height width 3"]
 _BAR = 36  # height of the line of text below [px]
 _TEXT, _SMALL = 17, 13  # sizes of text [px]
 _MARGIN = 10  # [px]
-_INSET = 0.27  # of the picture's width
+_INSET = 0.27  # width of the camera's image relative to the picture
 _SHADE = (24, 26, 30, 200)
 _SKY = (228, 233, 238)
 _OUTLINE = 0.35  # brightness of outlines
 
-# A film of 16 s at 720 x 450 px is 0.3 MB then: a report that holds it can be mailed.
+# A film of 16 s at 720 x 450 px then takes 0.3 MB, so that a report with it can be mailed.
 _CODEC = {"preset": "veryfast", "crf": "27"}
 
 
@@ -38,13 +38,13 @@ def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
     """An MP4 file (H.264) that browsers play.
 
     Args:
-        pictures: RGB, one at least, all of the same even size.
+        pictures: At least one RGB image; width and height are even, and the same for all.
         rate: Pictures per second [1/s].
     """
     import av
 
     stream = None
-    # In a file, which the index can be moved to the front of, so that it plays while it loads.
+    # A file, not memory: its index can then be moved to the front, to play while loading.
     with TemporaryDirectory(prefix="hrc_film_") as folder:
         path = Path(folder) / "film.mp4"
         with av.open(path, "w", options={"movflags": "+faststart"}) as container:

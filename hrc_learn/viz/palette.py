@@ -18,7 +18,7 @@ SERIES = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GREY)
 """Colours of up to seven joints or curves, on white paper."""
 
 SERIES_ON_DARK = (SKY, ORANGE, GREEN, VERMILION, PURPLE, YELLOW, GREY)
-"""The same for dark screens, where blue would sink."""
+"""The same for dark screens, where blue would be hard to see."""
 
 DEMO = GREY
 """Demonstrations."""
@@ -63,5 +63,5 @@ _ON_WHITE = {
 
 
 def on_white(colour: tuple[int, int, int, int]) -> tuple[float, ...]:
-    """Colour on white paper, 0 to 1, for the bytes of one on a dark screen."""
+    """Colour for white paper, 0 to 1, in place of a colour for dark screens, given as bytes."""
     return tuple(channel / 255 for channel in _ON_WHITE.get(colour, colour))

@@ -38,7 +38,7 @@ class Plot:
     range: tuple[float, float] | None = None
     """Range of the vertical axis; None: that of the data."""
     legend: bool = False
-    """Show a legend, if the title cannot name the colours."""
+    """Show a legend, because the title does not explain the colours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,8 +134,8 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
     title = f"Image Jacobian: ∂{pixel} / {half} velocity [{unit}]"
     if run.true_image_jacobian is not None:
         true = run.true_image_jacobian[:, row, columns]
-        # One entry of the legend for the three. The viewer draws entities by name: the thin
-        # estimate has to come after it.
+        # One legend entry for all three true curves. The viewer draws entities in the order of
+        # their names: "actual" comes first, so that the thin estimate is drawn over it.
         pale = several(f"{path}/actual", ("true",) * 3, true, width=5.0, light=True)
         curves.insert(0, pale)
     return Plot(title=title, curves=tuple(curves), legend=True)
@@ -158,7 +158,7 @@ def person_plots(run: RunRecording) -> list[Plot]:
         title = "Followed fraction of the push [-]"
         plots.append(Plot(title=title, curves=(share,), range=(-0.05, 1.05)))
     if run.hindered:
-        title = "Reasons for not following, or only in part"
+        title = "Reasons why the arm does not follow, or only in part"
         plots.append(_rows("person/hindered", title, run.hindered))
     moved, turned = run.position_deviation, run.rotation_deviation
     turning = "Deviation of the end effector, rotation [deg]"
@@ -174,7 +174,7 @@ def person_plots(run: RunRecording) -> list[Plot]:
 
 
 def worker_plots(run: RunRecording) -> list[Plot]:
-    """Plots of the distances from a worker, also enlarged; none without a worker."""
+    """Plots of the distances from a worker, one of them enlarged; none without a worker."""
     if not run.worker_distance:
         return []
     values = 1e3 * np.column_stack(list(run.worker_distance.values()))
@@ -193,7 +193,7 @@ def _primitive(run: RunRecording) -> Tab:
         joint_plot("joints", name, i, run.joint_position, demo, limits)
         for i, name in enumerate(run.joint_names)
     ]
-    # The names of the first hold for all, in plots that are too small for one each.
+    # Only the first plot has a legend, which holds for all: the others are too small for one.
     plots[0] = replace(plots[0], legend=True)
     title = "Joints" if demo is None else "Primitive"
     return Tab(title=title, plots=tuple(plots), columns=2)

@@ -50,10 +50,10 @@ class Measurement:
 
     @property
     def ok(self) -> bool | None:
-        """True if the target is met, None without a target. NaN meets none."""
+        """True if the target is met, None without a target. NaN does not meet any target."""
         if self.target is None:
             return None
-        # A bool of Python's own: numpy's is neither True nor False to an `is`.
+        # Python's bool, because callers test `ok is False`, which never holds for numpy's.
         return bool(self.value >= self.target if self.at_least else self.value <= self.target)
 
     @property
@@ -81,11 +81,11 @@ class Measurement:
 
 
 type Row = tuple[str, str, float, str, float | None, float]
-"""Key of a value, its name, factor to its unit, unit, largest one that passes, resolution."""
+"""Key, name, factor to the unit, unit, largest value that passes, resolution."""
 
 
 def measured(rows: Iterable[Row], values: Mapping[str, float | int]) -> list[Measurement]:
-    """Measurements of the rows whose values are there; values without a unit are counts."""
+    """Measurements of the rows whose values are given; values without a unit are counts."""
     return [
         Measurement(
             name=name,
@@ -109,7 +109,7 @@ class Picture:
     """A matplotlib figure, an RGB image (height, width, 3), or a finished PNG file."""
     caption: str = ""
     narrow: bytes = b""
-    """A figure for phones as a PNG file, its panels above one another; drawn together with
+    """PNG file of a figure for phones, with its panels above one another; drawn together with
     `png`. Empty for photographs, which dark pages show unchanged."""
 
     def __post_init__(self) -> None:
@@ -155,7 +155,7 @@ class Section:
 
     heading: str
     text: str = ""
-    """Plain text; blank lines part paragraphs."""
+    """Plain text; blank lines separate paragraphs."""
     figures: Sequence[Picture] = ()
 
 
@@ -169,7 +169,7 @@ class Report:
 
     title: str
     summary: str
-    """Description of the run, in plain text; blank lines part paragraphs."""
+    """Description of the run, in plain text; blank lines separate paragraphs."""
     table: Sequence[Measurement] = ()
     """All measured values."""
     sections: Sequence[Section] = ()
@@ -209,7 +209,7 @@ def leading(
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
     """Measurements to show first, and the others, both in the order of the table.
 
-    Those that missed their targets come first, however many; then others with a target.
+    All that missed their targets come first, then others with a target.
 
     Args:
         table: All measurements.
@@ -301,7 +301,7 @@ REPORT = "report.json"
 PAGE = "report.html"
 FIGURES = "figures"
 NARROW = "narrow"
-"""Folder of the figures for phones, in that of the figures."""
+"""Subfolder of `FIGURES` with the figures for phones."""
 FILM = "film.mp4"
 LINKED = (".rrd", ".mp4", ".npz")
 """Suffixes of recordings, films and logs in the folder, to which the page links."""
@@ -362,7 +362,7 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
     if not path.is_file():
         raise ValueError(
             f"{folder} has no {REPORT}: it is not the folder of a run, or the run failed "
-            "before its report."
+            "before its report was written."
         )
     advice = "read it with the package that wrote it, or repeat the run"
     return _from_file(read_json(path, _ReportFile, advice), folder)
@@ -423,7 +423,7 @@ def software_versions() -> dict[str, str]:
 def show_command(path: str | os.PathLike[str]) -> str:
     """Shell command that opens the dashboard of a run or a recording.
 
-    It names the program by its path if another one, or none, is on the search path.
+    The command contains the program's path, unless the search path leads to this program.
     """
     python = Path(sys.executable)
     program = python.with_name("hrc")
@@ -450,7 +450,7 @@ def show_measurements(
     more: int = 0,
     elsewhere: str = "the report",
 ) -> None:
-    """Print measured values with their targets: the missed, and the first of the others.
+    """Print measured values with their targets: all that missed, and the first of the others.
 
     Args:
         table: The values.
@@ -462,7 +462,7 @@ def show_measurements(
     from rich.table import Table
     from rich.text import Text
 
-    # As text: brackets in the name of a folder are no markup.
+    # As Text, so that brackets in the name of a folder are not read as markup.
     shown = Table("measured", "value", "target", "", title=Text(title))
     marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
     first, others = leading(table, _ROWS)

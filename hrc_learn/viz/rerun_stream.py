@@ -19,10 +19,10 @@ from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab
 
 TIMELINE = "time"
-"""All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
+"""Timeline of all data [s]: the viewer shows only one timeline at a time."""
 
 POSE_RATE = 30.0
-"""Poses and dots sent a second: as many as the eye sees."""
+"""Poses and dots sent per second: more would not be visible."""
 _PATH_POINTS = 400
 
 
@@ -39,7 +39,7 @@ def rrd_file(
     """
     with new_file(Path(path)) as part:
         stream = rr.RecordingStream("hrc_learn")
-        # Not by `stream.save`: on a full disk it loses data, and its `flush` never returns.
+        # Not `stream.save`: on a full disk it loses data, and its `flush` never returns.
         content = stream.binary_stream()
         try:
             if blueprint is not None:
@@ -49,12 +49,12 @@ def rrd_file(
             yield stream
             part.write_bytes(content.read() or b"")
         finally:
-            content.read()  # Rerun warns of data that are not taken
+            content.read()  # Rerun warns of data that are not read
             stream.disconnect()
 
 
 def begin(stream: rr.RecordingStream, title: str) -> None:
-    """Send the name of a recording and the direction of up."""
+    """Send the name of a recording and its upward direction."""
     stream.send_recording_name(title)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
@@ -125,7 +125,7 @@ def body_path(body: Body) -> str:
 
 
 def send_shapes(stream: rr.RecordingStream, body: Body) -> None:
-    """Send the shapes of a body: its meshes, or else its capsules, and its boxes."""
+    """Send the shapes of a body: meshes and named boxes, or else capsules and all boxes."""
     path, plain = body_path(body), body.boxes
     for k, mesh in enumerate(body.meshes):
         for j, part in enumerate(read_mesh(mesh.path)):
@@ -208,13 +208,13 @@ def boxes(shapes: tuple[Box, ...]) -> rr.Boxes3D:
 
 
 def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
-    """Solid capsules; rerun's start at the origin and point along z."""
+    """Solid capsules, placed by transforms: Rerun's start at the origin and point along z."""
     start, end = (np.array([getattr(s, at) for s in shapes]) for at in ("start", "end"))
     axis = end - start
     length = np.linalg.norm(axis, axis=1)
     direction = axis / np.maximum(length, 1e-12)[:, None]
-    # Half way between z and the axis lies the normal of the turn by pi that swaps them; its
-    # quaternion is (0, normal). The tilt chooses x where both are opposite.
+    # A rotation by pi about the bisector of z and the axis takes z to the axis: the quaternion
+    # is (0, bisector). The small x component chooses the bisector x if both are opposite.
     half = direction + np.array([1e-9, 0.0, 1.0])
     normal = half / np.linalg.norm(half, axis=1, keepdims=True)
     return rr.Capsules3D(
@@ -305,7 +305,7 @@ def frame_view(
     Args:
         path: Points to show [m].
         base: Show the base of the robot as well.
-        direction: From the middle of the points to the eye, relative to their extent.
+        direction: Vector from the middle of the points to the eye, relative to their extent.
         nearest: Smallest extent [m].
     """
     points = np.concatenate([path, np.zeros((1, 3))]) if base else path
@@ -319,13 +319,13 @@ def frame_view(
 
 
 def samples(time: Float[np.ndarray, " time"], rate: float) -> Int[np.ndarray, " chosen"]:
-    """Indices of about `rate` samples a second, the first and the last among them."""
+    """Indices of about `rate` samples per second, including the first and the last."""
     wanted = np.arange(time[0], time[-1], 1.0 / rate)
     return np.unique(np.append(np.searchsorted(time, wanted), len(time) - 1))
 
 
 def thin(path: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
-    """A path of at most a few hundred of its points, ends kept."""
+    """Path reduced to at most a few hundred points, including both ends."""
     if len(path) <= _PATH_POINTS:
         return path
     return path[np.linspace(0, len(path) - 1, _PATH_POINTS).astype(int)]
@@ -392,7 +392,7 @@ class CameraStream:
         trails = [[thin(camera.feature[: end + 1][seen[: end + 1]])] for end in ends]
         self._send_lines(f"{_ROOT}/path", time[ends], trails, palette.SKY)
         orange = [palette.rgba(palette.ORANGE)]
-        # A negative radius is in points of the screen, whatever the zoom.
+        # A negative radius is in screen points, independent of the zoom.
         dot = rr.Points2D.from_fields(radii=[-5.0], colors=orange, draw_order=30.0)
         self._still.send(f"{_ROOT}/feature", dot)
         # A sample without points removes the mark while the feature is not seen.

@@ -51,7 +51,7 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
-        # On the work; a camera that watches from afar would make it small.
+        # Frames the path only: with a distant camera in view, the robot would be small.
         eye_controls=frame_view(run.position),
     )
     left: list[rrb.View] = [scene]
@@ -69,14 +69,14 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
     views = [tab_view(tab, span) for tab in tabs]
     right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=views, active_tab=0)]
     if run.phases:
-        # The text tells the time as well: all other columns would only narrow it.
+        # The text contains the time, too: other columns would only make the text narrower.
         text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
         right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
     tabs_and_text = rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)])
     return dashboard(left, [tabs_and_text], row_shares=(3, 2))
 
 
-_PATH_RATE = 6.0  # times a second at which the growing path is sent anew
+_PATH_RATE = 6.0  # rate at which the growing path is sent again [1/s]
 
 
 class RunStream:
@@ -166,7 +166,7 @@ class RunStream:
             self._send_region(time[at], run.active_region[at], drawn[at])
         if run.camera is not None:
             self._camera.send_overlays(time, run.camera, at, ends)
-        # Plots of the overview show curves of other tabs.
+        # The overview shows curves of other tabs: each curve is sent once.
         plots = [plot for tab in run_tabs(run) for plot in tab.plots]
         for curves in {c.path: c for plot in plots for c in plot.curves}.values():
             self._still.send(curves.path, style(curves), key=curves.names)
@@ -272,14 +272,14 @@ def _plot(name: str, values: Shaped[np.ndarray, "rows curves"]) -> Plot:
     return Plot(title=name, curves=(curves,), legend=True)
 
 
-_DUTY_CYCLE = 0.2  # largest fraction of the time of a thread spent on sending
+_DUTY_CYCLE = 0.2  # largest fraction of the thread's time spent on sending
 
 
 @contextmanager
 def live_sender(send: Callable[[], object], *, period: float = 0.25) -> Iterator[None]:
     """Call a function a few times a second in a thread, and once more at the end.
 
-    An error of the function ends the thread and is raised where the `with` block is left.
+    An error of the function ends the thread and is raised at the end of the `with` block.
 
         log = StepLog()
         with live_sender(LogStream(log, stream, ["joint_position", "feature"]).send):
@@ -321,7 +321,7 @@ def live_dashboard(
     *,
     period: float = 0.25,
 ) -> Iterator[None]:
-    """Show a run while it goes on, in the layout of `record_run`.
+    """Show a run in progress, in the layout of `record_run`.
 
     Args:
         stream: Recording stream; `teleoperation.dashboard_page.serve_stream` makes one for a
