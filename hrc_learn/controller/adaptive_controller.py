@@ -82,7 +82,7 @@ class ControllerConfig:
         check_settings(
             self,
             positive=(*speeds, *approach, "vision_rate", "null_damping"),
-            not_negative=["drift_compensation_rate"],
+            not_negative=("drift_compensation_rate", "command_delay"),
         )
 
     @classmethod

@@ -272,6 +272,7 @@ class ArmLoop:
         pace = state.pace.limited(torch.where(slowed, left, 1.0), self.config.dt)
         change = (velocity - state.safety.velocity) / self.config.dt
         safety = self.safety.initial_state(q, velocity, change)
+        safety = replace(safety, counts=state.safety.counts)
         state = replace(_without_path(state), safety=safety, pace=pace)
         report = ArmReport(command.safety)
         if reading.explain:

@@ -57,7 +57,9 @@ class ArmLoopConfig(YieldingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_settings(self, positive=["dt"], fraction=["speed"])
+        positive = "dt", "longest_wait", "back_after", "direct_return_after"
+        not_negative = "command_delay", "limit_margin"
+        check_settings(self, positive=positive, not_negative=not_negative, fraction=["speed"])
 
 
 @pytree

@@ -84,7 +84,9 @@ class YieldingConfig:
     them: three times the calibration errors of base and table."""
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=["damping", "nullspace_rise", "return_speed"])
+        speeds = "elbow_speed", "return_speed"
+        positive = "damping", "nullspace_rise", "pose_gain", *speeds
+        check_settings(self, positive=positive, not_negative=["clearance"])
 
 
 def guided_elbow_speed(cap: float) -> float:

@@ -248,6 +248,8 @@ def test_bad_settings_are_refused():
         ControllerConfig(null_damping=0.0)
     with pytest.raises(ValueError, match="drift_compensation_rate must not be negative"):
         ControllerConfig(drift_compensation_rate=-1.0)
+    with pytest.raises(ValueError, match="command_delay must not be negative"):
+        ControllerConfig(command_delay=-0.01)
 
 
 # One joint is not known.

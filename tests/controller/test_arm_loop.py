@@ -173,7 +173,18 @@ def test_the_speed_must_be_a_fraction():
         ArmLoopConfig(speed=1.5)
 
 
-@pytest.mark.parametrize("name", ["dt", "damping", "nullspace_rise", "return_speed"])
-def test_a_setting_that_is_a_divisor_is_above_zero(name):
+DIVISORS = ["dt", "damping", "nullspace_rise", "pose_gain", "elbow_speed", "return_speed"]
+TIMES = ["longest_wait", "back_after", "direct_return_after"]
+
+
+@pytest.mark.parametrize("name", DIVISORS + TIMES)
+def test_a_setting_that_is_a_divisor_or_a_time_is_above_zero(name):
     with pytest.raises(ValueError, match=f"{name} must be positive, but is 0"):
         ArmLoopConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("name", ["command_delay", "limit_margin", "clearance"])
+def test_delays_and_margins_are_not_negative(name):
+    ArmLoopConfig(**{name: 0.0})
+    with pytest.raises(ValueError, match=f"{name} must not be negative"):
+        ArmLoopConfig(**{name: -0.01})

@@ -7,7 +7,7 @@ import pytest
 import torch
 from projections import null_space_projector
 
-from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig
+from hrc_learn.controller import Command, ConstraintConfig, Distances, SafetyConfig
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
@@ -287,3 +287,29 @@ def test_only_people_ahead_take_time_from_the_task():
     assert float(report.safety.constraints.slowed) < 1e-3
     assert report.safety.acted("acceleration")
     assert float(after.pace.people_scale) == 1.0
+
+
+def test_a_command_of_the_controller_keeps_the_counts_of_interventions():
+    law, six, two = loop(), Q.new_zeros(6), Q.new_zeros(2)
+    wanted = MoveJoints(joint_velocity=torch.full_like(Q, 99.0))
+    _, state, report = law.step(law.initial_state(Q), reading(), wanted)
+    assert state.safety.count("velocity") == 1
+    sent = Command(
+        joint_velocity=state.safety.velocity,
+        twist=six,
+        null_velocity=0 * Q,
+        xi_x=two,
+        xi_r=six,
+        xi_q=0 * Q,
+        s=six,
+        image_jacobian=Q.new_zeros(2, 6),
+        weight_norm=Q.new_zeros(()),
+        vision_level=Q.new_zeros(()),
+        potential=Q.new_zeros(()),
+        potential_rate=Q.new_zeros(()),
+        safety=report.safety,
+    )
+    velocity, after, _ = law.step(state, reading(), sent)
+    torch.testing.assert_close(velocity, sent.joint_velocity)
+    torch.testing.assert_close(after.safety.velocity, velocity)
+    assert torch.equal(after.safety.counts, state.safety.counts)
