@@ -144,7 +144,7 @@ class LoopWatch:
         late, actions = self._quality.late(LATE), len(self._quality.arrivals)
         if self._in_real_time and len(late) > TOLERATED * actions:
             logger.warning(
-                "%s: %d of %d actions came late, by %.0f ms at most: what was recorded lacks "
+                "%s: %d of %d actions came late, by %.0f ms at most: the recording lacks "
                 "about %d frames, and moves faster there than the arm did. Record again with "
                 "fewer or smaller images, a lower --dataset.fps, or nothing else to compute",
                 self._name,
@@ -211,8 +211,9 @@ class ArmRobot(Device, Robot):
     """Arm commanded by joint positions or by the pose of its end effector.
 
     Actions of either space are accepted, and the gripper's opening may be omitted. So
-    lerobot-rollout can also return the arm to its first position. Motions respect the joint
-    limits only; `send_action` returns the commanded values.
+    lerobot-rollout can also return the arm to its first position. Motions keep the limits of
+    the joints and of the tool speed, but do not avoid obstacles; `send_action` returns the
+    commanded values.
 
     With a person (`ArmRobotConfig.person`) actions command the end effector only, while the
     person guides the body (`ComplementaryMotion`).

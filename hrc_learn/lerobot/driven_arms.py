@@ -197,7 +197,7 @@ class Ros2ArmRobotConfig(DrivenArmConfig):
 
 
 class Ros2ArmRobot(DrivenArm):
-    """An arm of ros2_control for LeRobot's own commands."""
+    """An arm controlled by ros2_control, for LeRobot's own commands."""
 
     config_class = Ros2ArmRobotConfig
     name = "ros2"

@@ -26,7 +26,7 @@ from hrc_learn.store import DATASET, replacing
 
 
 def observation_features(robot: ArmRobot) -> dict[str, dict]:
-    """Dataset features of a robot's observations, the person's values in their own columns."""
+    """Dataset features of a robot's observations, with separate columns for the person."""
     values = robot.observation_features.items()
     rest = {name: shape for name, shape in values if name not in robot.person_names}
     features = hw_to_dataset_features(rest, OBS_STR)

@@ -146,7 +146,7 @@ class PositionServo:
         if not 0 < dt <= config.safety.longest_step:
             raise ValueError(
                 f"targets must come within {config.safety.longest_step:g} s of each other, but "
-                f"dt is {dt:g} s: raise the rate of frames."
+                f"dt is {dt:g} s: raise the frame rate."
             )
         # Tighter than the limits of the safety filter, which then need not intervene.
         limits, margin = chain.limits, 1.5 * config.safety.margin

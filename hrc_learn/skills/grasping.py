@@ -4,8 +4,8 @@
       ^         |                    |
       +---------+---- start over ----+
 
-In servo, the arm approaches in joint space and then follows the paper's vision-based control.
-In interact, it keeps servoing while a person pulls the elbow, if the job gives time for it.
+Servo consists of the paper's joint-space approach and its vision-based control. In interact,
+servoing continues while a person pulls the elbow, if the job gives time for that.
 Recoveries from failures are noted in the job:
 
 - occluded marker of the end effector: the controller holds the end effector until the marker is

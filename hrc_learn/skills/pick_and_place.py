@@ -8,7 +8,7 @@ Picking is `Grasping.grasp`, or a hand-over by a person; home to release is the 
 phase is a method that does its work and returns the next phase. In addition to the recoveries
 of grasping, these are noted in the job:
 
-- object dropped over the table: the arm starts over from home;
+- dropped object: the arm starts over from home, up to a number of attempts;
 - blocked path: another height, via point or arm angle, then waiting; finally the object is put
 back.
 """
@@ -173,8 +173,8 @@ class PickAndPlace:
     ) -> list[PickPlaceJob]:
         """Deliver objects one after the other.
 
-        An object that cannot be delivered stays on the table, and the next one is started. The
-        run ends early only if the arm cannot go home.
+        If an object cannot be delivered, the next one is started. The run ends early if a job
+        fails with an error, for example because the arm cannot go home or a person stops it.
 
         Args:
             orders: Objects, each with the name of its shelf.

@@ -144,7 +144,7 @@ class ServoCommand(NamedTuple):
 
 
 class ServoStep:
-    """Pure step of visual servoing round the adaptive controller."""
+    """Pure step of visual servoing with the adaptive controller."""
 
     def __init__(
         self,
@@ -445,7 +445,7 @@ class VisualServo:
         raise MissedGraspError(
             f"visual servoing: after {config.max_probes} probes the end effector may still be "
             f"{1e3 * error:.1f} mm off the object, more than {1e3 * config.object_error:.1f}: "
-            "see that the camera stands still and the marker is in view."
+            "check that the camera stands still and the marker is in view."
         )
 
     def hold(self, target: ServoTarget, duration: float) -> None:

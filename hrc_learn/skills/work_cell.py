@@ -224,7 +224,7 @@ class WorkCell:
         return float(self.pace.time)
 
     def watchful(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that keeps its distance from the people tracked here."""
+        """Settings of a safety filter that keeps the distance from the tracked people."""
         return safety if self._watch is None else self._watch.watchful(safety)
 
     # Messages and images.
@@ -364,7 +364,7 @@ class WorkCell:
             now = float(np.mean(felt))
             free = now if free is None else free
             if now - free > force:
-                # The arm pressed on while readings were averaged: the pose before that counts.
+                # The arm pressed on while readings were averaged: the contact was at before[0].
                 self.hold_pose(_AVERAGED * self.config.dt)
                 return before[0]
         return None

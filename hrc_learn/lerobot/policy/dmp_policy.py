@@ -34,7 +34,7 @@ __all__ = ["DMPConfig", "DMPPolicy", "make_dmp_pre_post_processors", "write_clos
 logger = logging.getLogger(__name__)
 
 EARLIEST = -1_000_000
-"""Offset [frames] for which LeRobot, which stays within the episode, loads the first frame."""
+"""Offset that LeRobot clamps to the first frame of the episode [frames]."""
 
 
 @PreTrainedConfig.register_subclass("dmp")

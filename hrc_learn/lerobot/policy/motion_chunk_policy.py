@@ -99,9 +99,10 @@ class MotionChunkConfig(MotionPolicyConfig):
     """Indices of the action's components that jump between two levels, such as a gripper that
     is open or closed; None: detected from the dataset's statistics."""
     blend_time: float | None = None
-    """Approximate time from the executed motion to the plan [s]; None: 0.05 s or one action
-    period, the longer, but at most 0.3 of the spacing of basis functions. A plan with close
-    basis functions has an uneven acceleration, which a longer blend would continue."""
+    """Approximate time in which a chunk changes from the executed motion to the plan [s]; None:
+    the longer of 0.05 s and one action period, but at most 0.3 of the spacing of basis
+    functions. The closer they are, the larger are errors of a plan's acceleration, which the
+    next chunk continues for this time."""
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-2
     scheduler_decay_steps: int = 20_000

@@ -55,10 +55,10 @@ class ChunkDecoder(nn.Module):
         Args:
             chunk_size: Actions of a chunk.
             step: Time between actions [s].
-            n_basis: N, weights a column; None: 10, or two for five actions.
-            blend_time: Approximate time from the executed motion to the plan [s]; None: 0.05 s
-                or one action period, the longer, but at most `BLEND_SHARE` of the spacing of
-                basis functions.
+            n_basis: N, weights a column; None: 10, or two per five actions if that is fewer.
+            blend_time: Approximate time in which a chunk changes from the executed motion to
+                the plan [s]; None: the longer of 0.05 s and one action period, but at most
+                `BLEND_SHARE` of the spacing of basis functions.
         """
         super().__init__()
         n_basis = n_basis or min(BASIS, max(2, int(chunk_size / ACTIONS_EACH)))

@@ -150,7 +150,7 @@ class MotionPolicy(PreTrainedPolicy):
 
         Args:
             config: Configuration with known features.
-            dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from.
+            dataset_meta: `LeRobotDatasetMetadata` with the frame rate.
 
         Raises:
             ValueError: The policy cannot work with the features, or the frame rate is unknown
@@ -304,7 +304,7 @@ MOST = 256
 def read_episodes(
     root: str | Path, keys: Sequence[str], episodes: Sequence[int] | None = None
 ) -> list[dict[str, Tensor]]:
-    """Columns of whole episodes, (frames, components) each, just as they are on disk.
+    """Columns of whole episodes, (frames, components) each, unchanged from disk.
 
     Args:
         root: Folder of a LeRobot dataset.

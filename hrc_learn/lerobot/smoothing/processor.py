@@ -31,7 +31,7 @@ PREPROCESSOR = "policy_preprocessor.json"
 POSTPROCESSOR = "policy_postprocessor.json"
 
 _JUMP = 5.0
-"""Multiple of the velocity limit above which the robot was put elsewhere: an episode began."""
+"""Multiple of the velocity limit above which a robot counts as reset for a new episode."""
 _SAME = 1e-6
 """Changes below this are rounding."""
 

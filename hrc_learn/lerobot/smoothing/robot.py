@@ -127,7 +127,7 @@ class ActionUpsampler:
             RuntimeError: There was no `reset`.
         """
         if self._points is None:
-            raise RuntimeError("reset() says where the robot is: call it first")
+            raise RuntimeError("call reset() with the position of the robot first")
         action = self._checked(action)
         action = np.where(np.isfinite(action), action, self._newest)
         ahead = action + self._lead * (action - self._newest)
