@@ -1,10 +1,9 @@
-"""Detection of tool and objects without markers, by SIFT features of reference views (Lowe
-2004).
+"""Detection of tool and objects without markers, by SIFT features (Lowe 2004).
 
 A tool is a cloud of points fixed to a link of the arm; its pixel is that of one place on the
-link, computed by perspective-n-point from all matching points. An object is a set of views; a
-similarity between one view and the image gives its pixel and direction. Every finding has a
-covariance; None means that nothing was found.
+link, computed by perspective-n-point from all matching points. An object is a set of reference
+views; the similarity between one view and the image gives the object's pixel and direction.
+Every finding has a covariance; None means that nothing was found.
 """
 
 from __future__ import annotations
