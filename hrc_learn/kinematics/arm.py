@@ -246,9 +246,9 @@ class Arm(SerialChain):
     ) -> Float[Tensor, "*batch joints"]:
         """Joint positions within the limits that bring the tool centre point to poses [rad].
 
-        Without `near`, the last batch dimension is a path: the first solution is the one
-        closest to the ready posture, each further one the closest to the solution before, so
-        that neighbouring poses have neighbouring solutions. With `near`, each pose is solved by
+        Without `near`, the last batch dimension is a path: the first solution is the closest to
+        the ready posture, and each further one is the closest to the previous solution, so that
+        neighbouring poses have neighbouring solutions. With `near`, each pose is solved by
         itself. Not differentiable.
 
         Args:

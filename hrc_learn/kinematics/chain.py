@@ -193,10 +193,10 @@ class SerialChain:
     def with_tool(
         self, tcp: Float[Tensor, "4 4"], flange: Float[Tensor, "4 4"] | None = None
     ) -> SerialChain:
-        """The same chain with another tool centre point, in the frame of the flange.
+        """The same chain with another tool centre point.
 
         Args:
-            tcp: Frame of the tool centre point.
+            tcp: Tool centre point in the frame of the flange.
             flange: Another flange, in the frame of the last joint; None: the same.
         """
         return SerialChain(

@@ -273,7 +273,7 @@ def nearest_on_segment_and_box(
 
 @dataclass(frozen=True, kw_only=True)
 class GraspedBox:
-    """A box between the fingers, its edges along the axes of the tool's frame."""
+    """A box between the fingers, with edges along the axes of the tool's frame."""
 
     half_size: tuple[float, float, float]
     """Half of its edges along x, y (the line of closing) and z of the tool [m]."""
@@ -297,8 +297,8 @@ class Separation:
     distance: Float[Tensor, "*batch C H"]
     """Between the surfaces; negative is the depth to which two capsules overlap [m]."""
     direction: Float[Tensor, "*batch C H 3"]
-    """Unit vector from the arm to the person; zero, as undefined, where the axes of two
-    capsules meet or the axis of the person's capsule enters the held box."""
+    """Unit vector from the arm to the person. It is undefined, and set to zero, where the axes
+    of two capsules meet or the axis of the person's capsule enters the held box."""
     fraction: Float[Tensor, "*batch C H"]
     """Nearest point on the axis of the person's capsule, 0 to 1 from its first end."""
     arm_point: Float[Tensor, "*batch C H 3"]

@@ -33,7 +33,7 @@ from hrc_learn.kinematics.mjcf import read_mjcf
 from hrc_learn.kinematics.urdf import read_urdf
 
 type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
-"""Limits that replace or complete those of a description, see `complete_limits`, or a file."""
+"""Limits that replace or complete those of a file (see `complete_limits`), or a TOML file."""
 
 type FittedBody = tuple[Sequence[LinkCapsule], Sequence[tuple[int, int]]]
 """Capsules of an arm, and pairs of links that overlap by design, besides neighbours."""
@@ -324,7 +324,7 @@ def _inertias(
         if link.inertia is not None:
             more, before = pose @ link.inertia @ pose.T, inertia[number]
             inertia[number] = more if before is None else before + more
-    # The frame of the flange carries no bodies; that of the tool none without a gripper.
+    # The frame of the flange carries no bodies, nor does that of the tool without a gripper.
     for number in {last + 1, last + 2} - {number for number, _ in bodies.values()}:
         masses[number], inertia[number] = 0.0, np.zeros((4, 4))
     return {"masses": tuple(masses), "inertia": tuple(inertia)}

@@ -62,7 +62,7 @@ def pseudo_inertia(
     centre: Sequence[float] | Float[np.ndarray, "3"],
     inertia: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """Pseudo-inertia P = [[S, m c], [m c^T, m]] of a body, S its second moments about zero.
+    """Pseudo-inertia P = [[S, m c], [m c^T, m]], with second moments S about the origin.
 
     Pseudo-inertias of bodies that move together add up. In a frame in which the body's frame
     has the pose T, P becomes T P T^T (Wensing et al. 2018, "Linear matrix inequalities for
@@ -157,7 +157,7 @@ class Description:
 
         Raises:
             ValueError: A name is used twice, a joint names a link that does not exist, a link
-                has two parents, joints form a cycle, or joints are absurdly far apart.
+                has two parents, joints form a cycle, or parts are 100 m or more apart.
         """
         if not links:
             raise ValueError(f"{path} has no links: is it complete, and is its xacro expanded?")
@@ -374,7 +374,7 @@ def turn_to(axis: Float[np.ndarray, "3"]) -> Transform:
     turn = np.eye(4)
     along = int(np.abs(axis).argmax())
     if abs(axis[along]) == 1.0:
-        # A cyclic permutation of the axes has no rounding. Half a turn reverses the axis.
+        # Permuting the axes causes no rounding errors. Half a turn reverses the axis.
         turn[:3, :3] = np.roll(np.eye(3), along + 1, axis=0)
         if axis[along] < 0:
             turn[:3, :3] = turn[:3, :3] @ np.diag([1.0, -1.0, -1.0])

@@ -20,7 +20,7 @@ from hrc_learn.kinematics.description import pseudo_inertia
 
 @final
 class MassMatrix:
-    """Mass matrix of an arm with its gripper and what the gripper holds.
+    """Mass matrix of an arm with its gripper and a held load.
 
     Bodies without an inertia in the description have their mass spread evenly over the axes of
     their capsules.
@@ -58,7 +58,7 @@ class MassMatrix:
         """
         frames, n = self._arm.link_frames(q), self._arm.joints
         axis, origin = frames[..., :n, :, 2], frames[..., :n, :, 3]
-        # Derivatives of all frames by all joints: z x (x - o) for a joint that turns.
+        # Derivatives of frames with respect to joints: z x (x - o) for a joint that turns.
         about = frames.unsqueeze(-3) - _at_last(origin)[..., None, :, :, :]
         turned = torch.linalg.cross(axis[..., None, :, :, None], about, dim=-2)
         slid = _at_last(axis)[..., None, :, :, :].expand_as(turned)

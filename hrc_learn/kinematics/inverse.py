@@ -146,7 +146,7 @@ def position_first(J: Float[Tensor, "*batch 6 n"]) -> Float[Tensor, "*batch n 6"
     """Orthonormal basis of the tool's twists that an arm of three to five joints controls.
 
     Rows are the linear velocities, then the rotations that the joints cause while the position
-    rests: B = [I 0; 0 U^T], with U an orthonormal basis of the range of J_w Z and J_v Z = 0.
+    rests: B = [I 0; 0 U^T], with U an orthonormal basis of the range of J_w Z, where J_v Z = 0.
     Solving B J q_dot = B v moves the position as wanted, and turns the tool as near to the
     wanted rotation as the joints can.
 

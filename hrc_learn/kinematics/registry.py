@@ -39,7 +39,7 @@ _INSTALL = {
     "gym-aloha": "--no-deps gym-aloha==0.1.5",
 }
 _OWN = {"panda": panda, "fr3": fr3}
-# Words of robot types in LeRobot datasets that name no arm.
+# Words in the robot types of LeRobot datasets that do not identify an arm.
 _ROLES = re.compile("follower|leader|robot$|arm$|description$")
 
 CAPSULES = Path(__file__).with_name("capsules.json")

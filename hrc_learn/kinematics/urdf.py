@@ -259,7 +259,7 @@ class _Reader:
             values = [float(word) for word in self._attribute(element, key, what).split()]
         except ValueError:
             values = []
-        if "_" in (text or ""):  # which Python allows between digits
+        if "_" in (text or ""):  # allowed between digits in Python, but not in URDF
             values = []
         if len(values) != count or not all(map(math.isfinite, values)):
             raise ValueError(

@@ -106,7 +106,7 @@ def add_box(body, name: str, half_size, colour, **more):
 
 
 def add_capsule(body, name: str, capsule: Capsule, colour):
-    """Add a capsule to a body, or a sphere if the axis has no length: MuJoCo refuses that."""
+    """Add a capsule to a body, or a sphere if its length is zero, which MuJoCo refuses."""
     is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
     along = {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
     kind = mujoco.mjtGeom.mjGEOM_SPHERE if is_ball else mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -141,7 +141,7 @@ class ArmModelConfig:
     """ArUco plate on the end effector, in the gripper's frame."""
 
     def servo(self, joint: int) -> tuple[float, float]:
-        """Position [N m/rad] and velocity gain [N m s/rad] of a joint, counted from 0."""
+        """Position gain [N m/rad] and velocity gain [N m s/rad] of a joint, counted from 0."""
         if self.robot.name in _SERVOS:
             stiffness, damping = _SERVOS[self.robot.name]
             return stiffness[joint], damping[joint]
@@ -205,12 +205,12 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
         if a in names and b in names:
             spec.add_exclude(bodyname1=names[a], bodyname2=names[b])
         if a == 0 and b in names:
-            # The pedestal continues the base downwards: what overlaps one may overlap both.
+            # The pedestal continues the base: links that overlap the base may touch it.
             spec.add_exclude(bodyname1="world", bodyname2=names[b])
     spec.add_exclude(bodyname1="finger_left", bodyname2="finger_right")
 
 
-# Number of parallel capsules that cover a plate; they protrude by a sixth of its edge.
+# Number of parallel capsules that cover a plate. They protrude by a sixth of the plate's edge.
 _STRIPS = 3
 
 
@@ -377,8 +377,8 @@ class MujocoArm:
         self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
         self._finger_servos = np.array([model.actuator(n).id for n in fingers])
         self._reference = np.zeros(len(names))
-        # Mass of each of the arm's bodies that gravity compensation misses [kg]: an unknown
-        # load, and errors of the compensated link masses.
+        # Uncompensated mass of each of the arm's bodies [kg]: an unknown load, and errors of
+        # the link masses that the arm assumes.
         own = model.body_rootid == model.body("link0").id
         self._unknown = np.where(own, model.body_mass * (1.0 - model.body_gravcomp), 0.0)
         # Filtered estimate of the external torques [N m]; None: the filter starts anew.

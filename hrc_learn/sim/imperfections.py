@@ -24,7 +24,7 @@ _MOST_OBJECTS = 8
 # Constant lag of the simulated servos [s]: compensation reduces path errors from 1.5 to 0.4 mm.
 _SIMULATED_SERVOS = 0.01
 # Time from a control step to full braking of the arm [s]; distance by which person and arm may
-# protrude from their capsules, with the arm's calibration error [m].
+# protrude from their capsules, including the arm's calibration error [m].
 _RAMP, _BEYOND_CAPSULES = 0.02, 0.05
 _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 

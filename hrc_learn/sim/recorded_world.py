@@ -24,7 +24,7 @@ from hrc_learn.sim.world import World
 
 
 class MovingBodies:
-    """Links and fingers of the arm, objects, and obstacles and bodies of people."""
+    """Links and fingers of the arm, objects, obstacles, and the body of a worker."""
 
     def __init__(self, world: World):
         self._world = world
@@ -182,7 +182,7 @@ class MotionLog:
         """All moving bodies with shapes to draw, along their recorded poses.
 
         Args:
-            steps: The first steps only.
+            steps: Number of steps from the first on; None: all.
         """
         positions, orientations = zip(*self._poses[:steps], strict=True)
         return self._bodies.drawn(np.stack(positions), np.stack(orientations))
@@ -193,7 +193,7 @@ class MotionLog:
         Empty in a world without a worker.
 
         Args:
-            steps: The first steps only.
+            steps: Number of steps from the first on; None: all.
         """
         return tuple(self._nearest[:steps])
 

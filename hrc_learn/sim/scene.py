@@ -109,7 +109,7 @@ class ObjectConfig:
 
     name: str = "box"
     half_size: tuple[float, float, float] = (0.022, 0.040, 0.030)
-    """[m]; the gripper closes along its x."""
+    """Half edges [m]; the gripper closes along x of the box."""
     mass: float = 0.12
     """[kg]"""
     marker: Marker = field(default_factory=lambda: Marker(11, 0.030))

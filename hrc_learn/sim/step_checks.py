@@ -73,7 +73,7 @@ class ContactMonitor:
         return self._matters
 
     def update(self, data: mujoco.MjData) -> None:
-        """Look at the contacts of one step."""
+        """Record the watched contacts of one step."""
         running = {}
         for pair, depth in self._current(data).items():
             k = self._running.get(pair, len(self.touches))

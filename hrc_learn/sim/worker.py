@@ -80,7 +80,7 @@ IMAGE_RATE = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerConfig:
-    """Size and place of a body."""
+    """Stature of a worker and height of the floor."""
 
     stature: float = 1.75
     """Height of the standing body [m]."""
@@ -232,7 +232,7 @@ class Worker:
     def _add_limbs(
         self, own: np.ndarray, posture: Posture, pelvis: np.ndarray, neck: np.ndarray
     ) -> None:
-        """Arms and legs, those of both sides at once."""
+        """Add arms and legs, both sides at once."""
         h, sides = self._size, _SIDES * np.array([0.0, 1.0, 0.0])
         shoulder = neck[..., None, :] + _SHOULDER_HALF * h * sides
         hip = pelvis[..., None, :] + _PELVIS_HALF * h * sides

@@ -51,7 +51,7 @@ _SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (0
 _REACHES = (0.14, 0.1)
 # Shifts of the cabinet, along the base's x axis and upwards [m].
 _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
-# The same shift upwards for short arms with thick wrists, which reach down to their shelves.
+# Upward shift for short arms with thick wrists, which reach down to their shelves [m].
 _DOWN = -0.3
 # Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
@@ -171,7 +171,7 @@ class Workplace:
     def approached(self, approach: Approach | None) -> "Workplace":
         """The same workplace with the demonstrated orientation above the table, if any.
 
-        An arm of fewer than six joints keeps pointing straight down: that it can do all over
+        An arm of fewer than six joints keeps pointing straight down, which it can do all over
         the table.
         """
         if approach is None or self.robot.task == "nearest pose":
@@ -446,7 +446,7 @@ def _placed(
     depth: float,
     far: float = 1.0,
 ) -> Workplace:
-    """The usual workplace with other distances, its cabinet `far` times as far as its table."""
+    """The usual workplace with other distances, the cabinet's `far` times the table's."""
     place, cabinet, table = Workplace(), usual.cabinet, usual.table
     size = usual.arm.robot.hand_size
     scale, along, higher, depth = (size * x for x in (scale, along, higher, depth))

@@ -1,8 +1,8 @@
 """Realistic images, with lens distortion, blur and sensor noise, and a camera without OpenGL.
 
-The camera draws markers by exact ray casting into a static background, all that visual servoing
-needs, in a fraction of a renderer's time. Sweeps and machines without OpenGL use it in place of
-the simulator's camera.
+The camera draws only markers, by exact ray casting into a static background: they are enough
+for visual servoing and take a fraction of a renderer's time. Sweeps and machines without OpenGL
+use this camera in place of the simulator's.
 """
 
 import zlib

@@ -36,7 +36,7 @@ _SCALES = (0.5, 2.0)
 _MARGIN = 70
 # Number of images between full-resolution searches for items that stay unseen.
 _CLOSE_LOOK_EVERY = 5
-# Width of images for which half the resolution shows enough, if exceeded [px].
+# Only images wider than this are searched at half resolution [px].
 _LARGE = 960
 
 # Change of grey level from which on a pixel counts as changed, and width by which such areas
@@ -94,7 +94,7 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Place of something in an image."""
+    """Place of a tool or an object in an image."""
 
     pixel: Float[np.ndarray, "2"]
     """(u, v) [px]."""
@@ -190,7 +190,7 @@ class Object:
     """Views of an object, each with its features around the object's middle."""
 
     views: tuple[Features, ...]
-    """Pixels relative to the middle, turned to its direction, at the first view's size."""
+    """Features relative to the object's middle and direction, at the first view's size [px]."""
 
     def find(self, seen: Features, width: int) -> Finding | None:
         """Find the object among an image's features; None: not found."""

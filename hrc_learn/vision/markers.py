@@ -48,7 +48,7 @@ class Marker:
     def corners(self) -> Float[np.ndarray, "4 3"]:
         """Corners of the black square in the marker frame [m].
 
-        In the order in which detectors report them: top left, top right, bottom right,
+        They are in the order in which detectors report them: top left, top right, bottom right,
         bottom left of the upright marker.
         """
         return self.size * _UNIT_SQUARE
@@ -72,7 +72,7 @@ def marker_texture(id: int, pixels: int) -> UInt8[np.ndarray, "pixels pixels"]:
 
     Args:
         id: Number in the 4x4_50 dictionary.
-        pixels: Edge of the picture [px], a multiple of 8: a whole number for each module.
+        pixels: Edge of the picture [px]: a multiple of 8, so that modules are whole pixels.
 
     Raises:
         ValueError: If `pixels` is not a positive multiple of 8.
