@@ -154,11 +154,11 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
     """One list of all episodes; tables may differ in their columns."""
     try:
         table = pa.concat_tables(tables, promote_options="permissive")
-    except pa.ArrowException:  # the same values in lists of another type
+    except pa.ArrowException:  # lists of the same values may differ in type
         table = _table_of([row for table in tables for row in table.to_pylist()])
     places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
     table = table.drop_columns([name for name in places if name in table.column_names])
-    for name in places:  # the list is one file
+    for name in places:  # the list is a single file
         table = table.append_column(name, pa.array(np.zeros(len(table), np.int64)))
     return table
 
@@ -277,7 +277,7 @@ class _Recording:
 
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
     episodes: store.Count | None = None
-    """Number of episodes of the dataset that it extends; None for a new one."""
+    """Number of episodes of the dataset that the recording extends; None for a new one."""
 
 
 def begin(root: Path, earlier_episodes: int | None) -> None:
@@ -412,7 +412,7 @@ def recover_all(path: str | Path) -> list[str]:
 
 def discard(staging: Path) -> None:
     """Remove the folder of a recording; if it holds foreign files, rename it and keep these."""
-    # The header is removed last: it identifies the folder if this is interrupted too.
+    # The header is removed last: it identifies the folder if the removal is interrupted too.
     store.delete_files(staging, _FILES)
     if not store.delete_files(staging, [_RECORDING]):
         kept = (staging.with_name(f"{staging.name}.kept{n or ''}") for n in itertools.count())

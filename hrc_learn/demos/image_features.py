@@ -25,7 +25,7 @@ from hrc_learn.demos.videos import VideoSegment, decode, image_key, read_segment
 from hrc_learn.store import new_file
 
 _SOURCE = b"hrc_learn.video"
-_ADVICE = "hrc fit image-jacobian --marker N searches the videos that are left"
+_ADVICE = "hrc fit image-jacobian --marker N searches the remaining videos"
 
 Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
 """Pixel (u right, v down) of the feature in an RGB image, or None if it is not visible."""

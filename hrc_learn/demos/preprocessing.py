@@ -488,11 +488,11 @@ _VELOCITY_WINDOW = 0.1
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of the demonstration of median duration.
+    """Warp every demonstration to the timing of a reference, that of median duration.
 
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled
-    likewise. Afterwards, all demonstrations have the frames of that reference, and frame k of
+    likewise. Afterwards, all demonstrations have the frames of the reference, and frame k of
     each shows the same phase of the task. Recorded joint velocities are estimated anew.
 
     Args:

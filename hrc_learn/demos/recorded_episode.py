@@ -37,7 +37,7 @@ class RecordedColumn:
     role: str | None
     """Role under which the reader finds it; None for a user-defined feature."""
     key: str
-    """Feature of the dataset that holds it."""
+    """Feature of the dataset that holds the quantity."""
     names: tuple[str, ...]
     """Component names within that feature; in `_COLUMNS`, `{joint}` stands for each joint."""
 

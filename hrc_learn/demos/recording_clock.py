@@ -101,7 +101,7 @@ def _thinned(
 def _stamps_of_state(
     recording: Recording, meaning: Meaning, options: ImportOptions
 ) -> tuple[Float64[np.ndarray, " frames"], list[str]]:
-    """Stamps of the state [s], even ones if only a duration or rate is known, and notes."""
+    """Stamps of the state [s], evenly spaced if only a duration or rate is known, and notes."""
     fields, frames = recording.fields, recording.fields[meaning.main].frames
     if frames < 2:
         raise recording.error(f"a demonstration needs at least two frames, got {frames}")
@@ -181,7 +181,7 @@ def _latest(
         text = (
             f"arrays differ in their numbers of frames: it has {length}, the state {len(time)}"
         )
-        raise recording.error(f"{text}, and no stamps are its own", name)
+        raise recording.error(f"{text}, and it has no stamps of its own", name)
     # The tolerance is for stamps that were rounded.
     index = np.searchsorted(stamps, time + 1e-6, side="right") - 1
     old = time - stamps[np.maximum(index, 0)] > longest_hold(stamps)

@@ -34,8 +34,8 @@ _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 """Number of episodes and frame rate [1/s] for comparing commands with joints. At this rate, the
 longest delay that is tried is 30 frames."""
 _ALIKE = 0.3
-"""Largest distance of a joint's nearest command, as a fraction of the second nearest one's, at
-which the order of the commands is clear."""
+"""The order of unnamed commands is clear if the nearest command of each joint is closer than
+this fraction of the distance of the second nearest one."""
 
 
 @dataclass(kw_only=True)

@@ -103,7 +103,7 @@ def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str,
 
 
 class FieldSearch:
-    """Features made of the numeric fields of an episode, and the fields that become none.
+    """Features made of the numeric fields of an episode, and fields that become no features.
 
     Attributes:
         features: Features by key.

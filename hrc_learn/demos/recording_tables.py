@@ -186,7 +186,7 @@ def _arrow_columns(path: Path, table: pa.Table) -> Table:
             widths = {0 if row is None else len(row) for row in rows}
             if len(widths) > 1:
                 text = f"holds vectors of {min(widths)} to {max(widths)} components"
-                raise DatasetError(f"{text}: all frames need as many", file=path, key=name)
+                raise DatasetError(f"{text}: all must be of one length", file=path, key=name)
             vectors = np.stack([*rows])
             if vectors.dtype != object:
                 found[name] = vectors

@@ -280,7 +280,7 @@ _CODEC = {"preset": "ultrafast", "crf": "20", "g": "2"}
 1440x1080 frame instead of 25 ms, for twice the size. Every second frame is a key frame, as in
 LeRobot: policies read single frames."""
 _SAMPLE_EVERY = 5
-"""Frames per image that enters the statistics, as in LeRobot."""
+"""Number of frames per image that enters the statistics, as in LeRobot."""
 
 
 def video_path(folder: Path, key: str, episode: int) -> Path:

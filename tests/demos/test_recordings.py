@@ -309,7 +309,7 @@ def dataset(path):
         ),
         (
             clocks(gripper=np.full(30, 0.01)),
-            "it has 30, the state 40, and no stamps are its own",
+            "it has 30, the state 40, and it has no stamps of its own",
         ),
     ],
 )

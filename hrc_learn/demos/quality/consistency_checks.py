@@ -43,7 +43,7 @@ hobby servos stop within a few degrees under load."""
 
 
 def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
-    """Report episodes that seem interrupted, or to hold several demonstrations."""
+    """Report unusually short or long episodes: interrupted ones, or several in one."""
     if len(entries) <= FEWEST:
         return
     usual = float(np.median([entry.length for entry in entries]))
@@ -270,7 +270,7 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
 def command_tracking(
     command: ColumnSelection, profiles: Sequence[EpisodeProfile]
 ) -> Iterator[Issue]:
-    """Report episodes whose states follow their commands otherwise than in other episodes.
+    """Report episodes whose states follow their commands differently than in the others.
 
     Args:
         command: Columns of the commands.

@@ -196,7 +196,7 @@ def _measure(
 
 
 def gripper_moves(gripper: Float64[np.ndarray, " frames"]) -> int:
-    """Number of times that a gripper opens or closes by more than half of its travel.
+    """Number of times that a gripper moves from one outer third of its travel to the other.
 
     A grasp that was tried twice, or an object that was dropped, adds two. Small changes of the
     opening, such as while holding an object, do not count.

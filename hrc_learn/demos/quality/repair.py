@@ -44,7 +44,7 @@ from hrc_learn.store import write_json
 
 _LISTS, _INDEX = "meta/episodes", ("episode_index",)
 _STAMP_TOLERANCE = 1e-3
-"""Deviation from a regular clock that is kept [s]: above the rounding of float32 stamps."""
+"""Deviation from a regular clock above which old stamps are kept [s]: float32 rounds finer."""
 
 
 @dataclass(frozen=True, kw_only=True)

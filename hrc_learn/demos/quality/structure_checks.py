@@ -119,7 +119,7 @@ def _column_faults(
 
 
 def _number_type(kind: pa.DataType) -> str | None:
-    """LeRobot's name of the type of the numbers in a column; None if it has none."""
+    """LeRobot's name of the type of the numbers in a column; None for unknown nesting."""
     while pa.types.is_nested(kind) and not (pa.types.is_struct(kind) or pa.types.is_map(kind)):
         if not hasattr(kind, "value_type"):
             return None
@@ -147,7 +147,7 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
 
 
 def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
-    """Check that a file of statistics exists, with which policies normalise."""
+    """Check that a file of statistics exists: policies normalise their inputs by them."""
     files = (_STATISTICS, "meta/episodes_stats.jsonl")
     if not any((folder.root / file).is_file() for file in files):
         text = "no statistics: LeRobot's policies cannot normalise their inputs"

@@ -19,7 +19,7 @@ from hrc_learn.demos.read.naming import ComponentMeaning
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ORIENTATION_ROLES, ROLES
 
 MappingSpec = Mapping[str, str | Sequence[str] | None]
-"""Role -> columns: a feature ("observation.qpos"), a range of one ("observation.state[0:7]"),
+"""Role -> columns: a feature ("observation.qpos"), part of a feature ("observation.state[0:7]")
 or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the role out."""
 
 _RANGE = re.compile(r"(.+)\[([^\[\]]*)\]")
@@ -49,7 +49,7 @@ class ColumnSelection:
     labels: tuple[str, ...]
     """Joint names, or component names for quantities without joints."""
     numbered: bool = False
-    """True if the dataset gives no names, so that the labels are only numbered."""
+    """True if the dataset gives no names, so that the labels only number the columns."""
     units: tuple[str, ...] = ()
     """Unit in the name of each column, "" for none; () if no name states one."""
     assumed: str = ""

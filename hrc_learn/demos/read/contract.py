@@ -141,7 +141,7 @@ class Contract:
         """Columns of each quantity.
 
         Raises:
-            DatasetError: A component does not exist, or a quantity has too many or too few.
+            DatasetError: A component does not exist, or a quantity's number of them is wrong.
         """
         found: dict[str, list[ComponentContract]] = {}
         for part in self.components:
@@ -168,7 +168,8 @@ class Contract:
         """This contract with the names and roles of an older one, which may have been edited.
 
         A component that is now read as another quantity keeps its new role. Quantities have the
-        units of this contract, which obeys the older one; other components have its units.
+        units of this contract, which obeys the older one; other components keep the units of
+        the older one.
         """
         known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:

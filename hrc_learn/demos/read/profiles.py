@@ -28,7 +28,7 @@ _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
 _REST, _FEWEST_STILL = 5, 5
-"""Number of frames over which a component at rest hardly moves, and fewest frames at rest."""
+"""Number of frames over which a component at rest hardly moves, and fewest such frames."""
 _REST_MOTION = 0.005
 """Largest motion at rest, relative to the range."""
 FOLLOWS = 0.8
@@ -94,8 +94,8 @@ class Tracking:
     delay: int
     """Delay of the state, the same for all components [frames]."""
     residual: Float32[np.ndarray, " delays"]
-    """Fraction of the variance left unexplained at each delay, in increasing order of delays
-    from -reach to reach, averaged over the components that follow their command."""
+    """Fraction of the variance left unexplained at each delay, from the longest lead to the
+    longest delay, averaged over the components that follow their command."""
     slope: Float64[np.ndarray, " components"]
     """Change of the state per change of the command, at that delay."""
     fit: Float64[np.ndarray, " components"]

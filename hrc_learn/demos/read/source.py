@@ -42,7 +42,7 @@ _POSES = 5
 """Number of episodes whose poses are compared with the kinematics."""
 _COMMAND = "command_position"
 _WHOLE_STEP, _SPEED = (0.1, 1.5), (2 / 3, 1.5)
-"""Ranges of the motion per unit of the command that count as 1: per step, and per second."""
+"""Ranges in which the motion per unit of a command counts as 1: per step, and per second."""
 
 
 @dataclass(frozen=True, kw_only=True)

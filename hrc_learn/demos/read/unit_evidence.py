@@ -57,7 +57,7 @@ class Sizes(NamedTuple):
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
     step: Float64[np.ndarray, " components"] = np.zeros(1)
-    """Step, such as an encoder's, whose multiples all differences of values are; 0 for none."""
+    """Step of which all differences of values are multiples, as of an encoder; 0 if none."""
 
 
 class Guess(NamedTuple):
