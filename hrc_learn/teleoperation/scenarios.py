@@ -189,8 +189,8 @@ class ScenarioRun:
             seed: Seed of the first initial configuration.
             imperfections: Imperfections of arm, calibration and workplace, drawn anew for each
                 seed; None: no imperfections.
-            worker: Reaction of the arm to a worker at the table, drawn anew for each
-                seed; None: no worker.
+            worker: Reaction of the arm to a worker at the table; None: no worker. Each seed
+                draws another worker.
         """
         self._worker, self.visit = worker, None
         self.scenario, self.dt = scenario, 1.0 / fps

@@ -52,7 +52,8 @@ class TouchConfig:
     undisturbed jobs; 20 N give 25 to 600.
     """
     hand_force: float = 10.0
-    """Force at the end effector above which the task pauses; the touch ends below half [N]."""
+    """Force at the end effector above which the task pauses [N]. The touch ends below half of
+    this force."""
     released: float = 0.4
     """Time without a push at the end effector until the task resumes [s]."""
     collision_rise: float = 30.0
