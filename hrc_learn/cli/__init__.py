@@ -1,7 +1,8 @@
 """The command `hrc`, and the frame of programs with a command line.
 
-`main` runs a command, `main("record", "placing")` one by name. Other programs declare a
-dataclass as their command line and call `run`. Importing this package imports no library.
+`main()` runs the command that was typed, `main("record", "placing")` a given one. Other
+programs declare a dataclass as their command line and call `run`. Importing this package
+imports no large library.
 """
 
 from hrc_learn.cli._commands import commands as commands

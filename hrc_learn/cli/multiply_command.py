@@ -33,7 +33,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.store import read_json, write_json
 from hrc_learn.teleoperation.scenarios import SHELVES, make_scenario
 
-# Motions that are made at a time.
+# Number of motions that are made at once.
 _CHUNK = 50
 # After this number of attempts, a smaller fraction of successes ends the run.
 _ENOUGH, _FEW = 100, 0.02
@@ -56,7 +56,7 @@ class ObjectConfig:
     z: tuple[float, float] | None = None
     """[m]"""
     yaw: tuple[float, float] = (0.0, 0.0)
-    """Range of its turn about the vertical from the demonstrated orientation [rad]."""
+    """Range of its rotation about the vertical, from the demonstrated orientation [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from hrc_learn.viz.report import Measurement, show_measurements
 MODEL = "tokens"
 """Folder of the tokenizer in the results of `hrc tokens fit`."""
 MOST_FITTED, MOST_MEASURED = 20_000, 500
-"""Largest number of chunks that are fitted and measured, evenly spread."""
+"""Largest number of chunks for fitting and for measuring, evenly spread over the episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)

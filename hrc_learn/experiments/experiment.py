@@ -276,7 +276,7 @@ def _run_trials(study: Study, file: Path, options: RunOptions) -> list[Trial]:
 def _print_outputs(out: Path, results: Evaluation, has_film: bool) -> None:
     if results.failure:
         print(f"failed: {results.failure}", file=sys.stderr)
-    # On lines of their own and unbroken, to be copied at any width of the terminal.
+    # Each on one unbroken line, so that it can be copied from a terminal of any width.
     print(f"Report: {shlex.quote(str(out / PAGE))}")
     if has_film:
         print(f"Film: {shlex.quote(str(out / FILM))}")

@@ -226,7 +226,7 @@ def _rotation(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def _starts(
     workplace: Workplace, rng: np.random.Generator
 ) -> Iterator[Float[np.ndarray, " joints"]]:
-    """Joint positions within the limits, with the end effector high and far enough [rad]."""
+    """Joint positions [rad] with the end effector high enough, and far enough from its goal."""
     limits, hover = workplace.robot.chain.limits, workplace.hover().position
     lower, upper = limits.lower + _LIMIT_MARGIN, limits.upper - _LIMIT_MARGIN
     while True:

@@ -97,7 +97,7 @@ class JudgeConfig:
 
 
 class CellJudge:
-    """Grasping or placing in our work cell, laid out for the arm."""
+    """Grasping or placing in hrc_learn's work cell, laid out for the arm."""
 
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float):
         """Build the work cell."""

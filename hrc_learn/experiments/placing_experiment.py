@@ -221,7 +221,7 @@ def dataset_of(placing: Path) -> Path:
     path = Path(read_made_by(placing)["dataset"])
     if not path.is_dir():
         raise FileNotFoundError(
-            f"{path}, the dataset of {placing}, no longer exists: name the dataset with "
-            "--demonstrations."
+            f"{path}, the dataset of {placing}, no longer exists: restore it, or fit the skill "
+            "again with hrc fit."
         )
     return path

@@ -47,7 +47,7 @@ class PlacingOutcome:
     peak_speed: float
     """Largest joint velocity as a fraction of the limit of that joint."""
     jerk: float
-    """Dimensionless jerk of the end effector's path over that of the demonstration."""
+    """Dimensionless jerk of the end effector's path, relative to that of the demonstration."""
     placed: bool
     """True if the object stands on its board afterwards."""
 

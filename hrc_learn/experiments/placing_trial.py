@@ -240,6 +240,6 @@ def demonstrated_shelf(end: Float[np.ndarray, "3"], workplace: Workplace) -> str
         raise ValueError(
             f"the demonstration ends at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
             f"{100 * distance[nearest]:.0f} cm from the nearest shelf ({nearest}): give "
-            "demonstrations of placing (hrc record expert)."
+            "demonstrations of placing (hrc record placing)."
         )
     return nearest

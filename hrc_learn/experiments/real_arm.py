@@ -92,7 +92,7 @@ class ArmSite:
     realtime: bool = True
     """Refuse a kernel without real-time scheduling."""
     dynamics: float = 0.3
-    """Fraction of the acceleration of the arm that is used."""
+    """Fraction of the arm's acceleration limits that is used."""
     speed: float = 1.0
     """Speed of all paths as a fraction of the planned speed: 0.1 for a first run."""
     touch: bool = True

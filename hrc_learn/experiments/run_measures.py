@@ -171,7 +171,7 @@ def unwanted_contacts(
 ) -> dict[str, tuple[Touch, ...]]:
     """Contacts of the arm and of the objects it carried, by the object that was hit.
 
-    The fingertips may touch the table while the arm feels for its height.
+    The fingertips may touch the table while the arm feels for the table's height.
 
     Args:
         world: World in the state that the run left.
@@ -251,7 +251,7 @@ def place_pitch_and_yaw(
 
 
 def _place_turn(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-    """Rotation vector of a placed box from its intended orientation, in the base [rad]."""
+    """Rotation vector of a box from its intended orientation, in the base frame [rad]."""
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
     back = quaternion.conjugate(quaternion.multiply(goal, _IN_HAND))
     # A box looks the same after half a turn about its z axis.

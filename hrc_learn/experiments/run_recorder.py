@@ -293,7 +293,7 @@ def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str,
     trail = _polyline(run.position[first : step + 1], palette.BLUE)
     drawn.append(("path of the gripper", palette.BLUE, trail))
     if run.push is not None and np.isfinite(run.push[step]).all():
-        # The forearm that pulls, and an arrow above it.
+        # The forearm of the person, and an arrow above it.
         at, tip = run.push[step]
         above = np.array([0.0, 0.0, _ABOVE])
         arrow = _line(at + above, tip + above, palette.VERMILION, width=0.02, head=True)
