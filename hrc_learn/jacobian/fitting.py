@@ -392,8 +392,8 @@ class ImageJacobianFitConfig(KeyFrameConfig):
     """Choice of key frames, noise and prior of a fit."""
 
     pixel_noise: float = 0.5
-    """Standard deviation of the measured feature [px]; each difference contains it twice. If
-    the network is too coarse and its held-out error larger, that error replaces it."""
+    """Standard deviation of the measured feature [px]; each difference contains it twice. The
+    held-out error replaces it if it is larger, since the network is then too coarse."""
     bias_std: float = 1500.0
     """Prior standard deviation of the mean Jacobian of the workspace [px/m]."""
     weight_std: float = 500.0

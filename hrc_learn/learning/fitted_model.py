@@ -52,7 +52,7 @@ class FittedModel:
         """Read the primitives that can be played.
 
         Raises:
-            FileNotFoundError: The folder holds none.
+            FileNotFoundError: The folder holds no such primitive.
         """
         found = [channel for channel in CHANNELS if (folder / channel).is_dir()]
         if not found:

@@ -383,7 +383,8 @@ def fit_streamed(
         Primitives by channel, and measured values by name.
 
     Raises:
-        ValueError: A channel is another one: its coordinates depend on a demonstration's goal.
+        ValueError: A channel is pose or orientation, whose coordinates depend on the goal of a
+            demonstration.
     """
     fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
     for channel in channels or ("joint",):

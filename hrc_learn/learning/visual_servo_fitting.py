@@ -61,7 +61,7 @@ def fit_visual_servo(
         learning: Settings for learning neurons, noise and prior. With None, or too few
             demonstrations to hold one out, they are not learned.
         on_round: Called after every round of learning.
-        landmarks: Landmarks of which the demonstrations contain pixels; None: of markers.
+        landmarks: Landmarks whose pixels the demonstrations contain; None: pixels of markers.
 
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
