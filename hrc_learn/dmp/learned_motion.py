@@ -157,8 +157,13 @@ def choose(
         regression_only: True to choose among the regressions on contexts only.
 
     Raises:
-        ValueError: A context that is not finite, or too few demonstrations for a regression.
+        ValueError: A context that is not finite, frames for orientations, or too few
+            demonstrations for a regression.
     """
+    if frames is not None and not isinstance(fits[0], JointDMP):
+        raise ValueError(
+            "frames move positions alone: leave out the orientations or the frames"
+        )
     fits = [with_common_reference(each) for each in fits]
     x = _coordinates(fits[0])
     n = len(x)
@@ -230,9 +235,14 @@ class LearnedMotion:
             frames: (F,) if the model uses frames.
 
         Raises:
-            ValueError: A context or frames are missing, or have the wrong size.
+            ValueError: A context or frames are missing or have the wrong size, or a context
+                is given to a model without contexts.
         """
-        if self.chosen.family == "frames":
+        by_frames = self.chosen.family == "frames"
+        if context is not None and (by_frames or self.by_ends):
+            known = "frames" if by_frames else "start and goal"
+            raise ValueError(f"the motion follows from {known} here: leave out the context")
+        if by_frames:
             assert self.frames is not None
             if frames is None:
                 raise ValueError(f"give the {self.frames.b.shape[-2]} frames of the motion")

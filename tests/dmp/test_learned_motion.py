@@ -155,8 +155,22 @@ def test_frames_are_chosen_where_they_determine_the_motion(tmp_path):
     assert (made - shown[5][1]).abs().max() < 0.1
     with pytest.raises(ValueError, match="give the 2 frames"):
         model.at()
+    with pytest.raises(ValueError, match="follows from frames here: leave out the context"):
+        model.at(frames=Frames(frames.A[5], frames.b[5]), context=[0.5])
     with pytest.raises(ValueError, match="a model of frames has no contexts"):
         model.at_contexts(torch.zeros(1, 2).double())
+    solid = [
+        (
+            t,
+            Pose(
+                torch.nn.functional.pad(y, (0, 1)),
+                torch.tensor([1.0, 0, 0, 0]).double().repeat(len(t), 1),
+            ),
+        )
+        for t, y in shown[:5]
+    ]
+    with pytest.raises(ValueError, match="leave out the orientations or the frames"):
+        learn(solid, n_basis=15, frames=Frames(frames.A[:5], frames.b[:5]))
     model.save(tmp_path / "model")
     again = LearnedMotion.load(tmp_path / "model")
     other = again.rollout(2 * S, frames=Frames(frames.A[5], frames.b[5])).position
@@ -490,6 +504,8 @@ def test_coordinates_and_durations_are_weighted_means(family, strength, shrinkag
     torch.testing.assert_close(single.duration, found[1].duration)
     torch.testing.assert_close(torch.cat([single.start, single.goal]), asked[1])
     assert model.at(start, goal, 3.5).duration.item() == 3.5
+    with pytest.raises(ValueError, match="follows from start and goal here: leave out"):
+        model.at(start, goal, context=asked[1])
     # By default those that the model predicts for the mean ones.
     usual = model.at_contexts(context.mean(0, keepdim=True))[0]
     torch.testing.assert_close(model.at().coordinates(), usual.coordinates())
