@@ -214,7 +214,13 @@ def test_orientations_are_mapped_in_every_encoding(tmp_path, role, encode):
     ("role", "columns", "fault"),
     [
         ("rotation_6d", np.ones((9, 6)), "frame 0 span no plane"),
-        ("rotation_matrix", damaged(np.eye(3), 1.01), "9 numbers at frame 3 are no rotation"),
+        ("rotation_matrix", damaged(np.eye(3), 1.01), "frame 3 are no rotation matrix"),
+        ("rotation_matrix", damaged(np.eye(3), -1.0), "frame 3 are no rotation matrix"),
+        (
+            "pose_matrix",
+            np.tile(np.diag([1, 1, -1, 1]).ravel(), (9, 1)),
+            "frame 0 are no rotation",
+        ),
         ("pose_matrix", damaged(np.eye(4), 1.001), "16 numbers are no 4x4 transform"),
         ("quaternion_xyzw", damaged(np.eye(4)[-1], 1.2), "frame 3"),
     ],

@@ -119,7 +119,7 @@ def to_quaternion(
         case "rotation_matrix":
             orientation = quaternion.from_matrix(_rotations(numbers.reshape(-1, 3, 3)))
         case _:
-            orientation = quaternion.from_matrix(transforms(values)[:, :3, :3])
+            orientation = quaternion.from_matrix(_rotations(transforms(values)[:, :3, :3]))
     return quaternion.continuous(orientation).numpy()
 
 
@@ -139,13 +139,14 @@ def transforms(values: Float64[np.ndarray, "frames 16"]) -> Tensor:
 
 
 def _rotations(matrices: Tensor) -> Tensor:
-    """The matrices, if they are orthogonal; a ValueError otherwise."""
+    """The matrices, if they are rotations and no reflections; a ValueError otherwise."""
     product = matrices @ matrices.mT
     # The tolerance allows for float32 and for few printed digits.
     wrong = ((product - torch.eye(3, dtype=product.dtype)).abs() > 1e-2).flatten(1).any(1)
+    wrong |= torch.linalg.det(matrices) < 0
     if wrong.any():
         frame = int(wrong.nonzero()[0])
-        raise ValueError(f"the 9 numbers at frame {frame} are no rotation matrix")
+        raise ValueError(f"the 3x3 numbers at frame {frame} are no rotation matrix")
     return matrices
 
 
