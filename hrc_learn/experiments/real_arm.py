@@ -39,7 +39,7 @@ from hrc_learn.hardware import (
 )
 from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.ros2_topics import ros2_origin
-from hrc_learn.kinematics import SerialChain, fr3, panda
+from hrc_learn.kinematics import Arm, SerialChain, fr3, panda
 from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
@@ -103,7 +103,7 @@ class ArmSite:
         check_settings(self, fraction=("dynamics", "speed"))
 
     @property
-    def chain(self) -> SerialChain:
+    def chain(self) -> Arm:
         """Kinematics and limits of the arm."""
         return {"panda": panda, "fr3": fr3}[self.robot]
 

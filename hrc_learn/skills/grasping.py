@@ -42,7 +42,8 @@ from hrc_learn.skills.work_cell import (
 )
 
 OPEN, CLOSED = 0.08, 0.0
-"""Commanded gripper widths [m]: the full stroke; and zero, which squeezes the object."""
+"""Commanded gripper widths [m]: the full stroke, of the Franka hand or of a smaller one; and
+zero, which squeezes the object."""
 JOINT_SPEED = 0.6
 """Largest joint speed between postures [rad/s]: about a quarter of the Panda's lowest limit."""
 DESCENT_SPEED = 0.08
@@ -504,6 +505,7 @@ def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
         at_least: Shortest time to hold still [s].
     """
     before, begun = cell.state.gripper_width, cell.time
+    width = min(width, _stroke(cell))  # else open fingers are expected to open further
     cell.gripper.move(width)
     cell.hold_pose(at_least - _FINGERS_REST)
     expected = abs(width - before) > _FINGERS_MOVED
@@ -520,11 +522,16 @@ def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
 def holds(cell: WorkCell, item: GraspObject) -> bool:
     """True if the opening of the fingers matches an object held between them.
 
-    For the stroke of the Franka hand, the thresholds lie midway between the object's width and
-    the openings of closed and of open fingers.
+    The thresholds lie midway between the object's width and the openings of closed and of open
+    fingers.
     """
     half = item.half_size[0]
-    return half < cell.state.gripper_width < half + OPEN / 2
+    return half < cell.state.gripper_width < half + _stroke(cell) / 2
+
+
+def _stroke(cell: WorkCell) -> float:
+    """Opening of the open fingers [m]."""
+    return cell.chain.hand_size * OPEN
 
 
 def raised(pose: Pose, height: float) -> Pose:

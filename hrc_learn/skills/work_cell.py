@@ -25,7 +25,8 @@ from hrc_learn.controller.joint_path import JointPaths, changed_rate, deviation_
 from hrc_learn.controller.null_space_motion import Clearance
 from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import GraspedBox, SerialChain
+from hrc_learn.kinematics import Arm as ArmModel
+from hrc_learn.kinematics import GraspedBox
 from hrc_learn.log import Event, StepLog
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
 from hrc_learn.regions import PositionRegion
@@ -105,7 +106,7 @@ class WorkCell:
     steps a simulator, or waits for real hardware.
 
     Attributes:
-        chain: Kinematics of the arm.
+        chain: Kinematics and hand of the arm.
         config: Settings of the loop.
         gripper: Driver of the gripper.
         state: Newest reading of the arm.
@@ -129,7 +130,7 @@ class WorkCell:
     def __init__(
         self,
         *,
-        chain: SerialChain,
+        chain: ArmModel,
         arm: Arm,
         gripper: Gripper,
         sensor: FeatureSensor | None = None,
@@ -144,7 +145,7 @@ class WorkCell:
         """Connect the parts.
 
         Args:
-            chain: Kinematics of the arm.
+            chain: Kinematics and hand of the arm.
             arm: Driver of the arm.
             gripper: Driver of its gripper.
             sensor: Fixed camera with its marker detector; None where a task needs none.

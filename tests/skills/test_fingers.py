@@ -51,8 +51,8 @@ class SlowHand(ObedientArm):
 class Cell:
     """A work cell that only lets time pass while it holds the arm still."""
 
-    def __init__(self, hand):
-        self.gripper = hand
+    def __init__(self, hand, chain=panda):
+        self.gripper, self.chain = hand, chain
 
     state = property(lambda self: self.gripper.read())
     time = property(lambda self: self.gripper.time)
@@ -107,5 +107,15 @@ def test_fingers_that_never_move_hold_nothing_and_are_given_up():
 @pytest.mark.parametrize(
     ("width", "held"), [(0.0, False), (WIDTH, True), (0.8 * WIDTH, True), (OPEN, False)]
 )
-def test_only_fingers_about_as_far_apart_as_the_object_is_wide_hold_it(width, held):
-    assert holds(Cell(SlowHand(width)), ITEM) == held
+@pytest.mark.parametrize("size", [1.0, 0.7, 0.4])
+def test_only_fingers_about_as_far_apart_as_the_object_is_wide_hold_it(size, width, held):
+    cell = Cell(SlowHand(size * width), panda.with_hand(size))
+    assert holds(cell, ITEM.scaled(size)) == held
+
+
+def test_open_fingers_of_a_small_hand_are_not_expected_to_open_further():
+    hand = SlowHand(0.4 * OPEN)
+    cell = Cell(hand, panda.with_hand(0.4))
+    move_fingers(cell, OPEN, 0.3)
+    assert cell.time == pytest.approx(0.3)
+    assert hand.goal == 0.4 * OPEN

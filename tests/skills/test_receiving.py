@@ -9,7 +9,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import InteractionPrimitive
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import gripper_down
+from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import ObjectConfig
 from hrc_learn.skills.receiving import MovementWatch, Receiving, ReceivingConfig
@@ -72,7 +72,7 @@ class Cell:
     """An arm that is at once where it is told, and a gripper that closes on what is there."""
 
     def __init__(self, moves, brings=True):
-        self.config = SimpleNamespace(dt=0.02)
+        self.config, self.chain = SimpleNamespace(dt=0.02), panda
         self.time, self.load, self.closed = 0.0, None, []
         self.pose = Pose(START.clone(), gripper_down())
         self.gripper = SimpleNamespace(move=self._grip)
