@@ -192,7 +192,7 @@ class PickAndPlace:
             try:
                 self._deliver(job)
             except TaskFailedError as error:
-                job.failure = str(error)
+                job.failure = f"{job.failure}; then {error}" if job.failure else str(error)
                 break
         self._cell.begin_phase("done")
         return self.jobs
@@ -238,8 +238,8 @@ class PickAndPlace:
             job.failure = str(error)
             return None
         except MissedGraspError as error:
-            self._grasping.start_over()
             job.failure = str(error)
+            self._grasping.start_over()
             return None
         return self._home
 
@@ -329,10 +329,11 @@ class PickAndPlace:
     def _dropped(self, job: PickPlaceJob, what: str) -> Phase | None:
         """Start over from home, unless the number of attempts is reached."""
         self._grasping.note(job, "dropped object", what)
-        self._grasping.start_over()
         # The place of a lost received object is unknown.
         if job.receipt is not None or job.attempts == self._config.grasping.attempts:
             job.failure = what
+        self._grasping.start_over()
+        if job.failure:
             return None
         job.attempts += 1
         return self._pick

@@ -271,6 +271,28 @@ def test_a_hand_over_that_fails_starts_over(scene):
     assert scene.names().count("start_over") == 1
 
 
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"home": 4}, "home: the path stayed blocked"),
+        ({"grasps": [MissedGraspError("missed")]}, "missed"),
+        ({"held": [False] * 3}, "lost on the way up"),
+    ],
+)
+def test_the_first_reason_is_kept_if_going_back_fails_too(scene, settings, reason):
+    vars(scene).update(settings)
+    last = 3 if reason == "lost on the way up" else 1
+
+    def start_over():
+        if scene.names().count("start_over") == last - 1:
+            raise BlockedPathError("a person is at home")
+        scene.did.append(("start_over",))
+
+    scene.start_over = start_over
+    (job, *rest) = run(scene, orders=2)
+    assert (job.failure, rest) == (f"{reason}; then a person is at home", [])
+
+
 def test_an_arm_that_cannot_go_on_ends_the_run(scene):
     scene.grasps = [None, TaskFailedError("the arm cannot go home")]
     jobs = run(scene, orders=3)
