@@ -1,4 +1,4 @@
-.PHONY: demo test test-slow test-wheel docs format check bench xr clean
+.PHONY: demo test test-long test-slow test-wheel docs format check bench xr clean
 .DEFAULT_GOAL := help
 
 PYTHON := .venv/bin/python
@@ -13,7 +13,7 @@ help:
 	@echo "make demo    demonstrate, learn, grasp, place in simulation; writes $(OUT)"
 	@echo "             make demo SHELF=upper places on another shelf (lower, middle, upper)"
 	@echo "             make demo ROBOT=xarm7 does it with another arm (ur5, ur5e, iiwa7, fr3, ...)"
-	@echo "make test    run the tests"
+	@echo "make test    run the tests        make test-long  whole jobs and browsers as well"
 	@echo "make xr      build the client for headsets and phones"
 	@echo "make bench   measure the speed against floors and peers"
 	@echo "make docs    build the documentation site; writes outputs/docs"
@@ -23,15 +23,18 @@ demo: .venv/.installed
 	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF) --robot $(ROBOT)
 
 # Rewritten assertions and checked shapes are compiled once, not by each worker and program.
-test test-slow: export PYTHONDONTWRITEBYTECODE =
+test test-long test-slow: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.installed
-	$(PYTHON) -m pytest -n auto --dist loadfile -m "not slow and not realtime"
+	$(PYTHON) -m pytest -n auto --dist loadfile -m "not slow and not long and not realtime"
 	@# Each file in a process of its own: nodes and threads that one leaves would slow the next.
 	@# A machine that does something else meanwhile may stall for longer than a protocol allows.
 	for file in $(REALTIME); do \
 	  $(PYTHON) -m pytest -q -m "realtime and not slow" $$file \
 	  || $(PYTHON) -m pytest --last-failed -m "realtime and not slow" $$file || exit 1; \
 	done
+
+test-long: .venv/.installed
+	$(PYTHON) -m pytest -n auto --dist loadfile -m "long and not slow"
 
 test-slow: .venv/.installed
 	$(PYTHON) -m pytest -m slow

@@ -92,6 +92,7 @@ def program(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_two_processes_give_the_answer_of_one(program, tmp_path, monkeypatch):
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     done = subprocess.run(

@@ -1,6 +1,6 @@
 """Pytest plugin: which lines of `hrc_learn` each test executes, and how long the test takes.
 
-    python -m pytest -p executed_lines --executed lines.json   # with PYTHONPATH=tools
+    python -m pytest -m "not slow" -p executed_lines --executed lines.json  # PYTHONPATH=tools
 
 `mutation_sample.py --executed lines.json` then runs, for each mutant, the tests that execute
 its line. Lines are seen by `sys.monitoring`, which stops reporting a line after its first time

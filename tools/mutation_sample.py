@@ -258,7 +258,7 @@ class Checkout:
             "PYTHONDONTWRITEBYTECODE": "1",
             "OMP_NUM_THREADS": "1",
         }
-        options = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:randomly"]
+        options = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:randomly"]
         with subprocess.Popen(
             [sys.executable, "-m", "pytest", *options, *tests],
             cwd=self.folder,
@@ -288,7 +288,8 @@ class Checkout:
 
             status = 3
             try:
-                status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]))
+                options = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+                status = int(pytest.main([*options, *tests]))
             finally:
                 os._exit(status)
         end = time.monotonic() + timeout

@@ -71,6 +71,7 @@ def test_converges_from_near_starts_with_a_good_jacobian():
     assert (outside < 1.1).double().mean() >= 0.98
 
 
+@pytest.mark.long
 def test_adaptation_finds_a_camera_turned_upside_down():
     """The initial Jacobian has the wrong sign everywhere: without adaptation nothing works."""
     rng = sampling.generator(6)
@@ -167,6 +168,7 @@ def test_what_is_nan_for_a_while_spoils_no_state():
     assert ((camera.project(panda.forward(q))[0] - target).norm(dim=-1) < 5).all()
 
 
+@pytest.mark.long
 def test_phases_share_one_module_and_one_state():
     """Approach, servo, then move the box down with the camera off: three goals, one state."""
     rng = sampling.generator(11)
@@ -271,6 +273,7 @@ def off_its_way(rng: torch.Generator, **options) -> tuple[Tensor, Tensor]:
     return off, fastest
 
 
+@pytest.mark.long
 def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
     cut, cut_turns = off_its_way(sampling.generator(11), yields_to_limits=False)
     slowed, slowed_turns = off_its_way(sampling.generator(11))
@@ -281,6 +284,7 @@ def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
     assert slowed.amax() < 0.5 * cut.amax()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("yields", [True, False])
 def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(yields):
     """Where a servoed arm stood still: on its way it would turn joint 1 alone, at its limit."""
@@ -307,6 +311,7 @@ def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(yields)
     assert (quaternion.angle(end.orientation, goal.orientation) < 0.2) == yields
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rests", [True, False])
 def test_the_null_space_goes_back_to_rest_and_the_tool_stays(rests):
     """From the elbow to the side, by the arm's own inverse for the same pose."""
@@ -382,6 +387,7 @@ def test_a_stop_is_obeyed_and_counted():
     assert state.safety.count("stopped") == 20
 
 
+@pytest.mark.long
 def test_every_reason_to_stop_brings_the_arm_to_rest():
     """Within its acceleration and jerk limits, flagged and counted; then it goes on. Of four
     arms each has one reason."""

@@ -9,7 +9,7 @@ from grasp_trials import TrialConfig, run_trials
 
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 QUICK = TrialConfig(
     count=20, duration=6.0, dt=0.02, imperfections=Imperfections(frame_steps=2, noise=0.5)

@@ -32,6 +32,7 @@ def poison_trials(**changes):
     return run_poison_trials(PoisonConfig(dt=0.02, estimators=("composite",), **changes))
 
 
+@pytest.mark.long
 def test_poisoned_arms_keep_their_limits_and_move_again():
     result = poison_trials(count=50, duration=2.0, seed=8)
     assert result.summary()["ticks"] == 5000
@@ -50,6 +51,7 @@ def test_poison_that_is_remembered_is_noticed(monkeypatch):
     assert result.stuck.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("worse", "kept"), [(1.0, True), (10.0, False)])
 def test_plants_as_declared_keep_their_limits_and_move_again(worse, kept):
     result = run_plant_trials(PlantConfig(count=40, duration=2.0, worse=worse))

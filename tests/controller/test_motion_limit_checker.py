@@ -53,7 +53,11 @@ def judged(sent: HostileStreams, limits: JointLimits | None, folder: Path, **mor
 
 
 @pytest.mark.parametrize("ticks", [4_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("judge", JUDGES)
+@pytest.mark.parametrize(
+    "judge",
+    ["fr3 as it is"]
+    + [pytest.param(j, marks=pytest.mark.long) for j in JUDGES if j != "fr3 as it is"],
+)
 def test_it_finds_nothing(judge, ticks, tmp_path):
     arm, limits = JUDGES[judge]
     # Of two seconds, to run into limits at full speed and back.

@@ -148,6 +148,7 @@ def fr3_step() -> tuple[AdaptiveController, Observation]:
     return controller, replace(observation, dt=DT)
 
 
+@pytest.mark.long
 def test_the_controllers_step_brakes_before_an_fr3s_limits():
     assert push_outwards(EagerRunner(*fr3_step()), 350) > 20
 

@@ -131,6 +131,7 @@ def test_a_person_moves_what_is_not_led_and_nothing_else(task):
     assert tilted < 4e-3 if task == "position+axis" else tilted > 0.05
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", [*TASKS, "nearest pose"])
 def test_an_arm_of_five_joints_servoes(five, task):
     """From around its ready posture to a target that a camera shows, tilted and turned."""

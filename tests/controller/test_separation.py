@@ -135,6 +135,7 @@ def test_at_the_speed_that_the_distance_allows_nothing_is_reported():
         assert report.acted("separation").item() is acts
 
 
+@pytest.mark.long
 def test_the_arm_rests_before_a_person_who_comes_running():
     """At v_h straight towards it, with 80 ms of the reaction time spent until the arm is told:
     who has come as near as the clearance meets a tool at rest. Then the person leaves."""

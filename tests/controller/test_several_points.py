@@ -112,6 +112,7 @@ def test_a_feature_is_seen_where_all_of_its_points_are():
     assert state.feature[1].tolist() == [719.5, 539.5] * 2
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_corners_are_brought_to_their_targets():
     """Their mean within 5 px from any camera, though the first guess knows one point only."""

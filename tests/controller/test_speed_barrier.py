@@ -28,9 +28,14 @@ READY = panda.ready
     [
         ("panda", 0.008, {}),
         ("ur5e", 0.0, {"dtype": torch.float32}),
-        ("panda", 0.02, {"path": "layer", "batch": 16}),
         ("ur5e", 0.008, {"late": 1, "encoder_error": 0.002, "reserve": 0.01}),
-        ("xarm7", 0.0, {"model_error": 0.02, "reserve": 0.025}),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in [
+                ("panda", 0.02, {"path": "layer", "batch": 16}),
+                ("xarm7", 0.0, {"model_error": 0.02, "reserve": 0.025}),
+            ]
+        ),
         # `benchmarks/bench_limits.py` searches with each of these for a million steps.
         *(
             pytest.param(*case, marks=pytest.mark.slow)

@@ -32,7 +32,10 @@ def expected() -> dict[str, dict[str, tuple[int, list[str]]]]:
 FINDINGS = expected()
 
 
-@pytest.fixture(scope="module", params=SETS)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(x, marks=pytest.mark.long) if x == "v2.0" else x for x in SETS],
+)
 def name(request):
     return request.param
 

@@ -43,7 +43,7 @@ from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 FORCE = (ScriptedForce(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), max_force=60.0),)
 BRIEF = PickAndPlaceConfig(interaction=0.0)

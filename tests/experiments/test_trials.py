@@ -56,7 +56,7 @@ def test_a_failed_trial_is_a_row_with_its_reason(tmp_path):
     assert trials[5].values == {"square": 25}
 
 
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("processes", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_an_unexpected_error_stops_all_names_its_seed_and_loses_nothing(tmp_path, processes):
     file = tmp_path / "t.jsonl"
     with pytest.raises(ZeroDivisionError) as caught:

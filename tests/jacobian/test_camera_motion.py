@@ -232,6 +232,7 @@ def test_a_marker_never_seen_is_said(demonstrations):
         CameraReference.fit(hidden, FPS, IMAGE)
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_placements_tell_episodes_of_a_moved_camera_apart():
     rng = np.random.default_rng(10)
@@ -246,6 +247,7 @@ def test_placements_tell_episodes_of_a_moved_camera_apart():
     assert 8.0 < second.motion.displacement < 25.0
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_a_camera_that_stood_still_has_one_placement(demonstrations):
     (only,) = camera_placements(demonstrations[:4], IMAGE)
@@ -392,6 +394,7 @@ def test_the_fewer_frames_the_more_they_must_show(reference, frames, thresholds)
         assert (correction.motion is not None) == expected
 
 
+@pytest.mark.long
 def test_a_camera_may_be_moved_again_and_put_back(reference, plane):
     rng = np.random.default_rng(14)
     correction = CameraCorrection(reference)

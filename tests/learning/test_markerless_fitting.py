@@ -13,6 +13,8 @@ from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.vision.imaging import carton
 from hrc_learn.vision.landmarks import LandmarkDetector
 
+pytestmark = pytest.mark.long
+
 WIDTH, HEIGHT, FOCUS = 480, 360, 520.0
 MATRIX = np.array([[FOCUS, 0, WIDTH / 2], [0, FOCUS, HEIGHT / 2], [0, 0, 1]])
 EYE = np.array([0.5, 0.0, 1.0])

@@ -228,6 +228,7 @@ def test_a_page_shows_the_real_panda_where_it_is(franka, served):
         assert distance.min() < 1e-4  # that its servos hold it to
 
 
+@pytest.mark.long
 def test_the_expert_knows_no_real_panda(franka, tmp_path):
     expert = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
     expert.connect()

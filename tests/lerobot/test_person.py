@@ -86,6 +86,7 @@ def test_with_a_person_who_does_nothing_the_robot_does_as_without(simulated, pul
     assert alone[2] == beside[2]
 
 
+@pytest.mark.long
 def test_the_elbow_goes_aside_and_back_while_the_hand_follows_the_actions(pulled):
     robot = pulled(PULL)
     wished, read, seen = carried_out(robot)

@@ -14,7 +14,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.skills import ComplementaryMotion, complementary_motion, joint_line
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])

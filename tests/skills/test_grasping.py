@@ -47,7 +47,7 @@ from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 WORKPLACE = Workplace()
 

@@ -15,7 +15,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.skills import TaskFailedError, WorkCellConfig, joint_line
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 DT = 0.02
 """Step of the long simulations [s]: twice the usual one halves their cost."""

@@ -29,7 +29,7 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
     placing_expert,
 )
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 WORKPLACE = Workplace()
 HOME = WORKPLACE.home_joints()

@@ -19,7 +19,7 @@ from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_li
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation import ScriptedPerturbation
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 ARM = whole_arm(Workplace().scene.arm)
 SEPARATION = SeparationConfig(reaction_time=0.03, clearance=0.08)

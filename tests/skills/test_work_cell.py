@@ -224,6 +224,7 @@ class LateArm(ObedientArm):
         self.velocity = self._told.pop(0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("straight", [True, False])
 def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
     def lag(told):
@@ -248,6 +249,7 @@ def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
     assert lag(0.0) > 4 * known
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("start", "side", "ends_at"),
     [

@@ -18,7 +18,7 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.page import Page, PageConfig
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.long]
 
 # Browsers tell poses in single precision.
 GEOMETRY = 1e-6

@@ -9,7 +9,7 @@ from page_in_browser import PATIENCE, Browser, Session, chromium, wait_until
 
 from hrc_learn.teleoperation.page_scene import _TWIN_AT
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

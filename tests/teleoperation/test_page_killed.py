@@ -57,6 +57,7 @@ def hearing_interrupts():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("hearing_interrupts")
 @pytest.mark.parametrize(
     "ended_by",

@@ -87,6 +87,7 @@ def session_from(start, tmp_path):
         )
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_an_arm_with_a_driver_moves_home_and_never_jumps(tmp_path):
     home = Workplace().home_joints()

@@ -19,7 +19,7 @@ from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joi
 from hrc_learn.teleoperation import CombinedInput, Touch, TouchConfig
 from hrc_learn.teleoperation.touch import TorqueBias, explain, log_density
 
-pytestmark = pytest.mark.simulation
+pytestmark = [pytest.mark.simulation, pytest.mark.long]
 
 WORKPLACE = Workplace()
 NOMINAL = Imperfections.nominal()
