@@ -12,11 +12,15 @@ import random
 
 import pytest
 import torch
+from hypothesis import settings
 from shape_checks import first_calls_checked
 from unchecked import shapes_unchecked
 
 torch.set_num_threads(1)
 torch.manual_seed(0)  # on accelerators too, once they are used
+# A machine that does something else meanwhile makes no test wrong.
+settings.register_profile("timeless", deadline=None)
+settings.load_profile("timeless")
 
 
 @pytest.hookimpl(wrapper=True)

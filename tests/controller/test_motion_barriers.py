@@ -13,7 +13,7 @@ from hrc_learn.kinematics import panda
 LIMITS = panda.limits
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(
     A=st.floats(1.0, 30.0),
     j=st.floats(100.0, 1e5),

@@ -55,7 +55,7 @@ HOSTILE = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     asked=st.lists(HOSTILE, min_size=1, max_size=60),
     velocity=st.floats(0.05, 50),

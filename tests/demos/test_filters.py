@@ -76,7 +76,7 @@ def cheapest(cost: np.ndarray) -> float:
     return best(cost.shape[0] - 1, cost.shape[1] - 1)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32 - 1))
 def test_the_path_is_a_cheapest_one(rows, columns, seed):
     cost = np.random.default_rng(seed).uniform(size=(rows, columns)).round(1)

@@ -115,7 +115,7 @@ def test_large_recordings_are_cut_into_files_between_episodes(tmp_path, monkeypa
     assert check_dataset(tmp_path / "set").ok
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     lengths=st.lists(st.integers(2, 30), min_size=1, max_size=4),
     width=st.integers(1, 9),

@@ -19,7 +19,7 @@ from hrc_learn.dmp import JointDMP, PoseDMP, Stepper, mean_primitive
 from hrc_learn.dmp.forcing_scale import SCALINGS, find_scaling
 from hrc_learn.geometry import Pose
 
-quick = settings(max_examples=30, deadline=None)
+quick = settings(max_examples=30)
 angles = st.floats(-3.1, 3.1)
 growths = st.floats(0.1, 10)
 plane = arrays("float64", 2, elements=st.floats(-3, 3)).map(torch.from_numpy)

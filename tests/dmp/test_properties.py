@@ -18,7 +18,7 @@ motions = arrays("float64", (40, 2), elements=number).map(
 durations = st.floats(0.05, 60)
 springs = st.builds(SpringDamper, alpha=st.floats(10, 60), beta=st.floats(2, 30))
 scalings = st.sampled_from(["none", "amplitude"])
-quick = settings(max_examples=30, deadline=None)
+quick = settings(max_examples=30)
 TIME = torch.linspace(0, 1, 40, dtype=torch.float64)
 
 
