@@ -196,7 +196,7 @@ def test_an_existing_folder_is_refused(tmp_path):
         (
             {"gripper": 1.0},
             {"position": [1, 2, 3]},
-            r"frame 1 lacks gripper and gives position",
+            r"frame 1 lacks gripper and adds position",
         ),
     ],
 )
