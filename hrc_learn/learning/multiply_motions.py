@@ -79,7 +79,7 @@ class Segmentation:
         Raises:
             ValueError: A frame or an episode is unknown, or cuts do not increase.
         """
-        for frame in self.frames:
+        for frame in self.frames or [""]:  # no frame is unknown, too
             if frame != BASE and frame.removesuffix(POSITION_ONLY) not in objects:
                 known = ", ".join([BASE, *objects])
                 raise ValueError(f"segments: no frame {frame!r}; there are {known}")
@@ -103,13 +103,19 @@ def find_segments(
         tool: Poses of the tool along each demonstration.
 
     Raises:
-        ValueError: The demonstrations differ in the number of gripper switches.
+        ValueError: A demonstration is too short, or they differ in the number of gripper
+            switches.
     """
     openings = [demo.gripper for demo in demos if demo.gripper is not None] or [np.zeros(1)]
     low, high = min(x.min() for x in openings), max(x.max() for x in openings)
     cuts: dict[int, tuple[int, ...]] = {}
     for demo in demos:
         last, kept = len(demo) - 1, [0]
+        if last < _SHORTEST:
+            raise ValueError(
+                f"episode {demo.episode} has {len(demo)} frames, but a segment needs "
+                f"{_SHORTEST + 1} or more: leave it out (multiply.demonstrations)"
+            )
         switches = [] if demo.gripper is None else _switches(demo.gripper, low, high)
         for cut in (*switches, last):
             if cut - kept[-1] >= _SHORTEST:

@@ -66,6 +66,9 @@ def test_frames_of_segments_are_known():
             wrong.check(demos, {"cup": HERE})
     with pytest.raises(ValueError, match=r"episode 3 needs 2 cuts below 20, .* has \[\]"):
         Segmentation(frames=("base",), cuts={4: (0, 19)}).check(demos, {})
+    for cuts in ((), (19,), (0, 19)):
+        with pytest.raises(ValueError, match=r"no frame ''; there are base"):
+            Segmentation(frames=(), cuts={3: cuts}).check(demos, {})
 
 
 def still(frames, place):
@@ -93,6 +96,10 @@ def test_each_segment_has_the_frame_in_which_its_ends_agree():
     open_ = demo(40, 1, np.full(40, 0.08))
     with pytest.raises(ValueError, match=r"differ .* \(episode 0: 1, episode 1: 0\)"):
         find_segments([demos[0], open_], objects, tools)
+    for shorter in ([demo(6, 5)], [demos[0], demo(6, 5)]):
+        with pytest.raises(ValueError, match=r"episode 5 has 6 frames, but .* needs 7 or more"):
+            find_segments(shorter, objects, tools)
+    assert find_segments([demo(7, 5)] * 2, objects, tools).cuts == {5: (0, 6)}
     whole = find_segments([demo(30, 7), demo(30, 8)], objects, [tools[0], tools[1]])
     assert whole.cuts == {7: (0, 29), 8: (0, 29)}
 
