@@ -123,7 +123,8 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
         camera: Name of the camera; None: the only one.
 
     Raises:
-        ValueError: There is no video, no pose, or nothing moves as the arm does.
+        ValueError: There is no video, no pose, nothing moves as the arm does, or the tool is
+            not found again.
     """
     reader = ImageReader(source.folder)
     key = camera_key(reader.cameras, camera)
@@ -166,7 +167,7 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
         demos=_described(demos, found, objects),
         landmarks=landmarks,
         camera=seen_by,
-        seen=len(sure) / max(1, search.followed),
+        seen=len(sure) / search.followed,
         deviation=float(np.median(sure)),
         picture=search.picture(found, objects),
     )
@@ -218,6 +219,11 @@ class _Search:
                     row[k] = seen
             found.append(row)
             self.followed += len(wanted)
+        if not any(map(any, found)):
+            raise ValueError(
+                f"{self._demos.source}, {self._key}: the tool is found in none of "
+                f"{self.followed} frames. Film it from nearer, in focus and with more light."
+            )
         return found
 
     def picture(

@@ -126,7 +126,7 @@ def test_the_tool_is_looked_for_backwards_in_about_320_frames(frames, stride, mo
     """What is not within 8 of 720 pixels of where the arm has it is not the tool."""
     demos = DemonstrationSet([demo(frames, 0), demo(frames, 1)])
     true = [places(one) for one in demos]
-    off = [7.9, 8.1, 0.0, np.nan]
+    off = [7.9, 8.1, 0.0, np.nan, 4.0]
 
     class Detector:
         def __init__(self, landmarks):
@@ -135,9 +135,9 @@ def test_the_tool_is_looked_for_backwards_in_about_320_frames(frames, stride, mo
         def find(self, image, names):
             assert names == ["tool"]
             episode, k = image
-            if np.isnan(off[k % 4]):
+            if np.isnan(off[k % 5]):
                 return {}
-            return {"tool": finding(true[episode][k] + off[k % 4] * np.array([0.6, -0.8]))}
+            return {"tool": finding(true[episode][k] + off[k % 5] * np.array([0.6, -0.8]))}
 
     monkeypatch.setattr("hrc_learn.learning.markerless_fitting.LandmarkDetector", Detector)
     film = Film(lambda episode, k: (episode, k))
@@ -149,12 +149,19 @@ def test_the_tool_is_looked_for_backwards_in_about_320_frames(frames, stride, mo
     for episode, row in enumerate(found):
         assert len(row) == frames
         for k, seen in enumerate(row):
-            if k not in wanted or k % 4 in (1, 3):
+            if k not in wanted or k % 5 in (1, 3):
                 assert seen is None
             else:
                 np.testing.assert_allclose(
-                    np.linalg.norm(seen.pixel - true[episode][k]), off[k % 4], atol=1e-6
+                    np.linalg.norm(seen.pixel - true[episode][k]), off[k % 5], atol=1e-6
                 )
+
+
+def test_a_tool_that_is_found_nowhere_is_refused():
+    demos = DemonstrationSet([demo(5, 0), demo(4, 1)], source="films")
+    search = search_in(Film(lambda *_: np.zeros((HEIGHT, WIDTH, 3), np.uint8)), demos)
+    with pytest.raises(ValueError, match="films, front: the tool is found in none of 9 frames"):
+        search.follow(Landmarks(tool=TOOL, image_size=(WIDTH, HEIGHT)), CAMERA)
 
 
 def test_the_object_is_seen_while_the_tool_is_far_from_where_it_ends():
