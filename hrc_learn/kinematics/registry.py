@@ -65,14 +65,14 @@ def maker_of(name: str) -> str:
 def arm_of_robot(robot_type: str | None) -> Arm | None:
     """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
 
-    Our simulated robots, such as mujoco_ur5e, carry the hand of the work cell. For other robots
-    it is also None if the package with the description is not installed.
+    It is also None if the package with the description is not installed. Our simulated robots,
+    such as mujoco_ur5e, carry the hand of the work cell.
     """
     simulated = (robot_type or "").removeprefix("mujoco_")
-    if simulated != robot_type and simulated in registered_arms():
-        return ArmChoice(simulated).work_arm()
     name = _registered_name(robot_type or "")
     try:
+        if simulated != robot_type and simulated in registered_arms():
+            return ArmChoice(simulated).work_arm()
         return None if name is None else _registered(name)
     except MissingModelError:
         return None

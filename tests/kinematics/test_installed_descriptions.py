@@ -3,7 +3,7 @@
 import pytest
 from urdf_text import to_urdf
 
-from hrc_learn.kinematics import ArmChoice, arm, fr3, panda
+from hrc_learn.kinematics import ArmChoice, MissingModelError, arm, fr3, panda, registry
 from hrc_learn.kinematics.registry import arm_of_robot, installed_descriptions
 
 
@@ -54,6 +54,17 @@ def test_robot_types_of_lerobot_are_registered_arms():
     # Our simulated robots carry the hand of the work cell.
     assert arm_of_robot("mujoco_ur5e") is ArmChoice("ur5e").work_arm()
     assert arm_of_robot("franka_research_3") is fr3
+
+
+@pytest.mark.parametrize("kind", ["viperx_follower", "mujoco_viperx"])
+def test_a_robot_whose_description_is_not_installed_is_unknown(kind, monkeypatch):
+    def locate(name, package, file):
+        raise MissingModelError("not installed", name=package)
+
+    monkeypatch.setattr(registry, "_locate", locate)
+    for name in ("_registered", "_equipped"):  # without what is cached
+        monkeypatch.setattr(registry, name, getattr(registry, name).__wrapped__)
+    assert arm_of_robot(kind) is None
 
 
 @pytest.mark.skipif(arm_of_robot("xarm7") is None, reason="extra meshes")
