@@ -178,13 +178,13 @@ def _models(args: Run) -> dict[str, Path]:
     defaults = {"placing": MODELS / "placing", "aiming": MODELS / _aiming(args.markerless)}
     needed = {k: v for k, v in defaults.items() if args.experiment in _APPLIES[k]}
     if any(getattr(args, k) is None and not v.is_dir() for k, v in needed.items()):
-        console = Console()
-        console.print(f"note: no model is given or found in {MODELS}: it is learned first")
         if args.robot != "panda":
             raise ValueError(
-                f"the models in {MODELS} are for the Panda: learn models for the {args.robot} "
+                f"no model is given, and those in {MODELS} are for the Panda: learn others "
                 f"by `hrc demo --robot {args.robot} --out FOLDER`, and name them as options."
             )
+        console = Console()
+        console.print(f"note: no model is given or found in {MODELS}: it is learned first")
         learn(MODELS, console, markerless=args.markerless)
     return {k: (getattr(args, k) or v).resolve() for k, v in needed.items()}
 

@@ -111,7 +111,16 @@ class PlacingExperiment:
         return PlacingRun(scene=scene, placings=placings, outcomes=outcomes)
 
     def open_scene(self, rng: np.random.Generator) -> PlacingScene:
-        """World with drawn imperfections, skill, demonstration and taught correction."""
+        """World with drawn imperfections, skill, demonstration and taught correction.
+
+        Raises:
+            FileNotFoundError: If the demonstrations no longer exist.
+        """
+        if not self.demonstrations.is_dir():
+            raise FileNotFoundError(
+                f"{self.demonstrations}, the dataset of {self.placing}, no longer exists: "
+                "restore it, or name its place by --config experiment.demonstrations=PATH."
+            )
         skill = PlacingSkill.load(self.placing, self.robot.work_arm())
         demonstration = load_demos(self.demonstrations, episodes=[0])[0]
         workplace = Workplace.of(skill.robot)
@@ -213,15 +222,5 @@ class RandomStart:
 
 
 def dataset_of(placing: Path) -> Path:
-    """Dataset that a placing skill was learned from.
-
-    Raises:
-        FileNotFoundError: If it no longer exists.
-    """
-    path = Path(read_made_by(placing)["dataset"])
-    if not path.is_dir():
-        raise FileNotFoundError(
-            f"{path}, the dataset of {placing}, no longer exists: restore it, or fit the skill "
-            "again with hrc fit."
-        )
-    return path
+    """Dataset that a placing skill was learned from; it may no longer exist."""
+    return Path(read_made_by(placing)["dataset"])

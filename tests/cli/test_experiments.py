@@ -19,7 +19,7 @@ from hrc_learn.cli import (
 from hrc_learn.cli.arguments import Demo, FitPrimitives, Record, Run, WithRobot
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
 from hrc_learn.experiments.grasping_experiment import GraspingExperiment
-from hrc_learn.experiments.placing_experiment import PlacingExperiment
+from hrc_learn.experiments.placing_experiment import PlacingExperiment, dataset_of
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraChange, Imperfections
 from hrc_learn.sim.scene import UnmarkedLook
@@ -310,6 +310,15 @@ def test_learning_records_then_fits_and_repeats_what_has_changed(learned, tmp_pa
     assert said.startswith("[1/5] Demonstrations of placing\n")
 
 
+def test_a_lost_dataset_of_a_placing_skill_can_be_named_anew(ran, monkeypatch, tmp_path):
+    (tmp_path / "made_by.json").write_text(json.dumps({"dataset": str(tmp_path / "lost")}))
+    monkeypatch.setattr(experiment_commands, "dataset_of", dataset_of)
+    monkeypatch.setattr(experiment_commands, "_models", lambda args: {"placing": tmp_path})
+    config = (f"experiment.demonstrations={tmp_path / 'found'}",)
+    placing, _ = experiment_of(ran, experiment="placing", out=tmp_path / "a", config=config)
+    assert placing.demonstrations == tmp_path / "found"
+
+
 def test_an_expert_that_fails_ends_learning(learned, monkeypatch, tmp_path):
     monkeypatch.setattr(record_command, "record", lambda args: 1)
     with pytest.raises(RuntimeError, match="failed to demonstrate placing"):
@@ -375,10 +384,11 @@ def test_models_that_are_missing_are_those_of_the_demo(
         assert made[1:] == [(Path("outputs/demo"), True)]
 
 
-def test_models_of_another_arm_are_not_learned_unasked(monkeypatch, tmp_path):
+def test_models_of_another_arm_are_not_learned_unasked(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="hrc demo --robot ur5e --out FOLDER"):
         experiment_commands._models(Run(experiment="grasping", robot="ur5e"))
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("markerless", [False, True])

@@ -413,10 +413,10 @@ def test_a_scene_is_opened_with_the_shelf_that_was_shown(monkeypatch, taught):
         assert scene.correction is None
 
 
-def test_the_dataset_of_a_skill_has_to_exist(tmp_path):
+def test_the_dataset_of_a_skill_has_to_exist_when_it_is_used(tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model/made_by.json").write_text(json.dumps({"dataset": str(tmp_path / "set")}))
-    with pytest.raises(FileNotFoundError, match="no longer exists: restore it"):
-        dataset_of(tmp_path / "model")
-    (tmp_path / "set").mkdir()
     assert dataset_of(tmp_path / "model") == tmp_path / "set"
+    made = PlacingExperiment(placing=tmp_path / "model", demonstrations=tmp_path / "set")
+    with pytest.raises(FileNotFoundError, match="no longer exists: restore it, or name"):
+        made.open_scene(np.random.default_rng(0))
