@@ -108,7 +108,7 @@ class Ros2Arm(Connected):
         self._offset, self.received, self._seen = math.inf, -math.inf, ()
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
-        self._commanded_at = -math.inf
+        self._commanded_at, self._moved_at, self._step = -math.inf, 0.0, config.timeout
         node, kind = self.session.node, config.interface
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
         self._hand, once = None, quality(reliable=True)
@@ -191,6 +191,9 @@ class Ros2Arm(Connected):
             self._offset = min(self._offset, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()
+        if config.interface == "position" and self._velocity.any():
+            with self._lock:
+                self._send(self._velocity, state)
 
     def read(self) -> ArmState:
         """Return the newest state; `time` is the stamp of its message [s].
@@ -233,29 +236,40 @@ class Ros2Arm(Connected):
         self._dog.feed()
         with self._lock:
             self._send(velocity, state)
+            self._commanded_at = time.monotonic()
 
     def _send(self, velocity: np.ndarray, state: ArmState) -> None:
+        """Continue with a velocity from where the previous one has moved the goal by now."""
         from std_msgs.msg import Float64MultiArray
 
-        now, config = time.monotonic(), self.config
-        elapsed = min(now - self._commanded_at, config.timeout)
-        self._commanded_at, self._velocity = now, velocity
-        here, limits = state.joint_position, self._chain.limits
-        goal = here if self._goal is None else self._goal + elapsed * velocity
-        lower, upper = limits.lower.numpy(), limits.upper.numpy()
-        self._goal = goal = led_goal(goal, here, config.lag, lower, upper)
+        now, config, rest = time.monotonic(), self.config, self.config.timeout
+        elapsed = now - self._moved_at
         if config.interface == "trajectory":
-            self._commands.publish(self._trajectory(goal, velocity, elapsed))
+            coast = np.clip(elapsed - self._step, 0, rest)
+            moved = min(elapsed, self._step) + coast * (1 - 0.5 * coast / rest)
+        else:
+            # The arm has waited at the last position: catching up at once would be a jump.
+            expired = min(now, self._commanded_at + rest) - self._moved_at
+            moved = np.clip(expired, 0, rest / 3)
+        here, limits = state.joint_position, self._chain.limits
+        goal = here if self._goal is None else self._goal + moved * self._velocity
+        bounds = (here, config.lag, limits.lower.numpy(), limits.upper.numpy())
+        self._goal = goal = led_goal(goal, *bounds)
+        self._velocity, self._moved_at = velocity, now
+        if config.interface == "trajectory":
+            self._step = float(np.clip(elapsed, 1e-3, rest))
+            ahead = led_goal(goal + self._step * velocity, *bounds)
+            self._commands.publish(self._trajectory(ahead, velocity))
         else:
             values = velocity if config.interface == "velocity" else goal
             self._commands.publish(Float64MultiArray(data=values.tolist()))
 
-    def _trajectory(self, goal: np.ndarray, velocity: np.ndarray, elapsed: float) -> Any:
+    def _trajectory(self, goal: np.ndarray, velocity: np.ndarray) -> Any:
         """Trajectory that continues with the velocity and then comes to rest."""
         from rclpy.duration import Duration
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-        step, rest = max(elapsed, 1e-3), self.config.timeout
+        step, rest = self._step, self.config.timeout
         points = [
             (step, goal, velocity),
             (step + rest, goal + 0.5 * rest * velocity, 0 * velocity),
@@ -298,7 +312,7 @@ class Ros2Arm(Connected):
         """
         self.read()
         with self._lock:
-            self._goal = None
+            self._goal, self._velocity = None, np.zeros(len(self._names))
 
     def close(self) -> None:
         """Stop the arm and leave the graph."""

@@ -149,7 +149,7 @@ def test_commands_are_integrated_for_their_time_and_led_by_the_measured_arm(grap
     velocity = 0.5 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0])
     arm.command(velocity)
     np.testing.assert_allclose(graph.sent[-1][1].data, READY)
-    for passed, moved in ((0.02, 0.02), (0.03, 0.05), (1.0, 0.2)):  # 0.15 s at most
+    for passed, moved in ((0.02, 0.02), (0.03, 0.05), (1.0, 0.1), (0.05, 0.15), (0.05, 0.2)):
         graph.now += passed
         graph.state(10.0 + graph.now - 50, READY)
         arm.command(velocity)
@@ -171,7 +171,7 @@ def test_commanded_positions_stay_within_the_limits(graph, end):
     arm = position_arm(graph)
     for _ in range(3):
         arm.command(np.full(7, 0.5 * sign))
-        graph.now += 0.06
+        graph.now += 0.05
     np.testing.assert_allclose(graph.sent[-1][1].data, limit)
 
 
@@ -192,7 +192,65 @@ def test_a_trajectory_goes_on_with_the_velocity_and_ends_at_rest(graph):
         # At constant deceleration to rest the way is half of what the velocity would go.
         way = np.array(end.positions) - np.array(ahead.positions)
         np.testing.assert_allclose(way, 0.5 * 0.2 * velocity)
-    np.testing.assert_allclose(ahead.positions, READY + 0.05 * velocity)
+    np.testing.assert_allclose(ahead.positions, READY + 0.051 * velocity)
+
+
+def test_a_position_goes_on_with_the_states_and_never_jumps(graph):
+    arm = position_arm(graph, timeout=0.15)
+    velocity = np.zeros(7)
+    velocity[0] = 1.0
+
+    def wait(duration):
+        """Let states come at 100 Hz."""
+        for _ in range(round(100 * duration)):
+            graph.now += 0.01
+            graph.state(graph.now - 40, arm._goal)
+
+    arm.command(velocity)
+    wait(0.14)  # a late loop
+    arm.command(velocity)
+    wait(0.5)
+    arm.stop()
+    expired = READY + (0.14 + 0.15) * velocity
+    np.testing.assert_allclose(graph.sent[-1][1].data, expired)
+    wait(0.4)
+    arm.command(velocity)  # after a pause
+    np.testing.assert_allclose(graph.sent[-1][1].data, expired)
+    wait(0.05)
+    graph.now += 0.14  # this process was suspended
+    arm.command(velocity)
+    goals = np.array([message.data for _, message in graph.sent])
+    np.testing.assert_allclose(goals[-1], expired + 0.1 * velocity)
+    steps = np.diff(goals, axis=0)
+    assert np.abs(steps[:-1]).max() < 0.01 + 1e-9
+    assert np.abs(steps[-1]).max() < 0.05 + 1e-9
+
+
+def test_a_trajectory_goes_on_from_where_the_last_one_is(graph):
+    """Each is followed by cubic splines, as stock controllers do."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    arm = Ros2Arm(panda.chain, Ros2Config(interface="trajectory", timeout=0.15, lag=3.0))
+    velocity = np.zeros(7)
+    velocity[0] = 1.0
+    at, speed, fastest = READY[0], 0.0, 0.0
+    asked = [(1, 0.01)] * 5 + [(1, 0.1), (1, 0.01), (1, 0.15), (0, 8.0)] + [(1, 0.01)] * 5
+    for factor, passed in asked:
+        arm.command(factor * velocity) if factor else arm.stop()
+        points = graph.sent[-1][1].points
+        times = [
+            0.0,
+            *(p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points),
+        ]
+        positions = [at, *(p.positions[0] for p in points)]
+        speeds = [speed, *(p.velocities[0] for p in points)]
+        fastest = max(fastest, np.abs(np.diff(positions) / np.diff(times)).max())
+        path = CubicHermiteSpline(times, positions, speeds)
+        end = min(passed, times[-1])
+        at, speed = float(path(end)), float(path(end, 1))
+        graph.now += passed
+        graph.state(graph.now - 40, READY)
+    assert fastest < 2.0  # a velocity that begins at once, not with a ramp, is caught up with
 
 
 def test_a_gripper_is_read_from_its_joint_and_led_within_its_travel(graph):
