@@ -134,7 +134,7 @@ class ControllerNode:
             (Float64MultiArray, "~/push", self._on_push, quality()),
             (Empty, "~/heartbeat", self._on_heartbeat, quality()),
         ):
-            self.node.create_subscription(kind, topic, take, form)
+            self.node.create_subscription(kind, topic, self._checked(take), form)
         self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", once)
         self._markers = self.node.create_publisher(MarkerArray, "~/markers", once)
 
@@ -238,27 +238,43 @@ class ControllerNode:
         self._report(now)
         return state.time
 
-    def _on_goal(self, message: Any) -> None:
-        base = self._config.base
-        if base and message.header.frame_id not in ("", base):
-            text = f"a goal in frame {message.header.frame_id} is refused: give it in {base}"
-            self.node.get_logger().warning(text)
-            return
+    def _checked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Callback that logs a message that is refused; an error would end its thread."""
+
+        def guarded(message: Any) -> None:
+            try:
+                if not hasattr(self, "_runner"):
+                    raise ValueError("a message is refused: configure the node first")
+                take(message)
+            except Exception as error:
+                self.node.get_logger().warning(str(error))
+
+        return guarded
+
+    def _pose(self, message: Any, what: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position [m] and unit quaternion of a message, in the base frame."""
+        frame, base = message.header.frame_id, self._config.base
+        if base and frame not in ("", base):
+            raise ValueError(f"a {what} in frame {frame} is refused: give it in {base}")
         at, turn = message.pose.position, message.pose.orientation
-        orientation = np.array([turn.w, turn.x, turn.y, turn.z])
-        if not np.isfinite([at.x, at.y, at.z]).all() or not np.linalg.norm(orientation) > 0:
-            self.node.get_logger().warning("a goal with NaN or without orientation is refused")
-            return
-        values = self._runner.observation
-        values["goals.position.centre"][:] = (at.x, at.y, at.z)
-        values["goals.orientation.goal"][:] = orientation / np.linalg.norm(orientation)
+        pose = np.array([at.x, at.y, at.z, turn.w, turn.x, turn.y, turn.z])
+        if not np.isfinite(pose).all() or not pose[3:].any():
+            raise ValueError(f"a {what} with NaN or without orientation is refused")
+        return pose[:3], pose[3:] / np.linalg.norm(pose[3:])
+
+    def _on_goal(self, message: Any) -> None:
+        position, orientation = self._pose(message, "goal")
+        self._runner.observation["goals.position.centre"][:] = position
+        self._runner.observation["goals.orientation.goal"][:] = orientation
 
     def _on_region(self, message: Any) -> None:
+        centre, orientation = self._pose(message, "region")
         size = 0.5 * np.array([message.scale.x, message.scale.y, message.scale.z])
-        if (size > 0).all():
-            at = message.pose.position
-            self._runner.observation["goals.position.centre"][:] = (at.x, at.y, at.z)
-            self._runner.observation["goals.position.half_size"][:] = size
+        if not (size > 0).all() or abs(orientation[0]) < 1 - 1e-6:
+            text = "a region is refused: give edges above 0, along the axes of the base"
+            raise ValueError(text)
+        self._runner.observation["goals.position.centre"][:] = centre
+        self._runner.observation["goals.position.half_size"][:] = size
 
     def _on_target(self, message: Any) -> None:
         values, pixel = self._runner.observation, (message.point.x, message.point.y)
@@ -285,9 +301,10 @@ class ControllerNode:
             values["feature_age"][...] = newest - at[0]
 
     def _on_push(self, message: Any) -> None:
-        effort = np.array(message.data)
-        if effort.shape == self._runner.observation["nullspace_input"].shape:
-            self._runner.observation["nullspace_input"][:] = effort
+        effort, values = np.array(message.data), self._runner.observation["nullspace_input"]
+        if effort.shape != values.shape or not np.isfinite(effort).all():
+            raise ValueError(f"a push is refused: give {len(values)} finite numbers")
+        values[:] = effort
 
     def _on_heartbeat(self, _message: Any) -> None:
         self._heard = time.monotonic()

@@ -213,14 +213,23 @@ def test_goals_and_regions_that_make_no_sense_change_nothing(graph, node, values
         goal_at([np.nan, 0, 0]),
         goal_at([0, 0, 0], [0, 0, 0, 0]),
         goal_at([0, 0, 0], [np.nan, 0, 0, 0]),
+        goal_at([0, 0, 0], [np.inf, 0, 0, 0]),
     ]
     for message in wrong:
         graph.takers["~/goal"](message)
         assert box() == held
     assert graph.log[0] == "a goal in frame camera is refused: give it in base_link"
-    assert graph.log[1:] == ["a goal with NaN or without orientation is refused"] * 3
+    assert graph.log[1:] == ["a goal with NaN or without orientation is refused"] * 4
     region = Marker()
-    region.pose.position = goal_at([0.4, 0.1, 0.5]).pose.position
+    region.scale.x = region.scale.y = region.scale.z = 0.1
+    half = np.sqrt(0.5)
+    for goal in (*wrong, goal_at(CENTRE, [half, 0, 0, half])):
+        region.header, region.pose = goal.header, goal.pose
+        graph.takers["~/region"](region)
+        assert box() == held
+    assert graph.log[5] == "a region in frame camera is refused: give it in base_link"
+    assert graph.log[-1].startswith("a region is refused: give edges above 0, along")
+    region.pose = goal_at([0.4, 0.1, 0.5], [-1, 0, 0, 0]).pose
     for edges in ([0.1, 0.0, 0.1], [0.1, 0.2, -0.1], [np.nan, 0.1, 0.1]):
         region.scale.x, region.scale.y, region.scale.z = edges
         graph.takers["~/region"](region)
@@ -230,6 +239,17 @@ def test_goals_and_regions_that_make_no_sense_change_nothing(graph, node, values
     np.testing.assert_allclose(box(), (0.4, 0.1, 0.5, 0.05, 0.1, 0.15, *TURN), atol=1e-12)
     graph.takers["~/goal"](goal_at([0.3, 0.2, 0.6], [0, 0, 3, 0], frame=""))
     np.testing.assert_allclose(box(), (0.3, 0.2, 0.6, 0.05, 0.1, 0.15, 0, 0, 1, 0), atol=1e-12)
+
+
+def test_messages_that_cannot_be_used_are_refused_and_do_not_end_the_thread(graph, node):
+    from sensor_msgs.msg import CompressedImage
+
+    graph.takers["~/goal"](goal_at(CENTRE))
+    assert graph.log == ["a message is refused: configure the node first"]
+    graph.parameters["marker"].value = 7.0
+    assert node.start()
+    graph.takers["~/image/compressed"](CompressedImage(format="png", data=b"no image"))
+    assert len(graph.log) == 2
 
 
 def test_a_feature_is_paired_with_the_posture_of_its_image(graph, arm, node, values):
@@ -267,6 +287,8 @@ def test_a_target_switches_vision_on_and_none_off_and_pushes_have_their_size(
     push = np.arange(7.0)
     graph.takers["~/push"](Float64MultiArray(data=push.tolist()))
     graph.takers["~/push"](Float64MultiArray(data=[9.0] * 6))
+    graph.takers["~/push"](Float64MultiArray(data=[*push[:6].tolist(), np.nan]))
+    assert graph.log == ["a push is refused: give 7 finite numbers"] * 2
     np.testing.assert_array_equal(values["nullspace_input"], push)
 
 
