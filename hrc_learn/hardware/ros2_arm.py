@@ -81,7 +81,8 @@ class Ros2Arm(Connected):
 
     Attributes:
         session: The node.
-        ignored: Number of joint states that were reordered or not finite.
+        ignored: Number of joint states with all joints that were reordered, or lacked a finite
+            position of a joint.
         received: Arrival time of the newest one, by this machine's monotonic clock [s].
     """
 
@@ -159,7 +160,8 @@ class Ros2Arm(Connected):
         if not {*self._names} <= places.keys():
             return
         order = [places[name] for name in self._names]
-        position = np.array(message.position, float)[order]
+        complete = len(message.position) == len(names)
+        position = np.array(message.position if complete else [np.nan] * len(names))[order]
         stamp, last = stamp_of(message) or now, self._state
         reordered = last is not None and stamp <= last.time
         if reordered and last is not None and last.time - stamp > _CLOCK_RESET:

@@ -112,10 +112,13 @@ def test_states_that_are_old_or_partial_are_not_used_and_a_new_clock_is(graph):
         assert arm.ignored == ignored
     graph.state(10.7, READY[:6], (), NAMES[:6])  # of another part of the robot
     assert arm.ignored == 4
+    for position in (READY[:6], ()):  # names without positions
+        graph.state(10.8, position, np.zeros(7))
+    assert arm.ignored == 6
     np.testing.assert_array_equal(arm.read().joint_position, READY)
     graph.now += 100
     graph.state(9.4, READY + 1)  # a second back: a clock that was set anew
-    assert arm.ignored == 4
+    assert arm.ignored == 6
     assert arm.read().time == pytest.approx(9.4)
     np.testing.assert_array_equal(arm.read().joint_velocity, np.zeros(7))
     graph.state(9.9, READY + 2)
