@@ -44,10 +44,6 @@ allows before it stops the arm by itself."""
 _STALE_IN_LOCKSTEP = 2.0
 """The same for a simulator [s], whose machine may be busy with the task. libfranka itself gives
 up a connection after 1 s."""
-_REST = 3.0
-"""Timeout for coming to rest [s]. At the maker's limits this takes half a second; with a tenth
-of the acceleration, 2.6 s from the highest speed of joints 1 to 4 of an FR3, but 4 to 5 s from
-that of the others."""
 _RECOVERY = 15.0
 """Timeout for recovery [s]; the control box needs some seconds."""
 _LOOK = 0.02
@@ -102,7 +98,8 @@ class FrankaArm(Connected):
                 f"a Franka arm has {JOINTS} joints, but the chain {len(chain.joint_names)}."
             )
         self._config = config = config or FrankaConfig()
-        self._names = chain.joint_names
+        self._names, limits = chain.joint_names, chain.limits
+        self._rest = config.rest_timeout(limits.velocity, limits.acceleration, limits.jerk)
         self._shared, self._orders = Shared(), Orders()
         # Held by threads of this process that command; the loop never waits for it.
         self._writing = threading.Lock()
@@ -181,7 +178,7 @@ class FrankaArm(Connected):
         """
         self._order(stop=True, stamp=-math.inf)
         self._await(
-            lambda report: report.resting and report.phase != Phase.MOVING, _REST, "stop"
+            lambda report: report.resting and report.phase != Phase.MOVING, self._rest, "stop"
         )
         before = self.report
 
@@ -195,7 +192,7 @@ class FrankaArm(Connected):
             before = report
             return bool(way < _STILL * passed)
 
-        self._await(still, _REST, "stop")
+        self._await(still, self._rest, "stop")
 
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
@@ -228,7 +225,7 @@ class FrankaArm(Connected):
     def close(self) -> None:
         """Bring the arm to rest, end the motion, and end both processes."""
         self._order(end=True)
-        self._process.join(_REST)
+        self._process.join(self._rest)
         self._end()
 
     def _order(self, **changes: object) -> None:

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.controller import SafetyConfig
+from hrc_learn.geometry.numerics import ArrayLike
 
 CYCLE = 1e-3
 """Period of Franka's control interface [s]."""
+_REST, _LATER = 3.0, 1.5
+"""Shortest timeout for coming to rest [s], and its smallest ratio to the time for braking."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +108,16 @@ class FrankyConfig:
         for name in ("timeout", "grip_force", "grip_speed"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+
+    def rest_timeout(self, *limits: ArrayLike) -> float:
+        """Timeout for coming to rest from the highest velocities [s].
+
+        Args:
+            limits: Velocities, accelerations and jerks of the joints, before `dynamics`.
+        """
+        velocity, acceleration, jerk = map(np.asarray, limits)
+        braking = velocity / (self.dynamics * acceleration) + acceleration / jerk
+        return max(_REST, _LATER * float(braking.max()))
 
     def send_to(self, robot: Any) -> None:
         """Set collision thresholds and load of a connected arm.

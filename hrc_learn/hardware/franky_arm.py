@@ -33,9 +33,6 @@ _MISSING = (
     "for the server version of its control box, on a machine with a real-time kernel"
 )
 _JOINTS = tuple(f"joint {k}" for k in range(1, 8))
-_COMING_TO_REST = 2.0
-"""Timeout for coming to rest [s]: from the fastest velocity with 0.15 of the driver's
-acceleration."""
 
 
 class FrankyArm(Connected):
@@ -176,7 +173,7 @@ class FrankyArm(Connected):
         try:
             self.stop()
             with suppress(Exception):  # the error ended the motion: the arm is at rest
-                self._robot.join_motion(timeout=_COMING_TO_REST)
+                self._robot.join_motion(timeout=self._rest)
         finally:
             self.gripper.close()
             # The control box accepts one connection at a time, so end this one.
@@ -209,7 +206,10 @@ class FrankyArm(Connected):
             1.0, config.dynamics, config.dynamics
         )
         config.send_to(self._robot)
-        self._fastest = np.array(self._robot.joint_velocity_limit.get(), dtype=float)
+        kinds = ("velocity", "acceleration", "jerk")
+        limits = [getattr(self._robot, f"joint_{kind}_limit").get() for kind in kinds]
+        self._fastest = np.array(limits[0], dtype=float)
+        self._rest = config.rest_timeout(*limits)
 
     def _recover(self) -> None:
         with suppress(Exception):  # the error of the last motion, which is recovered from

@@ -205,6 +205,24 @@ def test_a_stop_is_over_once_the_last_joint_rests(loop, arm):
     assert 1.02 < loop.now - begun < 1.05
 
 
+def test_a_gentle_arm_has_the_time_to_brake_from_its_highest_speed(loop):
+    """At a tenth of the acceleration, 10 rad/s^2, joint 7 of an FR3 brakes for 5.3 s."""
+    arm = FrankaArm("arm", fr3, replace(CONFIG, dynamics=0.1))
+    begun = loop.now
+
+    def turn(orders):
+        brakes = loop.now < begun + 5.26
+        phase = Phase.MOVING if brakes else Phase.IDLE
+        loop.publish(phase=phase, resting=not brakes, time=loop.now)
+
+    loop.turn = turn
+    turn(loop.orders)
+    arm.stop()
+    assert loop.now > begun + 5.26
+    arm.close()
+    assert 6 < loop.patience[0] < 12
+
+
 def test_a_stop_that_does_not_come_is_an_error_and_a_stopped_clock_is_none(loop, arm):
     begun = loop.now
     loop.publish(phase=Phase.MOVING, resting=True)

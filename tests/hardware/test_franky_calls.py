@@ -43,6 +43,8 @@ class Franky:
         self.scheduling, self.is_in_control, self.heals = (os.SCHED_OTHER, 0), False, True
         self.mode, self.errors, self.milliseconds = self.RobotMode.Idle, {}, 1000
         self.joint_velocity_limit = SimpleNamespace(get=lambda: [2.0] * 6 + [0.5])
+        self.joint_acceleration_limit = SimpleNamespace(get=lambda: [10.0] * 7)
+        self.joint_jerk_limit = SimpleNamespace(get=lambda: [5000.0] * 7)
         self.width = 0.06
 
     def __getattr__(self, name):
@@ -144,7 +146,7 @@ def test_connecting_recovers_and_sends_the_settings_in_ordinary_priority(franky)
         ]
         assert franky.relative_dynamics_factor == (1.0, 0.3, 0.3)
         assert franky.scheduling == (os.SCHED_OTHER, 0)
-    assert franky.calls[3:] == [("join_motion", 2.0)]  # nothing moved
+    assert franky.calls[3:] == [("join_motion", 3.0)]  # nothing moved
 
 
 @pytest.mark.parametrize("kernel", ["1\n", "0\n", None])
@@ -281,11 +283,20 @@ def test_a_closed_arm_says_so_and_closes_once(franky):
     franky.calls.clear()
     arm.close()
     arm.close()
-    assert franky.calls == [("move", "stop"), ("join_motion", 2.0)]
+    assert franky.calls == [("move", "stop"), ("join_motion", 3.0)]
     for call in (arm.read, arm.recover, lambda: arm.command(np.zeros(7))):
         with pytest.raises(ArmFaultError, match="the arm at arm is closed: open it again"):
             call()
     arm.stop()
+
+
+def test_a_gentle_arm_has_the_time_to_brake_before_it_is_disconnected(franky):
+    arm = FrankyArm("arm", FrankyConfig(realtime=False, dynamics=0.05))
+    franky.calls.clear()
+    arm.close()
+    ((name, patience),) = franky.calls
+    assert name == "join_motion"
+    assert 4.0 < patience < 8.0  # 2 rad/s at 0.5 rad/s^2
 
 
 def test_the_gripper_moves_and_squeezes_with_the_settings(franky, arm):
