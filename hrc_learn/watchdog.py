@@ -151,7 +151,8 @@ class Watchdog:
     def close(self) -> None:
         """End the thread, but do not wait for a stop that hangs: the process must end."""
         self._done.set()
-        self._thread.join(self._timeout + _LONGEST_PAUSE)
+        if self._thread.is_alive():
+            self._thread.join(self._timeout + _LONGEST_PAUSE)
 
     def __enter__(self) -> Watchdog:
         self.feed()

@@ -43,6 +43,10 @@ def test_its_thread_notices_a_loop_that_hangs():
     assert dog.trips == 1
 
 
+def test_one_that_has_not_begun_may_be_closed():
+    Watchdog(1.0, lambda: None).close()
+
+
 def test_a_timeout_must_be_positive():
     with pytest.raises(ValueError, match="timeout must be positive"):
         Watchdog(0.0, lambda: None)
