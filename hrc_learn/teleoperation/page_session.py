@@ -257,7 +257,7 @@ class PageSession:
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)
         counts = self.arm.safety.counts.tolist()
         return PageStatus(
-            title="Simulated Panda",
+            title=f"{'Simulated ' if self._jumps else ''}{self._workplace.robot.name}",
             **{**vars(status), "note": "; ".join(filter(None, notes))},
             interventions=dict(zip(INTERVENTIONS, counts, strict=True)),
             contacts=sum(len(monitor.touches) for monitor in monitors),

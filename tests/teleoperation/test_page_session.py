@@ -105,7 +105,9 @@ def test_an_arm_with_a_driver_does_not_go_home_through_a_board(tmp_path):
     home, shelf = Workplace().home_joints(), Workplace().shelf("upper")
     with session_from(panda.inverse(shelf, near=home), tmp_path) as session:
         steps = [session.step() for _ in range(50)]
-        note = session._status(steps[-1]).note
+        status = session._status(steps[-1])
+    note = status.note
+    assert status.title == "panda"
     assert "would meet board_upper" in note
     assert "guide the arm out first" in note
     moved = steps[-1].state.joint_position - steps[0].state.joint_position
