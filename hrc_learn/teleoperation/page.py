@@ -76,14 +76,15 @@ class PageConfig(AddressConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         level = np.array(self.touch_points).reshape(-1, 3)[:, :2]
-        if len(level) < 3 or np.ptp(level, axis=0).max() < _APART:
+        apart = np.linalg.norm(level[:, None] - level, axis=-1)[~np.eye(len(level), dtype=bool)]
+        if len(level) < 3 or not (apart >= _APART).all():
             raise ValueError(
                 f"touch_points must be three at least, {_APART} m apart or more as seen from "
                 f"above, but are {self.touch_points}."
             )
 
 
-# Smallest extent of the touched points [m]: 1 cm off at 10 cm turns the arm by 6 degrees.
+# Smallest distance between touched points [m]: 1 cm off at 10 cm turns the arm by 6 degrees.
 _APART = 0.1
 _PERIOD = 0.04
 """Period of refreshes, which compute the efforts and draw the scene anew [s]."""

@@ -144,11 +144,19 @@ def test_hands_that_are_none_are_refused(wrong):
 def test_a_hand_is_in_one_place():
     message = json.loads(hands())
     message["tracked"] *= 2
-    with pytest.raises(MessageError, match="in one place"):
+    with pytest.raises(MessageError, match="listed only once"):
         session_message(json.dumps(message))
 
 
-@pytest.mark.parametrize("points", [((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)), ((0.0, 0.0, 0.0),) * 3])
+@pytest.mark.parametrize(
+    "points",
+    [
+        ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0)),
+        ((0.0, 0.0, 0.0),) * 3,
+        ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 0.0, 0.3)),
+        ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, np.nan, 0.0)),
+    ],
+)
 def test_points_that_place_nothing_are_refused(points):
     with pytest.raises(ValueError, match="touch_points must be three at least"):
         PageConfig(touch_points=points)
