@@ -90,9 +90,10 @@ class MarkerAngle:
             reference: Orientation of a tool that is not turned.
             now: Present turn of the tool [rad].
             turn_range: Smallest and largest turn [rad]. Among the turns that differ by half
-                turns, the one in the range that is nearest to `now` is chosen. It is kept until
-                it is well outside the range: otherwise noise would turn the tool back and forth
-                near an end of the range.
+                turns, the one in the range that is nearest to `now` is chosen; if none is, the
+                end of the range nearest to one of them. It is kept until it is well outside the
+                range: otherwise noise would turn the tool back and forth near an end of the
+                range.
             chosen: Turn chosen before [rad]; None: none.
         """
         turn, (low, high) = heading + self.offset_rad - _heading(reference), turn_range
@@ -101,8 +102,8 @@ class MarkerAngle:
             same = min(candidates, key=lambda c: abs(c - chosen))
             if low - _KEPT <= same <= high + _KEPT:
                 return same
-        inside = [c for c in candidates if low <= c <= high]
-        return min(inside or [min(max(turn, low), high)], key=lambda c: abs(c - now))
+        nearest = min(candidates, key=lambda c: (max(low - c, c - high, 0.0), abs(c - now)))
+        return min(max(nearest, low), high)
 
     def save(self, path: Path) -> None:
         """Write a JSON file, atomically."""

@@ -270,10 +270,13 @@ def _arranged(
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
-    """Turn with which the gripper closes along the object's x axis, within reach [rad]."""
+    """Turn within reach with which the gripper closes along the object's x axis [rad], or the
+    end of the reach that is nearest to it.
+    """
     low, high = workplace.hover_turns
     yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
-    return low + (yaw - low) % np.pi if high - low >= np.pi - 1e-9 else yaw
+    turn = low + (yaw - low) % np.pi
+    return min(turn, high) if turn - high <= low + np.pi - turn else low
 
 
 # Number of places and paths tried: a camera that sees half of the table misses all of twenty

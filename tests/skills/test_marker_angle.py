@@ -100,6 +100,15 @@ def test_of_two_ways_to_grasp_the_one_within_reach_is_taken():
     assert turn == pytest.approx(math.radians(100), abs=math.radians(1))
 
 
+@pytest.mark.parametrize("yaw", [-3.0, -1.0, -0.2, 0.3, 1.5, 2.4, 3.1])
+def test_a_tool_of_little_reach_turns_as_far_as_it_can(yaw):
+    skill, reach = MarkerAngle(offset_rad=0.0, spread_rad=0.0), (-0.3, 0.5)
+    turn = skill.turn(yaw, torch.tensor([1.0, 0.0, 0.0, 0.0]), 0.0, reach, None)
+    assert reach[0] <= turn <= reach[1]
+    best = np.abs(np.sin(np.linspace(*reach, 10_001) - yaw)).min()
+    assert abs(math.sin(turn - yaw)) == pytest.approx(best, abs=2e-4)
+
+
 def test_the_spread_is_that_of_the_demonstrations():
     assert learned().spread_rad < math.radians(0.3)
     assert learned(noise=0.05).spread_rad == pytest.approx(0.05, rel=0.5)
