@@ -51,6 +51,7 @@ def check_settings(
     settings: object,
     *,
     positive: Iterable[str] = (),
+    finite: Iterable[str] = (),
     not_negative: Iterable[str] = (),
     below_one: Iterable[str] = (),
     fraction: Iterable[str] = (),
@@ -60,6 +61,7 @@ def check_settings(
     Args:
         settings: Object with the settings as attributes.
         positive: Names of those that must be positive.
+        finite: Names of those that must be positive and finite.
         not_negative: Names of those that must be zero or positive.
         below_one: Names of those that must be in [0, 1).
         fraction: Names of those that must be in (0, 1].
@@ -69,6 +71,7 @@ def check_settings(
     """
     rules = (
         (positive, "must be positive", lambda x: x > 0),
+        (finite, "must be positive and finite", lambda x: 0 < x < torch.inf),
         (not_negative, "must not be negative", lambda x: x >= 0),
         (below_one, "must be in [0, 1)", lambda x: 0 <= x < 1),
         (fraction, "must be in (0, 1]", lambda x: 0 < x <= 1),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.geometry.numerics import ArrayLike
+from hrc_learn.geometry.numerics import ArrayLike, check_settings
 
 CYCLE = 1e-3
 """Period of Franka's control interface [s]."""
@@ -103,11 +103,8 @@ class FrankyConfig:
     """Load on the flange in addition to the end effector; None keeps the arm's setting."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.dynamics <= 1:
-            raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
-        for name in ("timeout", "grip_force", "grip_speed"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        finite = "timeout", "grip_force", "grip_speed"
+        check_settings(self, fraction=["dynamics"], finite=finite)
 
     def rest_timeout(self, *limits: ArrayLike) -> float:
         """Timeout for coming to rest from the highest velocities [s].

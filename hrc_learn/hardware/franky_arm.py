@@ -75,9 +75,7 @@ class FrankyArm(Connected):
         self._closed = False
         self._scheduling = _scheduling()
         self._connect()
-        self.gripper = GripperThread(
-            partial(_FrankyGripper, self._franky, ip, self.config),
-        )
+        self.gripper = GripperThread(partial(_FrankyGripper, self._franky, ip, self.config))
         # The driver's destructor ends the process by a signal while a motion is under way.
         atexit.register(self.close)
 
@@ -208,8 +206,7 @@ class FrankyArm(Connected):
         config.send_to(self._robot)
         kinds = ("velocity", "acceleration", "jerk")
         limits = [getattr(self._robot, f"joint_{kind}_limit").get() for kind in kinds]
-        self._fastest = np.array(limits[0], dtype=float)
-        self._rest = config.rest_timeout(*limits)
+        self._fastest, self._rest = np.array(limits[0], float), config.rest_timeout(*limits)
 
     def _recover(self) -> None:
         with suppress(Exception):  # the error of the last motion, which is recovered from

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
 from hrc_learn.hardware.lerobot_arm import led_goal
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of, start_guard
@@ -61,9 +62,7 @@ class Ros2Config:
     """Position of its joint when closed."""
 
     def __post_init__(self) -> None:
-        for name in ("timeout", "silence", "startup", "lag"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        check_settings(self, finite=("timeout", "silence", "startup", "lag"))
         if bool(self.gripper) != bool(self.gripper_joint):
             raise ValueError(
                 "gripper and gripper_joint belong together: give both, or neither."
@@ -110,7 +109,7 @@ class Ros2Arm(Connected):
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
         self._commanded_at, self._moved_at, self._step = -math.inf, 0.0, config.timeout
-        node, kind = self.session.node, config.interface
+        node, kind, self._numbers = self.session.node, config.interface, Float64MultiArray
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
         self._hand, once = None, quality(reliable=True)
         if config.gripper:
@@ -183,10 +182,7 @@ class Ros2Arm(Connected):
         elif last is not None:
             width = last.gripper_width
         state = ArmState(
-            time=stamp,
-            joint_position=position,
-            joint_velocity=velocity,
-            gripper_width=float(width),
+            time=stamp, joint_position=position, joint_velocity=velocity, gripper_width=width
         )
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
@@ -242,17 +238,16 @@ class Ros2Arm(Connected):
 
     def _send(self, velocity: np.ndarray, state: ArmState) -> None:
         """Continue with a velocity from where the previous one has moved the goal by now."""
-        from std_msgs.msg import Float64MultiArray
-
         now, config, rest = time.monotonic(), self.config, self.config.timeout
         elapsed = now - self._moved_at
         if config.interface == "trajectory":
+            # Way along the last trajectory, which brakes after its step.
             coast = np.clip(elapsed - self._step, 0, rest)
             moved = min(elapsed, self._step) + coast * (1 - 0.5 * coast / rest)
         else:
             # The arm has waited at the last position: catching up at once would be a jump.
-            expired = min(now, self._commanded_at + rest) - self._moved_at
-            moved = np.clip(expired, 0, rest / 3)
+            held = min(now, self._commanded_at + rest) - self._moved_at
+            moved = np.clip(held, 0, rest / 3)
         here, limits = state.joint_position, self._chain.limits
         goal = here if self._goal is None else self._goal + moved * self._velocity
         bounds = (here, config.lag, limits.lower.numpy(), limits.upper.numpy())
@@ -264,7 +259,7 @@ class Ros2Arm(Connected):
             self._commands.publish(self._trajectory(ahead, velocity))
         else:
             values = velocity if config.interface == "velocity" else goal
-            self._commands.publish(Float64MultiArray(data=values.tolist()))
+            self._commands.publish(self._numbers(data=values.tolist()))
 
     def _trajectory(self, goal: np.ndarray, velocity: np.ndarray) -> Any:
         """Trajectory that continues with the velocity and then comes to rest."""
@@ -272,32 +267,23 @@ class Ros2Arm(Connected):
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
         step, rest = self._step, self.config.timeout
-        points = [
-            (step, goal, velocity),
-            (step + rest, goal + 0.5 * rest * velocity, 0 * velocity),
-        ]
-        message = JointTrajectory(joint_names=list(self._names))
+        end = goal + 0.5 * rest * velocity
+        message: Any = JointTrajectory(joint_names=list(self._names))
         message.header.stamp = self.session.node.get_clock().now().to_msg()
-        message.points = [
-            JointTrajectoryPoint(
-                positions=position.tolist(),
-                velocities=speed.tolist(),
-                time_from_start=Duration(seconds=at).to_msg(),
-            )
-            for at, position, speed in points
-        ]
+        for at, position, speed in (step, goal, velocity), (step + rest, end, 0 * velocity):
+            point = JointTrajectoryPoint(positions=position.tolist(), velocities=speed.tolist())
+            point.time_from_start = Duration(seconds=at).to_msg()
+            message.points.append(point)
         return message
 
     def move(self, width: float) -> None:
         """Set the opening of the gripper [m], if there is one."""
-        from std_msgs.msg import Float64MultiArray
-
         config = self.config
         if self._hand is None:
             return
         share = float(np.clip(width / config.opening, 0.0, 1.0))
         travel = config.gripper_open - config.gripper_closed
-        self._hand.publish(Float64MultiArray(data=[config.gripper_closed + share * travel]))
+        self._hand.publish(self._numbers(data=[config.gripper_closed + share * travel]))
 
     def stop(self) -> None:
         """Bring the arm to rest, by zero velocities or by holding the last position."""

@@ -151,6 +151,7 @@ def test_it_is_converted_once():
     ("rule", "good", "bad", "words"),
     [
         ("positive", [1e-9, 2.0], [0.0, -1.0], "x must be positive, but is"),
+        ("finite", [1e-9, 2.0], [0.0, math.inf], "x must be positive and finite, but is"),
         ("not_negative", [0.0, 2.0], [-1e-9], "x must not be negative, but is"),
         ("below_one", [0.0, 0.99], [-1e-9, 1.0], r"x must be in \[0, 1\), but is"),
         ("fraction", [1e-9, 1.0], [0.0, 1.01], r"x must be in \(0, 1\], but is"),
