@@ -48,13 +48,7 @@ class CaptureCamera(Connected, TimedCamera):
     receive older and older images. A file plays at its own rate from the first `read` on.
     """
 
-    def __init__(
-        self,
-        source: int | str | Path,
-        *,
-        delay: float = 0.0,
-        timeout: float = 1.0,
-    ):
+    def __init__(self, source: int | str | Path, *, delay: float = 0.0, timeout: float = 1.0):
         """Open the source, and wait for the first image.
 
         Args:

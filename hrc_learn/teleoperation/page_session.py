@@ -274,11 +274,7 @@ def recorded_frame(step: GuidedStep, hands: Mapping[str, TrackedHand]) -> Frame:
     asked, box = step.human_input, np.zeros(6)
     if asked.region is not None:
         box = np.array([*asked.region.centre, *asked.region.half_size])
-    frame = {
-        **step.frame(),
-        "observation.human_twist": asked.twist,
-        "observation.region": box,
-    }
+    frame = {**step.frame(), "observation.human_twist": asked.twist, "observation.region": box}
     for name in ("left", "right"):
         seen = hands.get(name)
         pose = np.zeros(7) if seen is None else np.array([*seen.position, *seen.orientation])

@@ -144,10 +144,7 @@ def servo_expert(
         return quaternion.multiply(quaternion.exp(torch.from_numpy(turn)), gripper_down())
 
     return ScriptedExpert(
-        workplace.robot.chain,
-        path,
-        orientation,
-        Tremor(size * config.tremor, rng),
+        workplace.robot.chain, path, orientation, Tremor(size * config.tremor, rng)
     )
 
 
