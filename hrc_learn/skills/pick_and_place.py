@@ -234,12 +234,10 @@ class PickAndPlace:
         """Grasp the object and lift it."""
         try:
             self._grasping.grasp(job)
-        except UndetectedObjectError as error:
+        except (UndetectedObjectError, MissedGraspError) as error:
             job.failure = str(error)
-            return None
-        except MissedGraspError as error:
-            job.failure = str(error)
-            self._grasping.start_over()
+            if isinstance(error, MissedGraspError):
+                self._grasping.start_over()
             return None
         return self._home
 
