@@ -111,13 +111,30 @@ def test_names_may_be_missing_or_grouped(tmp_path):
     ("shown", "message"),
     [
         ([np.zeros((9, 2))], "hold still"),
-        ([np.arange(18.0).reshape(9, 2)], "hold still"),  # no acceleration either
         ([np.arange(6.0).reshape(3, 2) ** 2], "too short"),
     ],
 )
 def test_what_shows_no_motion_is_refused(tmp_path, shown, message):
     with pytest.raises(ValueError, match=message):
         demonstrated_limits(write(tmp_path / "set", shown, ("a", "b")))
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.1, 0.01])
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_a_constant_velocity_is_reached_within_one_action(tmp_path, slope, scale):
+    """Also next to columns of constant acceleration and jerk, in single precision."""
+    k = np.arange(40.0)
+    ramp = 1 + slope * k
+    shown = [np.stack([ramp, k**2 / 64, k**3 / 4096], axis=1)]
+    found = demonstrated_limits(write(tmp_path / "set", shown, ("a", "b", "c")), scale)
+    limits = np.array([found.velocity, found.acceleration, found.jerk])
+    assert limits[:, 0] == pytest.approx(scale * slope * FPS ** np.arange(1, 4), rel=1e-3)
+    assert limits[1:, 1] == pytest.approx(scale / 32 * FPS ** np.arange(2, 4), rel=1e-5)
+    for order in (1, 2, 3):
+        expected = scale * largest(shown, order)[2]
+        assert limits[order - 1, 2] == pytest.approx(expected, rel=1e-5)
+    only = demonstrated_limits(write(tmp_path / "one", [ramp[:, None]], ("a",)), scale)
+    assert [only.velocity, only.acceleration, only.jerk] == [[x] for x in limits[:, 0]]
 
 
 def test_a_dataset_without_actions_is_refused(tmp_path):

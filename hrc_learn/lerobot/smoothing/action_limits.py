@@ -176,7 +176,8 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
     """Limits within which the policy moves at most as abruptly as its demonstrators did.
 
     Limits are the 99.9th percentiles of differences of the actions within episodes. Positions
-    are not limited.
+    are not limited. Where velocity or acceleration is constant, one action may change it from
+    zero to its limit.
 
     Args:
         dataset: LeRobot dataset that the policy was trained on.
@@ -184,7 +185,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
 
     Raises:
         FileNotFoundError: There is no dataset.
-        ValueError: It cannot be read, or its actions are constant or without acceleration.
+        ValueError: It cannot be read, or its actions are constant.
     """
     folder = open_folder(dataset)
     features, fps = folder.features, folder.fps
@@ -192,11 +193,16 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
         raise ValueError(f"{dataset} has no actions.")
     entries = select_episodes(folder)
     episodes = [np.asarray(x[ACTION], float) for _, x in read_frames(folder, entries, [ACTION])]
-    limits = [scale * _largest(episodes, order, fps) for order in (1, 2, 3)]
-    if not all((limit > 0).any() for limit in limits):
-        raise ValueError(f"the actions of {dataset} hold still or never change their velocity.")
+    velocity, acceleration, jerk = (scale * _largest(episodes, k, fps) for k in (1, 2, 3))
+    if not velocity.any():
+        raise ValueError(f"the actions of {dataset} hold still: name a dataset with motions.")
+    # Second differences of rounded values of constant velocity.
+    rounding = 2 * np.finfo(np.float32).eps * np.abs(np.concatenate(episodes)).max(axis=0)
+    steady = acceleration <= scale * fps**2 * rounding
+    acceleration = np.where(steady, fps * velocity, acceleration)
+    jerk = np.where(steady | (jerk == 0), fps * acceleration, jerk)
     velocity, acceleration, jerk = (
-        np.maximum(limit, _STILL * limit.max()).tolist() for limit in limits
+        np.maximum(x, _STILL * x.max()).tolist() for x in (velocity, acceleration, jerk)
     )
     names, width, state = features[ACTION].names, len(velocity), features.get(OBS_STATE)
     states, state_width = (None, 0) if state is None else (state.names, math.prod(state.shape))
@@ -276,11 +282,8 @@ def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, 
                 f"{calibration} is no calibration of LeRobot: {name} has no range_min below a "
                 "range_max"
             )
-        if name == "gripper":
-            ranges[f"{name}.pos"] = (0.0, 100.0)
-        else:
-            end = half * 360 / _ENCODER_STEPS if degrees else 100.0
-            ranges[f"{name}.pos"] = (-end, end)
+        end = half * 360 / _ENCODER_STEPS if degrees else 100.0
+        ranges[f"{name}.pos"] = (0.0, 100.0) if name == "gripper" else (-end, end)
     if not ranges:
         raise ValueError(f"{calibration} is no calibration of LeRobot: it has no motors")
     return ranges
