@@ -192,11 +192,11 @@ class MotionHead(nn.Module):
     def timing(
         self, duration: Scalars | None = None, delay: Scalars | None = None
     ) -> Float[Tensor, "*batch n"]:
-        """Timing parameters for durations and delays [s] within their ranges.
+        """Timing parameters for durations and delays [s] strictly within their ranges.
 
         Raises:
-            ValueError: A value for a fixed duration or delay, a missing value, or a value out
-                of its range.
+            ValueError: A value for a fixed duration or delay, a missing value, or a value that
+                is not strictly within its range.
         """
         found = []
         for name, value, low, high in (
@@ -211,7 +211,10 @@ class MotionHead(nn.Module):
                 continue
             x = to_tensor(value, self.amplitude.dtype, self.amplitude.device)
             if readable(x) and not ((x > low) & (x < high)).all():
-                raise ValueError(f"{name} must lie between {low} and {high}")
+                raise ValueError(
+                    f"{name} must lie strictly between {low} and {high}: its parameter is "
+                    "infinite at the ends. Move the value inwards, or widen the range."
+                )
             fraction = (x / low).log() / math.log(high / low) if low else x / high
             found.append(fraction.logit())
         if not found:

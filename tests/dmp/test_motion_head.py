@@ -313,10 +313,10 @@ def test_state_survives_a_file(head, tmp_path):
         )),
         ("no range", lambda: head_of(2).timing(duration=1.0)),
         ("a range", lambda: MotionHead(2, delay=1.0).timing()),
-        ("must lie between", lambda: MotionHead(2, duration=(1.0, 2.0)).timing(duration=2.5)),
-        ("must lie between", lambda: MotionHead(2, duration=(1.0, 2.0)).timing(duration=1.0)),
-        ("must lie between", lambda: MotionHead(2, duration=(1.0, 2.0)).timing(duration=2.0)),
-        ("0.0 and 0.5", lambda: MotionHead(2, delay=0.5).timing(delay=0.0)),
+        ("strictly between", lambda: MotionHead(2, duration=(1.0, 2.0)).timing(duration=2.5)),
+        ("infinite at", lambda: MotionHead(2, duration=(1.0, 2.0)).timing(duration=1.0)),
+        ("widen the range", lambda: MotionHead(2, duration=(1.0, 2.0)).timing(duration=2.0)),
+        ("between 0.0 and 0.5", lambda: MotionHead(2, delay=0.5).timing(delay=0.0)),
     ],
 )  # fmt: skip
 def test_refuses_with_a_sentence(message, call):
