@@ -146,7 +146,7 @@ class LoopWatch:
             logger.warning(
                 "%s: %d of %d actions came late, by %.0f ms at most: the recording lacks "
                 "about %d frames, and moves faster there than the arm did. Record again with "
-                "fewer or smaller images, a lower --dataset.fps, or nothing else to compute",
+                "fewer or smaller images, a lower --dataset.fps, or no other load",
                 self._name,
                 len(late),
                 actions,
@@ -179,8 +179,8 @@ def the_robot() -> ArmRobot:
     robots = connected_robots()
     if len(robots) != 1:
         raise DeviceNotConnectedError(
-            "this teleoperator guides the one connected robot of hrc_learn (such as mujoco_arm "
-            f"or franka_panda), but connected are: {', '.join(map(str, robots)) or 'none'}."
+            "this teleoperator needs exactly one connected robot of hrc_learn (such as "
+            f"mujoco_arm or franka_panda); connected: {', '.join(map(str, robots)) or 'none'}."
         )
     return robots[0]
 

@@ -115,7 +115,7 @@ PLACE = {"file": "v.mp4", "key": "cam"}
     [
         ((4, 6, 3), (4, 6), 50.0, None),
         ((3, 4, 6), (4, 6), 50.0, None),
-        ((4, 6, 3), (6, 4), 50.0, "has images of 6 x 4, declared are [4, 6, 3]"),
+        ((4, 6, 3), (6, 4), 50.0, "has images of 6 x 4, but [4, 6, 3] is declared"),
         ((4, 6), (6, 4), 50.0, None),
         ((4, 6, 3), (4, 6), 50.9, None),
         ((4, 6, 3), (4, 6), 51.1, "runs at 51.1 images a second, the dataset at 50"),

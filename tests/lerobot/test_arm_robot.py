@@ -134,7 +134,7 @@ def test_the_hand_is_observed_on_the_side_where_it_was(simulated):
 
 
 def test_a_robot_is_found_where_it_is_the_only_one(simulated):
-    with pytest.raises(DeviceNotConnectedError, match=r"connected are: none"):
+    with pytest.raises(DeviceNotConnectedError, match=r"connected: none"):
         the_robot()
     left = simulated(scenario="grasping", id="left")
     assert the_robot() is left

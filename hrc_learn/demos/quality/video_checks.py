@@ -16,7 +16,7 @@ from hrc_learn.demos.videos import VideoSegment, image_at, read_segments, video_
 _MOST_FILES = 2000
 """Largest number of files whose packets are counted: reading a terabyte takes an hour."""
 _MOST_DECODED = 60
-"""Approximate number of files from which images are decoded."""
+"""Images are decoded from this number of files, or up to twice as many."""
 _MOST_EPISODES = 8
 """Largest number of episodes of a file from which images are decoded."""
 
@@ -62,7 +62,7 @@ def check_videos(folder: DatasetFolder, report: ValidationReport) -> None:
 def _check_camera(
     folder: DatasetFolder, key: str, by_file: dict[Path, Shown], report: ValidationReport
 ) -> None:
-    every = max(1, len(by_file) // _MOST_DECODED)
+    every = max(1, min(len(by_file), _MOST_FILES) // _MOST_DECODED)
     seen: dict[str, int] = {}
     for number, (path, shown) in enumerate(by_file.items()):
         name, first = str(path.relative_to(folder.root)), shown[0][0].index
@@ -133,7 +133,7 @@ def _size_and_rate(
     declared, fps = folder.features[place["key"]].shape, folder.fps
     if len(declared) == 3 and stream.size not in (declared[:2], declared[1:]):
         height, width = stream.size
-        text = f"has images of {height} x {width}, declared are {list(declared)}"
+        text = f"has images of {height} x {width}, but {list(declared)} is declared"
         yield Issue(message=text, **place)
     if stream.rate and abs(stream.rate / fps - 1) > 0.02:
         text = f"runs at {stream.rate:.4g} images a second, the dataset at {fps:g}"
@@ -152,8 +152,8 @@ def _length(
         off = abs(images - entry.length)
         if off > 1:
             text = (
-                f"shows {images} images, but the episode has {entry.length} frames: it is that "
-                f"of another episode, or frames were lost"
+                f"shows {images} images, but the episode has {entry.length} frames: it "
+                f"shows another episode, or frames were lost"
             )
             yield Issue(message=text, episode=entry.index, severity=off, **place)
     if not folder.is_v3:
@@ -184,6 +184,7 @@ def _images(folder: DatasetFolder, shown: Shown, place: dict[str, Any]) -> Itera
         frames = dict.fromkeys((0, entry.length // 3, 2 * entry.length // 3, last))
         images = [image_at(segment, frame, folder.fps) for frame in frames]
         if len(images) > 2 and all(np.array_equal(images[0], i) for i in images[1:]):
-            blank = "all of one colour" if np.ptp(images[0]) == 0 else "the same image"
+            varied = np.ptp(images[0], axis=(0, 1)).any()
+            blank = "the same image" if varied else "one colour"
             text = f"shows {blank} at the beginning, in the middle and at the end"
             yield warning(message=text, episode=entry.index, **place)
