@@ -52,14 +52,14 @@ class ControllerConfig:
     gain of the law grows with the square of the image Jacobian: without a cap it can exceed the
     gain that is stable with images at 15 to 30 Hz and a delay of one frame or more."""
     approach_linear_speed: float = 0.5
-    """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
+    """Cap on the linear speed of the tool while it approaches `Goals.posture` [m/s]."""
     approach_angular_speed: float = 2.0
-    """Cap on the angular speed of the tool during a joint-space approach [rad/s]."""
+    """Cap on the angular speed of the tool while it approaches `Goals.posture` [rad/s]."""
     command_delay: float = 0.0
     """Time from a command until the arm follows it, servo lag included [s]. The joint velocity
     is computed at the joint positions predicted for that time."""
     null_damping: float = 3.0
-    """c_d: null-space velocity is null-space input divided by c_d."""
+    """c_d [N m s/rad]: a null-space input d requests the null-space velocity d/c_d."""
     yields_to_limits: bool = True
     """True: near joint limits, free joints take over the motion that limited joints cannot make
     (saturation in the null space); the task slows down where a limit would make the tool faster
@@ -71,8 +71,8 @@ class ControllerConfig:
     blending: BlendingConfig = field(default_factory=BlendingConfig)
     """Blending of vision feedback."""
     way_making: WayMakingConfig | None = None
-    """Null-space motion away from people and objects at the `distances` of an observation;
-    None: the null space follows a person only."""
+    """Null-space motion away from the people and objects of `Observation.distances`; None: only
+    the null-space input of a person moves the null space."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter."""
 
@@ -87,7 +87,7 @@ class ControllerConfig:
 
     @classmethod
     def paper(cls) -> ControllerConfig:
-        """Settings of the law as printed, without the extensions; the safety filter stays."""
+        """Settings of the law as printed in the paper: no extensions but the safety filter."""
         return cls(
             linear_speed=math.inf,
             angular_speed=math.inf,
@@ -116,7 +116,7 @@ class ControllerState:
 
 
 class _Given(NamedTuple):
-    """Inputs of a step; `dt` and `q` are replaced where they are invalid."""
+    """Inputs of a step, with invalid values of `dt` and `q` replaced."""
 
     observation: Observation
     goals: Goals
@@ -127,12 +127,12 @@ class _Given(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """Joint velocity of the law before the safety filter, with its terms."""
+    """Joint velocity of the law before the safety filter, and the terms of this velocity."""
 
     joint_velocity: Tensor
     null_velocity: Tensor
     twist: Tensor
-    """Twist of the tool: task and drift compensation."""
+    """Twist of the tool: sum of the task's twist and the drift compensation."""
     task_twist: Tensor
     """Twist of the task alone."""
     xi_q: Tensor
@@ -149,14 +149,16 @@ class AdaptiveController(nn.Module):
 
     u = -J^+ (J_s_hat^T xi_x + xi_r) + N c_d^-1 (d - xi_q)               (globalControl)
 
-    with extensions for real arms: the twist is capped with its direction kept, J^+ is damped
-    near singularities, vision feedback fades in and out, null-space motion yields to the task
-    near limits, and a safety filter has the last word.
+    u is the joint velocity, J the arm's Jacobian and N its null-space projector. The feedback
+    is xi_x from vision (with the image Jacobian J_s_hat), xi_r from the tool pose and xi_q from
+    the joints; d is the null-space input. For real arms we extend the law: the twist is capped
+    with its direction kept, J^+ is damped near singularities, vision feedback fades in and out,
+    null-space motion yields to the task near limits, and a safety filter has the last word.
 
     Goals for a part of the tool pose (`Goals.task`) leave more null space. With a basis B of
-    that part and J_t = B J, u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q), and the potential
-    still falls. An arm with the task "nearest pose" (`Arm.task`) also follows this law for
-    goals of the whole pose.
+    that part, J_t = B J and s = J_s_hat^T xi_x + xi_r, the law is
+    u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q). The potential still falls. An arm with the
+    task "nearest pose" (`Arm.task`) also follows this law for goals of the whole pose.
 
     A step is a pure function `(state, observation) -> (command, state)`; the module stores no
     state. Run real-time loops under `torch.inference_mode()`.
@@ -176,9 +178,9 @@ class AdaptiveController(nn.Module):
         Args:
             arm: The arm, or its kinematic chain.
             estimator: Estimator of the image Jacobian.
-            goals: Regions to go to, unless an observation has its own.
+            goals: Regions to go to; an observation may replace them.
             config: Settings; default: the recommended ones.
-            joint_region: Region of the joint limits; default: that of the arm.
+            joint_region: Region within the joint limits; default: from the arm's limits.
 
         Raises:
             ValueError: The arm has too few joints for the goals.
@@ -206,7 +208,7 @@ class AdaptiveController(nn.Module):
     """Linear and angular speed caps of the task and of a joint-space approach [m/s, rad/s]."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True):
-        # Regions are not modules, but have to move with this one like its buffers.
+        # Regions are not modules, but have to change device and dtype with this module.
         super()._apply(fn, recurse)
         self.goals = _pytree.tree_map(fn, self.goals)
         self.joint_region = _pytree.tree_map(fn, self.joint_region)
@@ -216,7 +218,7 @@ class AdaptiveController(nn.Module):
         """Dimension of the joint motion that a task leaves free.
 
         Args:
-            task: Controlled part of the tool pose; None: that of the goals.
+            task: Controlled part of the tool pose; None: the part that the goals control.
         """
         return len(self.chain.joint_names) - self._ranks[task or self.goals.task]
 
@@ -330,8 +332,8 @@ class AdaptiveController(nn.Module):
             safety=report,
         )
         if goals.posture is not None:
-            # A joint-space approach does not use vision, but the estimator learns from its
-            # images.
+            # A joint-space approach does not use vision, but the estimator learns from the
+            # images taken meanwhile.
             seen = visible & (self.blending.inside(observation.feature) >= 0)
             if observation.feature_age is not None:
                 seen = seen & ~self.blending.late(observation.feature_age)
@@ -433,7 +435,7 @@ class AdaptiveController(nn.Module):
         null: Tensor,
         task_level: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Joint velocities of the task and of the null space, which yields near limits."""
+        """Joint velocities of task and null space; near limits, the null space yields."""
         config, q, posture = self.config, given.q, given.goals.posture
         bounds = self.safety.velocity_bounds(q)
         J_task, rows = J, twist

@@ -52,9 +52,9 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# Fraction of the task's speed given up by the constraint layer below which it is rounding.
+# The constraint layer slows the task down by at least this fraction; less is rounding.
 _SLOWED = 1e-3
-# Twist below which the task counts as at rest (linear and angular together) [m/s, rad/s].
+# Norm of the whole twist below which the task counts as at rest [m/s and rad/s mixed].
 _AT_REST = 1e-3
 
 
@@ -73,8 +73,8 @@ class ArmLoop:
         Args:
             chain: Kinematics and limits of the arm.
             config: Settings of the loop.
-            clearance: Distance of the arm from itself and its surroundings; None: a push can
-                move it anywhere within its limits.
+            clearance: Function for the distance of the arm from itself and its surroundings;
+                None: a push can move the arm anywhere within its limits.
         """
         self.chain, self.clearance = chain, clearance
         config = config or ArmLoopConfig()
@@ -151,7 +151,7 @@ class ArmLoop:
             reading: Newest reading.
 
         Returns:
-            The state, and what limits the push.
+            The state, and the limitations of the push.
         """
         null_velocity, limitations = self._eased_push(state, reading)
         pace = state.pace.overridden(reading.pause, self.config.dt)
@@ -180,7 +180,7 @@ class ArmLoop:
     def _eased_push(
         self, state: ArmLoopState, reading: ArmReading
     ) -> tuple[Tensor, tuple[Limitation, ...]]:
-        """Null-space velocity for the present push, and its limitations."""
+        """Null-space velocity for the present push [rad/s], and limitations of the push."""
         requested = self._requested_null_velocity(reading)
         acts = (requested.norm(dim=-1) > 0) | state.pushed
         if not bool(acts.any()):
@@ -209,7 +209,7 @@ class ArmLoop:
         )
 
     def _requested_null_velocity(self, reading: ArmReading) -> Tensor:
-        """Joint velocity for push and repulsion; only its null-space part acts."""
+        """Joint velocity requested by push and repulsion; only its null-space part acts."""
         config = self.config
         push = null_space_input(
             reading.nullspace_input, _distances(reading), config.way_making, config.damping
@@ -297,7 +297,7 @@ class ArmLoop:
             return slowed
         slowed = slowed | (people.speed_scale < 1)
         if (layer := report.constraints) is not None:
-            # Limits of the arm itself do not count: a path would wait for them for ever.
+            # Slowing down for the arm's own limits does not count: a path would wait for ever.
             given_up = (layer.slowed > _SLOWED) & closes_in(
                 people.distances, sent, self.safety.config
             )

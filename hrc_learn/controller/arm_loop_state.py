@@ -22,8 +22,8 @@ from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import Hindrance
 from hrc_learn.pytree import pytree, static
 
-# Joints are stuck unless they come nearer to their path by this distance [rad]: the slowest
-# returns take 1 s for it.
+# Joints count as stuck unless they come nearer to their path by this distance [rad]. The
+# slowest returns need 1 s for this distance.
 _NEARER = 0.05
 
 
@@ -38,8 +38,8 @@ class ArmLoopConfig(YieldingConfig):
     that of the simulated servos; on real arms, networks and schedulers add to it."""
     limit_margin: float = 0.1
     """Range before the joint limits that is reserved for the task and closed to pushes, in
-    addition to the margin of the safety filter [rad]. It moves the end effector by some
-    centimetres."""
+    addition to the margin of the safety filter [rad]. Motion over this range moves the end
+    effector by some centimetres."""
     speed: float = 1.0
     """Speed of the task relative to its planned speed, in (0, 1]; for example low for a first
     run on a real arm. It does not slow down null-space motions off a path."""
@@ -65,12 +65,12 @@ class ArmLoopConfig(YieldingConfig):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class WatchedPeople:
-    """People near the arm, with the distance that they may have moved since the observation."""
+    """Distances of the arm from people near it, and the speed limits that result."""
 
     distances: Distances
-    """Distances of the most urgent pairs, reduced by the distance that people may have moved
-    since the observation. NaN, which brakes the arm, without an observation and where people
-    may touch the arm but must not."""
+    """Distances of the most urgent pairs of an arm capsule and a body capsule, reduced by the
+    distance that people may have moved since the observation. NaN (the arm brakes) if there is
+    no observation, or if people are close enough to touch the arm where they must not."""
     nearest: Float[Tensor, "*batch"]
     """Smallest distance between the observed people and the arm at its present joints [m]."""
     age: Float[Tensor, "*batch"]
@@ -97,11 +97,11 @@ class ArmReading:
     pause: Bool[Tensor, "*batch"]
     """True while a person pauses the task."""
     load: Float[Tensor, "*batch 3"] | None = None
-    """Far end of a load in the frame of the end effector [m]; its speed is capped as well.
-    None: no load."""
+    """Far end of a load in the frame of the end effector [m]. The cap on the tool's speed also
+    holds there. None: no load."""
     people: WatchedPeople | None = None
-    """People near the arm, which slow it down and whose distances the safety filter keeps;
-    None: people are not tracked."""
+    """People near the arm: they slow it down, and the safety filter keeps its distance from
+    them. None: people are not tracked."""
     stop: Bool[Tensor, "*batch"] | None = None
     """True where the arm must come to rest because of people; None: nowhere."""
     explain: bool = static(False)
@@ -114,24 +114,24 @@ class PathState:
     """Progress along a joint path, and how the last step tracked it."""
 
     progress: Float[Tensor, "*batch"]
-    """Sample of the path to track, interpolated between whole numbers."""
+    """Number of the path sample to track; a fraction lies between two samples."""
     rate: Float[Tensor, "*batch"]
-    """Rate relative to the path's own speed, -1 to 1."""
+    """Speed along the path, relative to the path's own speed, -1 (backwards) to 1."""
     last: Float[Tensor, "*batch"]
     """Index of the last sample."""
     followed: Bool[Tensor, "*batch"]
     """True if the last step followed the path."""
     goal: Float[Tensor, "*batch n"]
-    """Joint positions that were tracked [rad]."""
+    """Joint positions on the path that the last step tracked [rad]."""
     pose: Pose
     """Pose of the end effector at `goal`."""
     twist: Float[Tensor, "*batch 6"]
     """Velocity of that pose along the path (linear [m/s], angular [rad/s])."""
     blocked: Bool[Tensor, "*batch"]
-    """True if the arm, off its path, would have hit something if the path had advanced."""
+    """True if the arm is off its path and would hit something if the path advanced."""
     narrow_ahead: Bool[Tensor, "*batch"]
-    """True if the path becomes narrow, so that the joints cannot leave it, before it can
-    stop."""
+    """True if the path, before it can stop, comes near a singularity. The joints cannot leave
+    the path there."""
     waited: Float[Tensor, "*batch"]
     """Waiting time in which the joints came no nearer to the path [s]."""
     nearest: Float[Tensor, "*batch"]
@@ -177,7 +177,8 @@ class PathState:
         Args:
             off: Distance of the joints from the path now [rad].
             counts: False for steps in which the arm is pushed or slowed down by people.
-            stuck_after: Waiting time after which coming nearer no longer counts [s].
+            stuck_after: Waiting time [s] after which joints stay stuck even if they come
+                nearer.
             dt: Control step [s].
         """
         nearer = counts & (off < self.nearest - _NEARER) & (self.waited <= stuck_after)
@@ -244,7 +245,7 @@ class MoveJoints:
 
 
 type ArmRequest = FollowPath | TrackPose | MoveJoints | Command
-"""Request of a task; a command of the adaptive controller has passed its own safety filter."""
+"""Request of a task; a `Command` of the adaptive controller has passed a safety filter."""
 
 
 class Limitation(NamedTuple):
@@ -254,7 +255,7 @@ class Limitation(NamedTuple):
     kept: Float[Tensor, "*batch"]
     """Fraction of the motion that remains, 0 to 1."""
     joint: Int[Tensor, "*batch"] | None = None
-    """Joint at its limit, from 0."""
+    """Index of the joint at its limit, from 0."""
     distance: Float[Tensor, "*batch"] | None = None
     """Distance from an obstacle [m]."""
     mentioned: Bool[Tensor, "*batch"] | None = None

@@ -1,9 +1,9 @@
-"""Joint velocities that keep joint limits and distances at once, by a quadratic program.
+"""Joint velocities that keep joint limits and distances together, by a quadratic program.
 
 The program finds the joint velocity nearest to a wanted one, with priority for the task. It has
-two unknowns more than the arm has joints: the speed of the task, and the excess where distances
-conflict. The distances are those of the arm from itself, from objects and from people
-(`SeparationConfig`).
+two unknowns more than the arm has joints: the speed of the task, and the excess of the closing
+speed where distances conflict. The arm keeps distances from itself, from objects and from
+people (`SeparationConfig`).
 
 The solver is the dual active-set method of Goldfarb and Idnani (1983), batched, with a fixed
 limit on the number of steps. It starts at the optimum without limits and adds one limit at a
@@ -35,9 +35,9 @@ from hrc_learn.pytree import pytree, zero_where
 
 # Violations of a limit up to this are rounding.
 _TOLERANCE = 1e-10
-# A row counts as linearly dependent on the active rows if its projection onto their null space
-# is relatively shorter than this. Rounding leaves 1e-16; with weights of 1e7, a fraction of
-# 1e-7 of a row is significant.
+# The row of a limit counts as linearly dependent on the active rows if this fraction of it, or
+# less, lies in their null space. Rounding leaves 1e-16; with weights of 1e7, a fraction of 1e-7
+# of a row is significant.
 _DEPENDENT = 1e-12
 
 
@@ -53,7 +53,7 @@ class LeastChange(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _Step:
-    """Iterate of the method: the nearest point within the active limits."""
+    """Nearest point within the active limits in a step of the method; shapes in parentheses."""
 
     y: Tensor
     """The point (p)."""
@@ -63,8 +63,8 @@ class _Step:
     """1 for an active upper limit, -1 for an active lower one, 0 otherwise (rows)."""
     operators: Tensor
     """Projector onto the null space of the active rows (p, p) and, to its right, the
-    pseudo-inverse of these rows (p, rows); each of its columns is multiplied by `side`, so it
-    is zero for inactive limits."""
+    pseudo-inverse of these rows (p, rows). The columns of the pseudo-inverse are multiplied by
+    `side`, so the columns of inactive limits are zero."""
     pending: Tensor
     """True while a limit is only partly added, because another one had to be dropped first
     (1)."""
@@ -86,8 +86,8 @@ def least_change(
     without limits, its unknown is y = L^T (x - x_0).
 
     Args:
-        rows: C^T, a column for each limit: sums then run over the first axis, and compiled
-            code works on vectors of limits.
+        rows: C^T, with a column for each limit. In this layout sums run over the first axis,
+            and compiled code works on vectors of limits.
         lower: Lower limits, not above `upper`; minus infinity: none.
         upper: Upper limits; infinity: none.
         steps: Number of steps. Each active limit takes one step, and each limit that is added
@@ -128,7 +128,7 @@ def _violations(
 
 
 def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
-    """One step: add the most violated limit, or drop one that stands in its way."""
+    """One step: add the most violated limit, or drop an active limit that prevents this."""
     below, above = _violations(now, rows, lower, upper)
     violation = torch.where(now.side == 0, torch.maximum(below, above), -1.0)
     index = torch.where(now.pending, now.index, violation.argmax(-1, keepdim=True))
@@ -210,8 +210,8 @@ class ConstraintConfig:
     path_weight: float = 1e3
     """Cost of leaving the path of the task by 1 rad/s, relative to stopping it."""
     distance_weight: float = 1e2
-    """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2 the
-    violation of conflicting distances is minimal to a part in 1e4."""
+    """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2,
+    the violation of conflicting distances exceeds the least possible one by a part in 1e4."""
     steps: int = 16
     """Steps of the solver; the arm brakes where they are not enough. Arms approached by a
     person never needed more than 12; random limits need more than 16 in 4 % of the states, and
@@ -249,8 +249,8 @@ class Distances:
     towards the arm, along the line between both."""
     person: Bool[Tensor, "*batch pairs"] | None = None
     """True for pairs with a person: the arm approaches only as fast as the protective distance
-    allows, and does not retreat from a person who approaches. False for objects; None: all
-    pairs are objects."""
+    allows, and does not retreat from an approaching person. False for objects; None: all pairs
+    are objects."""
     contact_speed: Float[Tensor, "*batch pairs"] | None = None
     """Highest relative speed of an allowed contact with the person [m/s]; zero where no contact
     is allowed. None: no contact is allowed at all."""
@@ -326,14 +326,15 @@ def constrained_velocity(
     with c = rate (d - clearance) - approach_speed for objects, and for people the speed that
     keeps the protective distance (`Distances.closing_speed`).
 
-    The weights are far apart, which makes them priorities. Joint limits hold exactly. Distances
+    The weights are far apart (W_t `task_weight`, W_p `path_cost`, W_d `slack_cost` of
+    `ConstraintConfig`), which makes them priorities. Joint limits hold exactly. Distances
     hold, or are violated by the least possible excess `delta`, equal for all pairs. The tool
     stays on the path of the task, J u = J wanted + sigma J t, if any motion on it is allowed.
     The task keeps as much of its speed as possible. The null space yields first. Where no limit
     binds, the result is the wanted velocity.
 
-    On the path the tool never moves faster than wanted, whatever the null space does: to cap
-    its speed, cap the wanted velocity.
+    On the path, the tool never moves faster than wanted, whatever the null space does. To cap
+    the speed of the tool, cap the wanted velocity.
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
@@ -394,8 +395,8 @@ def constrained_velocity(
 
 
 def _unit_cost_directions(jacobian: Tensor, task: Tensor, config: ConstraintConfig) -> Tensor:
-    """Joint velocities that cost one unit each (directions, n): m off the path, one along it,
-    and those of the null space.
+    """Joint velocities that cost one unit each (directions, n): m directions that leave the
+    path, one along the path, and the directions of the null space.
     """
     m = jacobian.shape[-2]
     basis = orthonormal_basis(jacobian).mT

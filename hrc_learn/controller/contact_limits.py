@@ -8,8 +8,9 @@ of the arm at its posture is given by
 
     1/m_R = n^T J M^-1 J^T n
 
-for the direction n of approach. A part of the body between the arm and furniture cannot yield:
-there the arm is also assumed to push on until it has stopped.
+with the direction n of approach, the Jacobian J of the contact point and the mass matrix M. A
+part of the body between the arm and furniture cannot yield: there we also assume that the arm
+pushes on until it has stopped.
 
 The values are those of ISO/TS 15066:2016, tables A.2 and A.3, as commonly quoted; secondary
 sources confirm the spring constants and masses, and that the edition of 2025 kept the tables.
@@ -65,7 +66,7 @@ _TRANSIENT = 2.0
 # Cosine of 60 degrees: furniture clamps a person if, seen from the arm, it lies within this
 # angle of the person.
 _FACING = 0.5
-# Distance below which the direction is undefined [m].
+# Distance of the arm from furniture below which its direction is undefined [m].
 _TOUCHING = 1e-6
 # Excess speed that counts as rounding of the constraint solver [m/s].
 _TOLERANCE = 1e-10
@@ -83,7 +84,7 @@ class ContactConfig:
     """Fraction of the limits that is used; the rest allows for errors of the masses of arm and
     load."""
     rotor_inertia: float = 0.1
-    """Inertia of motor and gear at each joint [kg m^2], as of MuJoCo's Panda."""
+    """Inertia of motor and gear at each joint [kg m^2]: the value of MuJoCo's Panda."""
     load: float = 0.5
     """Mass of an object in the gripper, at the tool centre point [kg]."""
 
@@ -96,7 +97,7 @@ class ContactConfig:
 class SeparationConfig:
     """Settings of speed and separation monitoring and of power and force limiting.
 
-    The first fields are the terms of the protective separation distance (ISO 10218-2:2025,
+    The first four fields are terms of the protective separation distance (ISO 10218-2:2025,
     Annex L; formerly ISO/TS 15066:2016, 5.5.4.2.3).
     """
 
@@ -309,7 +310,7 @@ class ContactLimits:
 def clamped(
     found: Separation, furniture: Sequence[Box], gap: Float[Tensor, "*#batch 1 H"]
 ) -> Bool[Tensor, "*batch C H"]:
-    """True where less than a gap is left between the arm and furniture behind the person.
+    """True where the space between the arm and furniture behind the person is below `gap`.
 
     Args:
         found: Distances between arm and person.

@@ -112,8 +112,8 @@ class SafetyReport:
     speed_excess_time: Float[Tensor, "*batch"]
     """Time for which the cap has been exceeded, up to the end of this step [s]."""
     constraints: ConstraintReport | None = None
-    """Effect of the constraints, none while the arm brakes to rest; None: the filter has no
-    constraints."""
+    """Effect of the constraints, which is zero while the arm brakes to rest. None: the filter
+    has no constraints."""
 
     def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
         """True where one kind of intervention changed the command."""
@@ -140,7 +140,7 @@ _PAPER_IMAGE = (1440, 1080)
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Goals:
-    """The attracting regions.
+    """Regions that attract the tool, the image feature and the joints.
 
     All fields are tensors, so a task can change them between two steps without rebuilding or
     recompiling the controller.
@@ -231,8 +231,8 @@ class Goals:
         in time takes joints to their limits and the arm into singularities.
 
         Args:
-            posture: Posture that has the tool in the box; None: the null space stays where it
-                is.
+            posture: Posture in which the tool is in the box; None: the null space stays where
+                it is.
             rate: Convergence rate near the posture [1/s].
             speed: Highest speed, norm over all joints [rad/s].
 
@@ -266,8 +266,8 @@ class Observation:
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
     joint_velocity: Float[Tensor, "*batch n"] | None = None
-    """Measured joint velocities [rad/s]. In the first step after a start they replace the
-    velocities of the initial state if they differ from them. None: not measured."""
+    """Measured joint velocities [rad/s]. In the first step after a start, they replace the
+    velocities of the initial state if the two differ clearly. None: not measured."""
     nullspace_input: Float[Tensor, "*batch n"] | None = None
     """Null-space input d of the paper: joint torques exerted by a person [N m]; None: none."""
     goals: Goals | None = None
@@ -285,8 +285,8 @@ class Observation:
     """Distance of the nearest person from the tool [m]; a short one slows down or stops the
     arm. NaN (unknown): stop. None: no person is monitored."""
     load: Float[Tensor, "*batch 3"] | None = None
-    """Far end of a load in the frame of the tool centre point [m]; its speed is capped as well.
-    None: no load."""
+    """Far end of a load in the frame of the tool centre point [m]. The cap on the tool's speed
+    also holds there. None: no load."""
     distances: Distances | None = None
     """Distances of the arm from itself, the scene and people, kept by
     `SafetyConfig.constraints`; None: none."""
@@ -344,8 +344,8 @@ class Command:
     vision_level: Float[Tensor, "*batch"]
     """Fraction of vision feedback, 0 to 1."""
     potential: Float[Tensor, "*batch"]
-    """Sum of the task-space potentials P_t + P_o + P_v, with P_v scaled by the blending: the
-    part of the Lyapunov function that does not depend on the true weights."""
+    """Sum P_t + P_o + P_v of the potentials of position, orientation and vision, with P_v
+    scaled by the blending: the part of the Lyapunov function without the true weights."""
     potential_rate: Float[Tensor, "*batch"]
     """s^T J u, the rate of the potential predicted with the estimated image Jacobian [1/s]; not
     positive while no limit or person turns the motion against the task. A measured potential

@@ -35,16 +35,18 @@ WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
 second, the null space may lead to a posture other than the path's. The alignment is 0.7 when
 the elbow has moved a quarter of its circle, and 0 after half of the circle."""
 NARROW = 0.07
-"""Smallest singular value of the Jacobian below which the joints cannot leave a path. Damping
-begins at 0.05."""
+"""Smallest singular value of the Jacobian below which the joints cannot leave a path. The
+damping of the inverse Jacobian begins at 0.05."""
 
 # Distance at which a path that has waited goes on [rad].
 _NEAR_AGAIN = 1.4
 # Distances from the path [rad]: below the first, joints return whatever their alignment; above
 # the second, the alignment counts in full.
 _NEARBY = 0.3, 0.5
-# Tolerated distance of the end effector from its path [m], half the deviation that a push may
-# cause; and tolerated lag [s], twice the servo lag of an arm with a delay of 20 ms.
+# `_ON_PATH`: tolerated distance of the end effector from its path [m], half the deviation that
+# a push may cause.
+# `_SERVO_LAG`: tolerated lag behind the path [s], twice the servo lag of an arm with a delay of
+# 20 ms.
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
 # Length that converts rotations of the end effector to distances: the size of gripper and
 # object [m/rad].
@@ -136,8 +138,8 @@ def may_not_return(
         error: Path minus joint positions [rad].
         alignment: `return_alignment` of that error.
         waited: True if the path has waited for the joints and they are no longer pushed. The
-            path then goes on only once they are well on their way back; otherwise it would lead
-            them off again.
+            path then goes on only once the joints are well on their way back; otherwise it
+            would lead them off again.
     """
     waited = torch.as_tensor(waited)
     farthest = torch.where(waited, _NEAR_AGAIN, FAR_ASIDE)
@@ -169,7 +171,7 @@ def nears_singularity(
 ) -> Bool[Tensor, "*batch"]:
     """True if joints off their path are near a singularity, or will be before the path stops.
 
-    There the end effector could not be kept on the path.
+    Near a singularity, the end effector could not be kept on the path.
 
     Args:
         chain: Kinematics of the arm.
@@ -216,8 +218,8 @@ def _length(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
     return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)
 
 
-# Least number of samples of a long path that a direct return may lead to, and number of
-# postures checked on the way to each.
+# `_RETURN_GOALS`: least number of samples of a long path among which a direct return chooses.
+# `_CHECKED`: number of postures checked on the way to each of these samples.
 _RETURN_GOALS, _CHECKED = 20, 51
 
 
@@ -245,7 +247,7 @@ class DirectReturn:
 
     @classmethod
     def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:
-        """No return under way."""
+        """State in which no return is under way."""
         q, zero = joint_position, joint_position.new_zeros(joint_position.shape[:-1])
         clocks = {"progress": zero, "duration": zero, "time": zero}
         never = torch.zeros_like(zero, dtype=torch.bool)
@@ -261,15 +263,16 @@ class DirectReturn:
         config: YieldingConfig,
         clearance: Clearance | None,
     ) -> DirectReturn:
-        """Plan a return to the waiting sample, or else to the nearest one without contact.
+        """Plan a return to the sample at which the path waits, or, if the arm would hit
+        something on this way, to the nearest sample that it reaches without contact.
 
         Args:
             paths: Table of paths.
             path: Index of the path.
-            progress: Sample at which it waits.
+            progress: Sample at which the path waits.
             joint_position: Joint positions now [rad].
-            config: Highest speed, and the clearance to keep; a return may start and end with
-                less.
+            config: Highest speed of the return, and the clearance to keep. A return may start
+                and end with less clearance.
             clearance: Distance of the arm from obstacles; None: there are no obstacles.
         """
         goals, order = _return_goals(paths, path, progress, joint_position)
@@ -309,7 +312,9 @@ def _return_goals(
     progress: Float[Tensor, "*batch"],
     joint_position: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "goals *batch n"], Float[Tensor, "goals *batch"]]:
-    """Goals of a direct return and their samples: the waiting one, then others by distance."""
+    """Possible goals of a direct return [rad], and their numbers on the path: first the sample
+    at which the path waits, then others by distance.
+    """
     last = paths.last[path]
     stride = ((last + 1) // _RETURN_GOALS).clamp(min=1)
     k = torch.arange(2 * _RETURN_GOALS).reshape(-1, *(1 for _ in last.shape)) * stride

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from hrc_learn.kinematics import MotionLimits
 
-# Rounding error of a velocity, in units of the dtype's resolution times v_max: one for the sum
-# v + a dt, and one in reserve for the sums and products before it.
+# Rounding error of a velocity, in units of the dtype's resolution times v_max: one unit for the
+# sum v + a dt, and one in reserve for the operations before this sum.
 _ROUNDING = 2.0
 # Margin [rad/s] that libfranka 0.21 also subtracts from position-dependent velocity limits to
 # absorb rounding errors (kJointVelocityLimitsTolerance).
@@ -49,7 +49,7 @@ class LimitBarrier(nn.Module):
     distance that the joint travels while the acceleration ramps down. It matters for axes with
     a long ramp time A/j.
 
-    *Starts outside.* A joint may start at rest nearer to a limit than this, or beyond it. Such
+    *Starts outside.* A joint may start at rest with a smaller delta, or beyond the limit. Such
     a joint never moves outwards, and may stay at rest; the set is then
     v_hat <= max(h(delta), A^2/(2 j)). A joint that comes to rest within its margin then stops
     at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. This set is also
@@ -266,7 +266,8 @@ class SpeedBarrier(nn.Module):
     Let J be the linear Jacobian of a point, v and a the joint velocity and acceleration. The
     speed |J v| changes although v rests, because J turns with the joints. The set therefore
     bounds the speed throughout one braking motion to rest, v(t) = y v, in which y falls from 1
-    to 0 with dy/dt = -1/T, where T = max(kappa |v_i|/A_i) + tau for the present v.
+    to 0 with dy/dt = -1/T. For the present v, T = max(kappa |v_i|/A_i) + tau, with the limits
+    A_i of the acceleration, a factor kappa >= 1, and a time tau in which the braking fades out.
 
     *Turning.* For joints i, j of a chain, d^2 p/dq_i dq_j = z_min(i,j) x J_max(i,j), at most as
     long as the column J_max(i,j). Let R_i be the longest column from joint i on, and x = |v|.
@@ -274,14 +275,15 @@ class SpeedBarrier(nn.Module):
 
         |J(q + d) v - J(q) v| <= sum_ij R_max(i,j) d_j x_i,
 
-    and B = sum_ij R_max(i,j) x_i x_j bounds |dJ/dt v|. Until y, joint j moves by at most
-    x_j (T (1 - y^2)/2 + dt), where dt is for the step itself. So the speed is at most
+    and B = sum_ij R_max(i,j) x_i x_j bounds |dJ/dt v|. While y falls from 1 to a value y, joint
+    j moves by at most x_j (T (1 - y^2)/2 + dt); the term dt is the step before the braking. So
+    the speed is at most
 
         y (|J v| + dt B + Gamma (1 - y^2)),    Gamma = B (T + tau)/2.
 
-    Its largest value over y is |J v| + dt B as long as that exceeds 2 Gamma: braking outruns
-    the turning. The bound is a barrier, because one step of braking, of any length, does not
-    increase it. The columns R_i grow as well, by a factor of at most exp(sum of all d).
+    The largest value over y is |J v| + dt B if this sum exceeds 2 Gamma: braking outruns the
+    turning. The bound is a barrier, because one step of braking, of any length, does not
+    increase it. The columns R_i also grow, by a factor of at most exp(sum of all d).
 
     *Jerk.* While its acceleration a ramps down, a joint is faster than y v by at most
     (a + b)^2/(2 j), where b = |v|/T is its deceleration. A large kappa keeps these ramps small.

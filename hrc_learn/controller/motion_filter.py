@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 # Fraction of the limits that corrections of errors use; the requested motion needs the rest.
 _USABLE = 0.8
-# Decay rates of position and velocity errors, as fractions of the sampling rate: the fastest
-# ones tried with which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a
-# second.
+# Decay rates of position and velocity errors, as fractions of the sampling rate. Of the rates
+# that we tried, these are the fastest at which steps of 0.03 to 1 rad settle without overshoot
+# at 20 and 50 samples a second.
 _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
 # Factor on limits for differences of rounded numbers, also in float32.
 _ROUNDING = 1 + 1e-6
@@ -76,8 +76,10 @@ class MotionFilter:
         a = a_r - h'(e; A, lambda) e' - h(e' + h(e; A, lambda); j, mu)
         h(x; b, k) = sign(x) (sqrt((b/k)^2 + 2 b |x|) - b/k)
 
-    so that e' follows -h(e): a large e shrinks with the deceleration A, a small e decays at the
-    rate lambda. A step in the requested positions counts as an error, not as a motion.
+    with the slope h' of h. So e' follows -h(e): a large e shrinks with the deceleration A, a
+    small e decays at the rate lambda. Deviations of e' from -h(e) decay in the same way, with
+    the jerk j and the rate mu. A step in the requested positions counts as an error, not as a
+    motion.
 
     The limits hold for *any* input, because they apply to differences of the returned
     positions: v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt.
@@ -86,9 +88,9 @@ class MotionFilter:
 
         v + (a + A)^2/(2 j) <= min(h(d; A, 1/dt), v_max + A^2/(2 j))
 
-    remains true. Braking with A, ramped up with j, never leaves this set. The start must lie in
-    it: at rest, it must be at least A^3/(8 j^2) + A^2 dt/(2 j) away from the position limits. A
-    is lowered where this distance would exceed a tenth of their range.
+    remains true. Braking with A, ramped up with j, never leaves this set. The motion must start
+    in the set: at rest, at least A^3/(8 j^2) + A^2 dt/(2 j) away from the position limits. A is
+    lowered where this distance would exceed a tenth of the range between these limits.
     """
 
     def __init__(
@@ -175,13 +177,14 @@ class MotionFilter:
         """Nearest acceleration that keeps the limits now and later [1/s^2]."""
         A, j, dt = self.acceleration, self.jerk, self.dt
         margin = self._walls + self._sides * state.position[..., None, :]
-        # Past a limit the motion returns as fast as from the same distance inside it.
+        # Past a limit, the motion returns at the speed at which it may approach the limit from
+        # the same distance inside.
         speed = np.sqrt(self._knee**2 + 2 * A * np.abs(margin)) - self._knee
         speed = np.copysign(speed, margin) - self._reserve
         speed = np.minimum(np.maximum(speed, -self._fastest), self._fastest)
         slack = speed + self._sides * state.velocity[..., None, :]
         offset = A + j * dt
-        # Negative far outside the set, where no acceleration is enough: brake hard.
+        # Far outside the set no acceleration is enough, and the square is negative: brake hard.
         most = np.sqrt(np.maximum(offset**2 + 2 * j * slack, 0.0)) - offset
         a = np.minimum(np.maximum(wanted, -most[..., 0, :]), most[..., 1, :])
         # Clamp to jerk and acceleration last: outside the set, the bounds above may exceed

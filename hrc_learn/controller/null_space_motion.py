@@ -23,41 +23,43 @@ from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain
 LOOK_AHEAD = 0.15
 """Time ahead over which a null-space motion is checked [s]: about its stopping time."""
 
-# Largest acceleration of the end effector that a null-space motion may cause [m/s^2]; 1 rad
-# counts as 0.1 m. If servos lag 10 ms more than assumed, it moves the end effector by 0.5 mm at
-# a pose gain of 4 1/s.
+# `_BENDING`: largest acceleration of the end effector that a null-space motion may cause
+# [m/s^2]. If servos lag 10 ms more than assumed, this acceleration moves the end effector by
+# 0.5 mm at a pose gain of 4 1/s. `_METRES_PER_RADIAN`: length that counts as much as 1 rad.
 _BENDING, _METRES_PER_RADIAN = 0.2, 0.1
 _DIFFERENCE_STEP = 1e-4  # [s]
-# Highest speed of a guided elbow [m/s]: the reduced speed of ISO 10218-1:2025. Fraction of a
-# speed cap that a guided elbow may use. The bound of the speed barrier includes braking and
-# delay, so nearer to the cap it would slow the elbow down (on a Panda with a cap of 0.25 m/s,
-# above 0.15 m/s).
+# `_GUIDED_SPEED`: highest speed of an elbow that a person guides [m/s], the reduced speed of
+# ISO 10218-1:2025. `_GUIDED_FRACTION`: fraction of a speed cap that a guided elbow may use.
+# Above this fraction the speed barrier, which allows for braking and delay, would slow the
+# elbow down (on a Panda with a cap of 0.25 m/s, above 0.15 m/s).
 _GUIDED_SPEED, _GUIDED_FRACTION = 0.25, 0.6
 # Highest speed of a guided joint [rad/s]. With `_STOP_EFFORT`, every joint of a Panda stops
 # within 0.11 rad.
 _GUIDED_JOINT_SPEED = 1.0
 # Fractions of a motion at which it is checked.
 _FRACTIONS = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
-# Smallest singular values between which a motion towards a singularity fades out: below the
-# lower one the task itself is damped.
+# A motion towards a singularity fades out while the smallest singular value falls from
+# `_REGULAR` to `_SINGULAR`. Below `_SINGULAR`, the task itself is damped.
 _SINGULAR, _REGULAR = SINGULAR_BELOW, 1.6 * SINGULAR_BELOW
-# Fractions of the acceleration limits with which null-space motions may speed up and slow down.
-# The task needs the rest; if both together exceed the limits, the task slows down as well.
+# Fractions of the acceleration limits with which null-space motions may speed up
+# (`_PUSH_EFFORT`) and slow down (`_STOP_EFFORT`). The task needs the rest; if task and
+# null-space motion together exceed the limits, the task slows down as well.
 _PUSH_EFFORT, _STOP_EFFORT = 0.3, 0.6
 # Lower bound on the null-space speed with which the arm looks ahead for singularities [rad/s].
 _SLOW = 0.2
-# A correction has no null-space part if that part is smaller than this [rad/s]. A joint does
-# not take part in it if its ratio to the largest entry is smaller.
+# The null-space part of a correction counts as zero if it is shorter than this [rad/s]. A joint
+# takes no part in a correction if its entry is smaller than this, relative to the largest one.
 _NEGLIGIBLE = 1e-6
-# Closing speed allowed at the clearance margin [m/s], and depth inside the margin at which it
-# has fallen to zero [m]. Without it, an arm that slides along a surface, and its task, would
-# stop and start with every reading.
+# `_SLIDING_SPEED`: closing speed allowed at the clearance margin [m/s].
+# `_DEEPEST`: depth inside the margin at which this allowed speed has fallen to zero [m].
+# Without them, an arm that slides along a surface would stop and start with every reading, and
+# so would its task.
 _SLIDING_SPEED, _DEEPEST = 0.002, 0.005
 # Null-space fraction of a push below which the push counts as a push on the end effector.
 _ACROSS = 0.1
 
 type Clearance = Callable[[Float[Tensor, "*batch n"]], Float[Tensor, "*batch"]]
-"""Distance of the arm at given joint positions from itself and its surroundings [m]."""
+"""Function from joint positions to the arm's distance from itself and its surroundings [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +82,9 @@ class YieldingConfig:
     return_speed: float = 0.4
     """Highest speed of the return, norm over all joints [rad/s]."""
     clearance: float = 0.03
-    """Distance that pushes keep from obstacles [m], up to 5 mm less while the arm slides along
-    them: three times the calibration errors of base and table."""
+    """Distance from obstacles that the arm keeps when it is pushed [m]: three times the
+    calibration errors of base and table. The distance may be up to 5 mm less while the arm
+    slides along an obstacle."""
 
     def __post_init__(self) -> None:
         speeds = "elbow_speed", "return_speed"
@@ -120,10 +123,10 @@ def null_space_slowdown(
 ) -> Float[Tensor, "*batch"]:
     """Fraction of a null-space velocity at which the end effector can be kept in place.
 
-    The null space is curved. A motion along it at speed s accelerates the end effector by
-    s^2 c, where c is the derivative of J along the motion times the motion; late servos
-    compensate for it only in part. The speeds of elbow and joints are limited as well: near a
-    singularity a joint could turn far before it stops.
+    The null space is curved. A motion in it at the speed s along a unit vector w accelerates
+    the end effector by s^2 c. Here c is the derivative of J along w, times w. Late servos
+    compensate for this acceleration only in part. The speeds of elbow and joints are limited as
+    well: near a singularity, a joint could turn far before it stops.
 
     Args:
         chain: Kinematics of the arm.
@@ -249,8 +252,8 @@ def null_space_giving_way(
     """The null-space velocity nearest to a given one that keeps task plus null space in bounds.
 
     At a limit to which a person has pushed the arm, the null space thus gives way to the task.
-    The correction has a single direction, which for seven joints spans the whole null space. If
-    no correction is sufficient, the bounds are exceeded as little as possible.
+    The correction has a single direction, which spans the whole null space of an arm with seven
+    joints. If no correction is sufficient, the bounds are exceeded as little as possible.
 
     Args:
         jacobian: Jacobian of the end effector.
@@ -281,8 +284,8 @@ class ClearMotion(NamedTuple):
     null: Float[Tensor, "*batch n"]
     """Null-space velocity [rad/s]."""
     blocked: Bool[Tensor, "*batch"]
-    """True where the task alone would bring the arm inside the margin, or nearer if it is
-    inside: the task has to wait."""
+    """True where the task has to wait: the task alone would bring the arm inside the margin, or
+    nearer to an obstacle if the arm is already inside."""
     distance: Float[Tensor, "*batch"]
     """Clearance of the arm now [m]."""
 
@@ -300,10 +303,10 @@ def kept_clear(
         joint_position: Joint positions [rad].
         task: Joint velocity of the task, which is not changed [rad/s].
         null: Null-space velocity [rad/s].
-        clearance: Distance from obstacles. Called once, with a leading axis of the postures
-            that are compared.
+        clearance: Function for the distance from obstacles. It is called once, for all
+            postures to compare, along a new first axis.
         margin: Clearance to keep [m]. Where the task alone leaves less, the null space reduces
-            it by at most 2 mm/s, and not at all from 5 mm inside the margin on.
+            the clearance by at most 2 mm/s, and not at all if it is more than 5 mm too small.
     """
     ahead = joint_position + LOOK_AHEAD * (task + _fractions_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
@@ -342,7 +345,7 @@ def fraction_in_null_space(
 
     Args:
         requested: Joint velocity requested by the push [rad/s].
-        projected: Its null-space part [rad/s].
+        projected: Null-space part of `requested` [rad/s].
     """
     square = torch.linalg.vecdot(requested, requested)
     # For an orthogonal projection N, |N w|^2 = w^T N w.

@@ -1,6 +1,6 @@
 """Joint velocities that track poses and joint paths while a push may move the null space.
 
-A path advances, waits or is retraced, depending on how well an arm pushed aside can follow it.
+A path advances, waits or is retraced, depending on how well an arm off the path can follow.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# Distance from the path beyond which joints count as aside when a path begins, and within which
-# pushed joints count as back [rad]. Servos lag by 0.03 rad at the speed of transfers.
+# `_ASIDE`: joints farther than this from the start of a path begin off the path [rad].
+# `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
+# by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
 
 
@@ -87,7 +88,7 @@ class OffPath(NamedTuple):
     fraction: Tensor
     """Fraction of the push that is followed."""
     push: Tensor
-    """That fraction of the push [rad/s]."""
+    """Part of the push that is followed [rad/s]."""
     back: Tensor
     """Velocity of the return [rad/s]."""
 
@@ -99,9 +100,9 @@ class PathLaw:
 
         u = J^+ (twist + gain error) + N w,
 
-    with w reduced until the arm can keep the pose, stays clear of obstacles, and leaves the
-    task a margin before the joint limits. In this way, joints off their path track the poses of
-    the path.
+    where u is the joint velocity, `error` the pose error and w the joint velocity of the push,
+    reduced until the arm can keep the pose, stays clear of obstacles, and leaves the task a
+    margin before the joint limits. In this way, joints off their path track its poses.
     """
 
     def __init__(self, chain: SerialChain, config: ArmLoopConfig, clearance: Clearance | None):
@@ -236,7 +237,7 @@ class PathLaw:
         waited, nearest = path.waiting(off, counts, self.config.back_after, dt)
         waited = torch.where(state.aside, waited, 0.0)
         held = torch.where((path.rate <= 0) & pushed, path.held + dt, 0.0)
-        # Joints that find no way back here may find one where they left the path.
+        # Joints that find no way back to this sample may find one where they left the path.
         backs = (waited > self.config.back_after) & (path.progress > 0)
 
         def astray(part: tuple[Any, ...]) -> tuple[Tensor, Tensor]:
@@ -316,7 +317,9 @@ class PathLaw:
         )
 
     def _target_motion(self, target: PathTarget, aside: Tensor) -> tuple[Pose, Tensor]:
-        """Pose of the end effector on the path, and its twist for joints off it."""
+        """Pose of the end effector on the path, and its twist along the path, which is zero
+        except for arms that are aside.
+        """
         ahead = target.goal + self.config.command_delay * target.velocity
         twist = apply_where(
             aside,
@@ -329,16 +332,16 @@ class PathLaw:
     def _off_path(
         self, state: ArmLoopState, reading: ArmReading, path: PathState, target: PathTarget
     ) -> OffPath:
-        """Joints off their path: how far a push may take them, and how they return."""
+        """State of joints off their path: the part of the push to follow, and their return."""
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        # Joints that lag without a push touch something: they keep following the path.
+        # If joints on the path lag without a push, they touch something: they stay on the path.
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
         lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)
-        # Joints return where the path waits for them, and once they are let go.
+        # Joints return while the path waits for them and, with "return", after the push.
         returns = path.rate <= 0
         if config.after_push == "return":
             alignment = joint_path.return_alignment(null_error, error)
@@ -382,7 +385,9 @@ class PathLaw:
     def _returning(
         self, path: PathState, joint_position: Tensor, request: FollowPath
     ) -> PathState:
-        """The path, with direct returns begun after too long a wait and ended on arrival."""
+        """State of the path, with direct returns started after a long wait and ended on
+        arrival.
+        """
         direct, dt = path.direct_return, self.config.dt
         arrived = direct.active & (direct.time > direct.duration + dt)
         if bool(arrived.any()):

@@ -59,12 +59,12 @@ def task_descent(
     basis: Float[Tensor, "*batch rows 6"],
     gradient: Float[Tensor, "*batch 6"],
 ) -> Float[Tensor, "*batch 6"]:
-    """Part of a gradient along which a task of fewer than six dimensions descends.
+    """Twist along which a task of fewer than six dimensions descends the potentials.
 
     With J_t = B J and a motion y of the task, the joints move by J_t^+ y, and the tool moves by
-    J J_t^+ y, which includes rotations outside the task. So the gradient over y is (J J_t^+)^T
-    s, and the potential falls at the rate of its square. The gradient is B s where s lies in
-    the task.
+    J J_t^+ y, which includes rotations outside the task. So the gradient of the potentials over
+    y is g = (J J_t^+)^T s. A motion along -g lowers them at the rate |g|^2. If s lies in the
+    task, g = B s.
 
     Args:
         J: Geometric Jacobian.
@@ -72,7 +72,7 @@ def task_descent(
         gradient: s, gradient of the potentials over small motions of the tool.
 
     Returns:
-        B^T y, a twist.
+        The twist B^T g.
     """
     J_t = matmul(basis, J)
     pushed = matmul(J_t, matmul(J.mT, gradient.unsqueeze(-1)))
@@ -148,8 +148,8 @@ def saturate_in_null_space(
     Joints that would exceed a limit move at the limit, and the other joints make up for the
     rest of the twist: one iteration of the saturation in the null space (Flacco, De Luca and
     Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015). Without it,
-    an arm with a joint at its limit may stop short of its goal, where the smallest velocity
-    moves that joint alone.
+    an arm may stop short of its goal: this happens where the smallest joint velocity would move
+    only a joint that is at its limit.
 
     Args:
         task: Joint velocity of the task, by `resolved_rate` [rad/s].
@@ -159,8 +159,8 @@ def saturate_in_null_space(
         upper: Highest allowed velocity [rad/s].
 
     Returns:
-        The shifted velocity, which may exceed the bounds of joints that were within them; or
-        the given velocity, if that comes at least as near to the twist after clamping [rad/s].
+        The shifted velocity [rad/s], which may exceed bounds that the given velocity kept; or
+        the given velocity, if after clamping it comes at least as near to the twist.
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
     free = cut == task
@@ -191,8 +191,8 @@ def scale_task(
     """Slow the task down where limits of single joints would make the tool faster.
 
     If one of two joints that nearly cancel each other's motion is limited, the other swings the
-    tool off its path, faster than was asked for. Slowing down the task as a whole avoids that.
-    Where the limit makes the tool slower the task goes on, and slides along the limit.
+    tool off its path, faster than requested. Slowing down the task as a whole avoids this.
+    Where the limit makes the tool slower, the task goes on and slides along the limit.
 
     Args:
         task: Joint velocity of the task [rad/s].
@@ -229,7 +229,8 @@ def scale_null_space(
     """Scale the null-space velocity as a whole to keep the limits of single joints.
 
     Limiting single joints would move the tool. The factor is the largest from 0 to 1 that keeps
-    the limits. If the task alone is too fast for any factor, it is the one that comes closest.
+    the limits. If no factor keeps them, because the task alone is too fast, we take the factor
+    that comes closest.
     (Factors outside this range would let the redundant joints give way to the task, but in
     measurements they drove the elbow fast into the limits near singularities.)
 
@@ -295,8 +296,9 @@ def measure_drift(
 ) -> PoseDrift:
     """Add the drift of the last step: planned motion minus motion of the tool.
 
-    The motion of the tool is (J_0 + J_1)/2 dq, up to an error of third order in the step. It
-    was planned with J_0 dq, which has an error of second order: the difference is the drift.
+    With the Jacobians J_0 before and J_1 after the step dq of the joints, the tool moves by
+    (J_0 + J_1)/2 dq, up to an error of third order in the step. The motion was planned as
+    J_0 dq, with an error of second order: the difference is the drift.
 
     Args:
         before: Drift after the last step.
@@ -507,10 +509,10 @@ def next_task_level(
 ) -> Float[Tensor, "*batch"]:
     """Level of task-space feedback after a joint-space approach, 0 to 1.
 
-    It rises inside the posture region: task-space feedback from an arbitrary posture often ends
-    at a joint limit. Then it stays up, even if a person or the task moves the joints out of the
-    region, unless the posture is far away, as at the start of a new phase, and no feature is
-    followed.
+    The level rises inside the posture region: task-space feedback from an arbitrary posture
+    often ends at a joint limit. Then the level stays up, even if a person or the task moves the
+    joints out of the region. It falls only while no feature is followed and the posture is far
+    away, as at the start of a new phase.
 
     Args:
         task_level: Level after the last step.
@@ -542,7 +544,7 @@ class Feedback(NamedTuple):
     s: Float[Tensor, "*batch 6"]
     """J_s_hat^T xi_x + xi_r."""
     potential: Float[Tensor, "*batch"]
-    """Sum of the potentials, that of vision scaled by the vision level."""
+    """Sum of the potentials, with the potential of vision scaled by the vision level."""
 
 
 def regional_feedback(

@@ -1,7 +1,7 @@
 """Safety filter: the last stage before a joint velocity is sent to the arm.
 
-It needs only the joint limits, and serves any source of commands: the adaptive controller, the
-playback of a learned motion, a joystick.
+The filter needs only the joint limits, and serves any source of commands: the adaptive
+controller, the playback of a learned motion, a joystick.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from hrc_learn.geometry.numerics import ArrayLike, as_tensor, everywhere, has_nu
 from hrc_learn.kinematics import MotionLimits, SerialChain
 from hrc_learn.pytree import zero_where
 
-# Smallest relative excess, or change of a joint velocity [rad/s], reported as an intervention.
-# Smaller ones are rounding, also in float32: a command along a limit would be flagged at
-# random.
+# Smallest relative excess over a limit, or change of a joint velocity [rad/s], that is reported
+# as an intervention. Smaller values are rounding, also in float32: if they were reported, a
+# command along a limit would be flagged at random.
 _REPORTED = 1e-6
 # Fraction of the acceleration and jerk limits left unused. A check of the sent positions
 # divides differences of rounded numbers by powers of the step: for the jerk at 1 kHz by 1e-9
@@ -40,8 +40,8 @@ _REPORTED = 1e-6
 _ROUNDING = 1e-9
 # Smaller joint velocities are rounded to rest [rad/s].
 _REST = 1e-15
-# Step assumed for braking before the first valid one [s]: the shortest that arms use, with
-# which braking is gentlest.
+# Step dt assumed for braking before the first valid dt [s]: the shortest step that arms use,
+# because it brakes most gently.
 _SHORTEST_STEP = 1e-3
 # Fraction of the velocity limits by which measured velocities may differ from those of the
 # initial state: encoders at 1 kHz err by some hundredths of a radian per second.
@@ -76,11 +76,11 @@ class SafetyFilter(nn.Module):
 
     The limits hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), if
     the arm follows its commands with an error below the margins. Otherwise the limits of
-    acceleration and jerk hold, and the other limits as soon as these allow. A joint outside its
-    limits, or within their margin, does not move further out. It may rest there, and returns
-    when the command asks for it: a stop never causes a motion.
+    acceleration and jerk hold, and the other limits hold again as soon as these two allow. A
+    joint outside its limits, or within their margin, does not move further out. It may rest
+    there, and returns when the command asks for it: a stop never causes a motion.
 
-    The cap on the speed of tool, elbow and load holds by a barrier as well (`SpeedBarrier`). If
+    A second barrier (`SpeedBarrier`) keeps the cap on the speed of tool, elbow and load. If
     no admissible motion keeps the cap, because it has fallen faster than the arm can brake or
     the arm was too fast at the start, the arm brakes as hard as it can, and the report says by
     how much and for how long the cap is exceeded.
@@ -342,7 +342,9 @@ class SafetyFilter(nn.Module):
     def _from_measured_start(
         self, given: _Inputs, measured: Tensor | None
     ) -> tuple[_Inputs, Tensor]:
-        """The arguments, with the measured velocity at a start that differs, and the flag."""
+        """The arguments, and the flag `start`: True where the state takes the measured velocity
+        because the initial velocity differed from it.
+        """
         state = given.state
         if measured is None:
             return given, torch.zeros_like(given.invalid)
@@ -375,7 +377,7 @@ class SafetyFilter(nn.Module):
         )
 
     def _limit_velocity(self, given: _Inputs) -> tuple[Tensor, Tensor, Tensor]:
-        """Limits of velocity and position.
+        """Apply the limits of velocity and position.
 
         Returns:
             The velocity, and the flags `velocity` and `position`.
@@ -554,7 +556,7 @@ def _speed(points: Tensor, joint_velocity: Tensor) -> Float[Tensor, "*batch 1"]:
 
 
 def _secant(low: Tensor, high: Tensor, cap: Tensor | float) -> Tensor:
-    """Largest fraction of the way from a value to a higher one at which the cap is kept."""
+    """Largest fraction of the way from the value `low` to `high` at which the cap is kept."""
     rise = (high - low).clamp(min=_REPORTED)
     return torch.where(high > cap, ((cap - low) / rise).clamp(0, 1), 1.0)
 

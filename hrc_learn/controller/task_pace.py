@@ -18,15 +18,16 @@ from hrc_learn.pytree import pytree, static
 
 # Step of a difference quotient along a motion [s].
 _STEP = 1e-4
-# Unused closing speed up to which a distance counts as binding [m/s]: the solver leaves only
-# rounding unused. Speed scale below which the arm counts as blocked.
+# `_BINDING`: a distance counts as binding if at most this much of the allowed closing speed is
+# unused [m/s]; at a binding distance, the solver leaves only rounding unused.
+# `_BLOCKED`: speed scale below which the arm counts as blocked.
 _BINDING, _BLOCKED = 1e-3, 0.01
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class TaskPace:
-    """Speed of the task relative to its planned speed, and the clock that runs with it."""
+    """Speed of the task relative to its planned speed, and a clock that runs at this speed."""
 
     time: Float[Tensor, "*batch"]
     """Task time: the clock without the time lost to people near the arm and to pauses [s]."""
@@ -66,12 +67,11 @@ class TaskPace:
         return (self.people_scale == 1) & (self.speed_override == self.full_speed)
 
     def limited(self, people_scale: Float[Tensor, "*batch"], dt: float) -> TaskPace:
-        """Pace one step later, if people near the arm permit a fraction of the requested
-        motion.
+        """Pace one step later, limited by people near the arm.
 
         Args:
-            people_scale: That fraction. The speed scale may drop at once, but rises only as
-                fast as the rate of paths.
+            people_scale: Fraction of the requested motion that people permit. The speed scale
+                follows a drop immediately, but rises only as fast as a path speeds up.
             dt: Control step [s].
         """
         scale = torch.minimum(people_scale, self.people_scale + dt / CHANGE_OF_RATE)
@@ -80,7 +80,7 @@ class TaskPace:
         return replace(pace, time=self.time + pace.scale * dt, blocked_for=blocked_for)
 
     def overridden(self, pause: Bool[Tensor, "*batch"], dt: float) -> TaskPace:
-        """Pace one step later.
+        """Pace one step later, slowed down smoothly during a pause.
 
         Args:
             pause: True while a person pauses the task.
@@ -149,8 +149,8 @@ class WayMakingConfig:
     speed: float = 0.5
     """Joint velocity at the largest repulsion [rad/s]; only its null-space part acts."""
     smoothing: float = 0.02
-    """Difference of distances below which pairs count alike [m]. Without it the direction
-    would jump where another pair becomes the nearest."""
+    """Difference of distances below which pairs count about equally [m]. Without smoothing, the
+    direction would jump where another pair becomes the nearest."""
 
     def __post_init__(self):
         if self.mode not in (modes := get_args(WayMaking)):
@@ -175,9 +175,10 @@ def way_making_velocity(
 ) -> Float[Tensor, "*batch n"]:
     """Joint velocity away from nearby bodies [rad/s]; only its null-space part acts.
 
-    It follows the gradient of the smoothed least distance d = -k log sum exp(-d_i/k), like a
-    repulsive potential (Khatib 1986). Its speed rises smoothly from zero at `far` to `speed` at
-    `near`. It is zero where a distance is not a number: the arm brakes there.
+    The velocity follows the gradient of the smoothed least distance
+    d = -k log sum exp(-d_i/k), with k = `smoothing`, like a repulsive potential (Khatib 1986).
+    It rises smoothly from zero at `far` to `speed` at `near`. It is zero where a distance is
+    not a number: the arm brakes there.
 
     Args:
         distances: Distances from the bodies to keep away from.

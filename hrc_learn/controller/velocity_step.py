@@ -29,8 +29,8 @@ class WantedVelocity:
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
     load: Float[Tensor, "*batch 3"] | None = None
-    """Far end of a load in the frame of the tool centre point [m]; its speed is capped as well.
-    None: no load."""
+    """Far end of a load in the frame of the tool centre point [m]. The cap on the tool's speed
+    also holds there. None: no load."""
 
 
 class FilteredVelocity(NamedTuple):
