@@ -1,7 +1,7 @@
 """A robot arm: its kinematics, limits, shape, gripper and inverse kinematics in one object.
 
 Link frames are those of `SerialChain`, with z along the joint axis. They may differ from the
-frames of the description by a constant rotation; everything mounted on a link accounts for it.
+frames of the description by a constant rotation, which all mounted parts account for.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from hrc_learn.kinematics.inverse import (
     unwound,
 )
 
-# Density of aluminium shells with motors and gears, a little above that of water. A guess: it
-# gives masses from the volumes of capsules where a description has none.
+# Density of aluminium shells with motors and gears, a little above the density of water. It is
+# a guess: where a description has no masses, they are this density times volumes of capsules.
 _DENSITY = 1200.0  # [kg/m^3]
 _STARTS = 200  # random starts from which `postures` searches
 _SCAN = 57  # positions of joint 7 among which `inverse` chooses
@@ -62,8 +62,9 @@ class UnreachableError(ValueError):
 
 
 type ClosedForm = Callable[[SerialChain, Pose, Tensor | float], Tensor]
-"""Closed-form inverse of a seven-joint arm: all solutions (*batch, 4, 7) within limits for a
-position of joint 7 [rad], followed by rows of NaN."""
+"""Function for the closed-form inverse of a seven-joint arm. It takes the chain, poses and the
+position of joint 7 [rad], and returns all solutions within limits (*batch, 4, 7), followed by
+rows of NaN."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +75,15 @@ class FingerJoint:
     kind: str
     """"revolute" or "prismatic"."""
     closed: float
-    """[rad] or [m]"""
+    """Position of the closed gripper [rad or m]."""
     opened: float
-    """[rad] or [m]; the end of its range that is further from zero."""
+    """Position of the open gripper [rad or m]: the end of the range further from zero."""
     follows: tuple[str, float, float] | None = None
     """Leading joint, factor and offset: position = factor * leading position + offset."""
     carrier: str | None = None
     """Joint of the gripper that carries this joint; None: the hand carries it."""
     mount: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    """Frame of the joint at zero, in the frame of its carrier, or of the tool without one."""
+    """Frame of the joint at zero, in the frame of the carrier; in that of the tool if None."""
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector of the axis in the joint's frame."""
     meshes: tuple[MeshFile, ...] = ()
@@ -94,7 +95,7 @@ class ArmShape:
     """Appearance, collision shapes, gripper and masses of an arm."""
 
     meshes: Mapping[str, tuple[MeshFile, ...]] = field(default_factory=dict)
-    """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
+    """Meshes by the name of their link (link0, link1, ...); the gripper's are not included."""
     gripper: tuple[FingerJoint, ...] = ()
     """Joints of the gripper in the description, carriers first; empty if the description ends
     at the flange."""
@@ -105,7 +106,8 @@ class ArmShape:
     masses: tuple[float | None, ...] = ()
     """Masses of base, links, flange and tool [kg], as far as the description gives them."""
     inertia: tuple[Float[np.ndarray, "4 4"] | None, ...] = ()
-    """Pseudo-inertias of these bodies (`description.pseudo_inertia`), each in its own frame."""
+    """Pseudo-inertias of the bodies of `masses` (`description.pseudo_inertia`), each in the
+    frame of its body."""
 
 
 class Arm(SerialChain):
@@ -466,8 +468,8 @@ def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:
 def comfortable_posture(arm: Arm, pose: Pose) -> Float[Tensor, " joints"]:
     """Inverse-kinematics solution furthest from singularities and joint limits [rad].
 
-    An arm that servoes around a pose hardly changes its posture, so its posture on arrival
-    decides whether it meets a limit there.
+    An arm that servoes around a pose hardly changes its posture. The posture on arrival
+    therefore decides whether the arm meets a limit there.
 
     Args:
         arm: The arm.

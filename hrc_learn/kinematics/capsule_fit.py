@@ -29,18 +29,18 @@ _SLACK = 1e-6
 _WORTH = 0.2
 # Cuts of a link, as fractions of its extent along an axis.
 _CUTS = ((), (0.35,), (0.5,), (0.65,), (0.2, 0.8), (0.3, 0.7))
-# Corners of the prism around a cylinder, which is 2 % wider there.
+# Number of corners of the prism around a cylinder; the corners are 2 % outside the cylinder.
 _CORNERS = 16
 # Steps towards the smallest circle around points (Badoiu and Clarkson 2003).
 _CIRCLE_STEPS = 32
 _SEED, _POSTURES = 0, 2000
-# Radius of links of unknown shape [m], and its largest fraction of the arm's length. The radius
-# is chosen as that of a large arm's forearm.
+# `_BARE_RADIUS`: radius of links of unknown shape [m], about that of a large arm's forearm.
+# `_BARE_FRACTION`: largest value of this radius, as a fraction of the arm's length.
 _BARE_RADIUS, _BARE_FRACTION = 0.045, 0.06
 # Pairs of links that stay farther apart than this in all sampled postures are ignored [m].
 _FAR = 0.1
-# Pairs of links that overlap in a larger fraction of postures are ignored, too; the second
-# value is for links with one link between them.
+# Pairs of links that overlap in a larger fraction of postures than this are ignored, too:
+# `_MOST` for links with one link between them, `_ALWAYS` for all others.
 _ALWAYS, _MOST = 0.99, 0.5
 
 type _Capsule = tuple[np.ndarray, np.ndarray, float]
@@ -52,8 +52,8 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
 
     Like MoveIt's setup assistant, this ignores pairs of links that are neighbours, that overlap
     in nearly all random postures, or that never come near each other. Capsules are rounder than
-    links: those of a short, wide link overlap those of the next link but one. Such a pair is
-    ignored as well if it overlaps in most postures.
+    links: capsules of a short, wide link overlap capsules of the next link but one. Such a pair
+    of links is ignored as well if it overlaps in most postures.
 
     Args:
         chain: The arm.
@@ -135,7 +135,7 @@ def hull_of(shape: Shape) -> Hull:
 
 
 def shape_points(shape: Shape) -> Float[np.ndarray, "points 3"]:
-    """Points whose convex hull contains a shape, in its own frame [m]."""
+    """Points with a convex hull that contains a shape, in the frame of the shape [m]."""
     if shape.kind == "mesh":
         assert shape.path is not None
         return mesh_points(shape.path) * shape.scale

@@ -217,7 +217,9 @@ class SerialChain:
 
     @property
     def elbow(self) -> int:
-        """Number of the elbow's joint, from 1: the middle joint, or the first of two."""
+        """Number of the elbow's joint, from 1: the middle joint, or the first of two middle
+        joints.
+        """
         return (len(self.joint_names) + 1) // 2
 
     def joint_positions(self, q: ArrayLike) -> Float[Tensor, "*batch joints"]:
@@ -283,7 +285,7 @@ class SerialChain:
     def joint_origins_and_jacobian(
         self, q: ArrayLike
     ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch 6 joints"]]:
-        """`joint_origins` and `jacobian` for little more than the price of one."""
+        """`joint_origins` and `jacobian`, for little more than the time of one of them."""
         q = self.joint_positions(q)
         frames = self._joint_frames(q)
         tip, frames = frames[-1] @ self._tip.like(q), torch.stack(frames, dim=-3)
@@ -303,7 +305,7 @@ class SerialChain:
     def forward_and_jacobian(
         self, q: ArrayLike
     ) -> tuple[Pose, Float[Tensor, "*batch 6 joints"]]:
-        """`forward` and `jacobian` for little more than the price of one."""
+        """`forward` and `jacobian`, for little more than the time of one of them."""
         tip, J = self.transform_and_jacobian(q)
         return Pose.from_matrix(tip), J
 
@@ -359,7 +361,12 @@ class SerialChain:
         frames: Float[Tensor, "*batch some 3 4"],
         tip: Float[Tensor, "*batch 3 4"],
     ) -> Float[Tensor, "*batch 6 some"]:
-        """Twist of the tip for unit speed of each of the first joints, from their frames."""
+        """Jacobian of a tip: column i is the twist of the tip at unit speed of joint i.
+
+        Args:
+            frames: Frames (R | p) of the first joints in the base frame.
+            tip: Frame of the tip in the base frame.
+        """
         axis, origin = frames[..., 2], frames[..., 3]
         linear, angular = torch.linalg.cross(axis, tip[..., None, :, 3] - origin), axis
         if self._turning is not None:

@@ -40,7 +40,7 @@ class LinkCapsule(Capsule):
     """A capsule in the frame of a link."""
 
     link: int
-    """Number of the link it belongs to; 0 is the base."""
+    """Number of the link that carries the capsule; 0 is the base."""
 
 
 def link_capsules(rows: Iterable[Sequence[Any]]) -> tuple[LinkCapsule, ...]:
@@ -168,14 +168,14 @@ class CapsuleArm:
     ) -> Float[Tensor, "*batch"]:
         """Distance of the nearest moving link from boxes along the base axes [m].
 
-        A capsule whose axis enters a box counts with minus its radius, not with its depth.
-        Pairs of a link and a box that are too far apart to be the nearest are skipped by a
-        branch on the data, so this neither compiles nor works under `vmap`.
+        Where the axis of a capsule enters a box, the distance is minus the radius, not the
+        depth. Pairs of a link and a box that are too far apart to be the nearest are skipped by
+        a branch on the data, so this method neither compiles nor works under `vmap`.
 
         Args:
             q: Joint position [rad].
             centre: Centre of the box, or of each of several boxes [m].
-            half_size: Half of its edges [m].
+            half_size: Half edges of the box, or of each box [m].
             frames: `SerialChain.link_frames` at q, if already computed.
         """
         ends = self.segments(q, frames).index_select(-3, self._moving.like(q))
@@ -189,7 +189,7 @@ class CapsuleArm:
         middle = torch.linalg.vector_norm(outside, dim=-1) - radius.unsqueeze(-1)
         half_axis = torch.linalg.vector_norm(end - start, dim=-1, keepdim=True) / 2
         least = middle.amin((-2, -1), keepdim=True) + _ROUNDING
-        # Written so that NaN stays.
+        # Written so that NaN counts as near, and the result becomes NaN.
         near = ~(middle - half_axis > least)
         posture, link, box = near.nonzero(as_tuple=True)
         distance = segment_box_distance(ends[posture, link], centre[box], half_size[box])
@@ -278,7 +278,7 @@ class GraspedBox:
     half_size: tuple[float, float, float]
     """Half of its edges along x, y (the line of closing) and z of the tool [m]."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """In the frame of the tool centre point [m]."""
+    """Centre of the box in the frame of the tool centre point [m]."""
 
     @property
     def end(self) -> tuple[float, float, float]:
@@ -291,11 +291,11 @@ class GraspedBox:
 class Separation:
     """Distances of an arm's C capsules from a person's H capsules.
 
-    An object held by the arm adds one row, the last, which C includes.
+    If the arm holds an object, this object counts as the last of the C capsules.
     """
 
     distance: Float[Tensor, "*batch C H"]
-    """Between the surfaces; negative is the depth to which two capsules overlap [m]."""
+    """Distance between the surfaces [m]; if negative, the depth to which capsules overlap."""
     direction: Float[Tensor, "*batch C H 3"]
     """Unit vector from the arm to the person. It is undefined, and set to zero, where the axes
     of two capsules meet or the axis of the person's capsule enters the held box."""
@@ -382,10 +382,10 @@ def separation(
 ) -> Separation:
     """Distances of all capsules of an arm from all capsules of a person.
 
-    Nearest points of two segments follow Ericson (2005), section 5.1.9; those of a segment and
-    a box are found by interval search. Distances from a held box are exact unless the axis of a
-    person's capsule enters it. Where several points are equally near, the gradient is that of
-    one of them.
+    Nearest points of two segments follow Ericson (2005), section 5.1.9. Nearest points of a
+    segment and a box are found by interval search. Distances from a held box are exact unless
+    the axis of a person's capsule enters the box. Where several points are equally near, the
+    gradient belongs to one of them.
 
     Args:
         arm: The arm's capsules.
@@ -429,7 +429,7 @@ def separation(
 
 @cache
 def _moved(links: tuple[int, ...], joints: int) -> Bool[Tensor, "links joints"]:
-    """Mask of the joints that move a link: those up to its own number."""
+    """Mask of the joints that move a link: all joints up to the link's own number."""
     with torch.inference_mode(False):
         return torch.arange(joints) < torch.tensor(links)[:, None]
 
@@ -446,7 +446,9 @@ def _stacked(points: Tensor, last: Tensor) -> Tensor:
 
 
 def _nearest_on_box(tool: Tensor, ends: Tensor, box: GraspedBox) -> tuple[Tensor, Tensor]:
-    """Points of a held box nearest to segments, and nearest points of these as fractions."""
+    """Points of a held box nearest to segments, in the base frame [m], and nearest points of
+    the segments as fractions of their length.
+    """
     R, p = tool[..., :3], tool[..., None, :, 3]
     local = (ends - p[..., None, :]) @ R[..., None, :, :]
     centre, half_size = local.new_tensor(box.centre), local.new_tensor(box.half_size)

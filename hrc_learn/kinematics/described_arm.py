@@ -72,9 +72,9 @@ def arm_from_file(
 ) -> Arm:
     """An arm from a URDF or MJCF file.
 
-    Links that moving joints carry beyond the last joint of the arm are the gripper and belong
-    to the tool, as does a hand that only carries the fingers. Links on moving joints that
-    branch off earlier are left out.
+    Beyond the last joint of the arm, links on further moving joints are the gripper. They
+    belong to the tool, as does a hand that carries only the fingers. Links on moving joints
+    that branch off earlier are left out.
 
     Args:
         path: The file.
@@ -175,7 +175,9 @@ def _ready(
 def _places(
     description: Description, base: str, moving: Sequence[Joint], base_turn: float
 ) -> tuple[dict[str, tuple[int, Transform]], list[Transform]]:
-    """Number of the frame that carries each link, its pose there, and mounts of the joints."""
+    """Number of the frame that carries each link with the link's pose in this frame, and the
+    mounts of the moving joints.
+    """
     turned = motion("revolute", np.array([0.0, 0.0, 1.0]), base_turn)
     subtree = description.rigid_subtree(base)
     places = {name: (0, turned @ pose) for name, pose in subtree.items()}
@@ -262,7 +264,7 @@ def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transfor
 
     Args:
         joint: The joint.
-        parent: Pose of its parent in the frame of the tool.
+        parent: Pose of the joint's parent link in the frame of the tool.
     """
     lower, upper = joint.lower or 0.0, joint.upper or 0.0
     closed, opened = (lower, upper) if abs(upper) >= abs(lower) else (upper, lower)
@@ -324,7 +326,7 @@ def _inertias(
         if link.inertia is not None:
             more, before = pose @ link.inertia @ pose.T, inertia[number]
             inertia[number] = more if before is None else before + more
-    # The frame of the flange carries no bodies, nor does that of the tool without a gripper.
+    # The frame of the flange carries no bodies. Without a gripper, nor does the tool's frame.
     for number in {last + 1, last + 2} - {number for number, _ in bodies.values()}:
         masses[number], inertia[number] = 0.0, np.zeros((4, 4))
     return {"masses": tuple(masses), "inertia": tuple(inertia)}

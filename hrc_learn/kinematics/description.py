@@ -26,13 +26,15 @@ _KINDS = (*MOVING, "fixed", "floating", "planar", "ball", "free")
 # Larger distances between parts are errors [m], for example lengths in millimetres.
 _FURTHEST = 100.0
 
-# Words in the names of a gripper's joints and of the links that they move; then words which
-# show that the joint turns the whole gripper instead, or that the link is fixed to the arm.
+# `_GRIPPER_JOINT`, `_FINGER_LINK`: words in the names of a gripper's joints, and of the links
+# that these joints move. `_ARM_JOINT`: words in the name of a joint that turns the whole
+# gripper instead. `_FIXED_LINK`: words in the name of a link that is fixed to the arm.
 _GRIPPER_JOINT = re.compile("gripper|jaw|finger|knuckle|thumb|claw")
 _FINGER_LINK = re.compile("jaw|finger|knuckle|thumb|claw")
 _ARM_JOINT = re.compile("wrist|elbow|shoulder|forearm|roll|pitch|yaw|rotat|swivel|turn")
 _FIXED_LINK = re.compile("fixed|static")
-# Words in the names of tool frames, the likeliest first, and of frames that are no tool frames.
+# `_TOOL_FRAMES`: words in the names of tool frames, the likeliest first.
+# `_NO_TOOL_FRAME`: words in the names of frames that are no tool frames.
 _TOOL_FRAMES = (r"\btcp\b", r"tool", r"grasp|pinch", r"\bee|effector", r"gripper", r"hand|tip")
 _NO_TOOL_FRAME = re.compile(
     r"camera|optical|depth|laser|lidar|sensor|accelerometer|marker|safety|motor|finger|knuckle"
@@ -96,7 +98,7 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Joint:
-    """A joint. Its child's frame is `origin` followed by the motion about or along `axis`."""
+    """A joint. The frame of its child is `origin`, then the motion about or along `axis`."""
 
     name: str
     kind: str
@@ -107,7 +109,7 @@ class Joint:
     axis: Float[np.ndarray, "3"]
     """Unit vector."""
     lower: float | None = None
-    """[rad] or [m]; None where the file has none."""
+    """Lower limit [rad or m]; None where the file gives no limit."""
     upper: float | None = None
     velocity: float | None = None
     """[rad/s] or [m/s]"""
@@ -131,7 +133,7 @@ class _End:
     """A rigid body at which an arm ends."""
 
     joints: int
-    """Number of the arm's joints before it."""
+    """Number of the arm's joints before this body."""
     frames: list[str]
     """Links that may be the tool frame."""
 
@@ -229,7 +231,7 @@ class Description:
         return found
 
     def rigid_subtree(self, link: str) -> dict[str, Transform]:
-        """A link and all links fixed to it, with their poses in its frame."""
+        """A link and all links fixed to it, with their poses in the frame of the first."""
         found, ahead = {link: np.eye(4)}, [link]
         for name in ahead:
             for joint in self.below(name):
@@ -243,8 +245,8 @@ class Description:
 
         Args:
             base: A link; None: the root.
-            tip: A link; None: the tool frame, if there is only one end besides a gripper's. The
-                joints of the gripper are left out with a warning.
+            tip: A link; None: the tool frame, if the tree has only one end apart from those of
+                a gripper. The joints of the gripper are left out with a warning.
 
         Raises:
             ValueError: A link does not exist, no joint moves between base and tip, there are

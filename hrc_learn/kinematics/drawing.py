@@ -25,8 +25,8 @@ _PARTS = {
     "finger_left": {"file": "finger"},
     "finger_right": {"file": "finger", "orientation": (0.0, 0.0, 0.0, 1.0)},
 }
-# Travel of each finger of the Franka hand, and its guide in the frame of the hand [m], from
-# franka_description.
+# `_FRANKA_STROKE`: travel of each finger of the Franka hand [m]. `_FRANKA_GUIDE`: distance of
+# the fingers from the origin of the hand, along z [m]. Both are from franka_description.
 _FRANKA_STROKE, _FRANKA_GUIDE = 0.04, 0.0584
 
 
@@ -131,7 +131,7 @@ def _franka_fingers(tool: Pose, opening: Float[np.ndarray, " time"]) -> Iterator
 
 
 def _fingers(robot: Arm, tool: Pose, opening: Float[np.ndarray, " time"]) -> Iterator[Body]:
-    """Fingers of a gripper from a description; those that follow others move with them."""
+    """Fingers of a gripper from a description; coupled fingers move with their leaders."""
     fingers = {finger.name: finger for finger in robot.shape.gripper}
     places: dict[str, Pose] = {}
     for finger in robot.shape.gripper:  # carriers come before what they carry

@@ -12,8 +12,8 @@ For the Research 3 it also misses most solutions outside the Panda's range (q6 >
 constant velocity limits. Of configurations in the whole range with q4 < -0.467 it finds 81 %,
 of those within the Panda's range 99.8 %.
 
-Franka's meshes, which agree to 2 mm for both arms, protrude from the capsules by at most 30 mm
-(link 2), those of the base by 46 mm and of the gripper by 9 mm: clearances must cover this.
+Franka's meshes agree to 2 mm for both arms. They protrude from the capsules by at most 30 mm at
+the links (link 2), 46 mm at the base and 9 mm at the gripper: clearances must cover this.
 """
 
 from __future__ import annotations
@@ -47,15 +47,16 @@ PANDA_LIMITS = _limits(**_TABLES["panda_limits"])
 
 FR3_LIMITS = _limits(**_TABLES["fr3_limits"])
 """The strictest limits of the tables that `vintage` names, which every Research 3 accepts: the
-innermost position limits, and the smallest velocity offsets whose curves stay below those of
-all tables. A robot uses the values of the URDF that it sends to its driver; they depend on its
-system image."""
+innermost position limits, and the smallest velocity offsets with curves below the curves of all
+tables. A robot uses the values of the URDF that it sends to its driver; these values depend on
+its system image."""
 
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
 _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
 
 
-# A branch is dropped if its forward kinematics misses the pose by more [m; entries of R].
+# A branch is dropped if its forward kinematics misses the pose by more than this [m, and 1 for
+# entries of the rotation matrix].
 _TOLERANCE = 1e-6
 
 

@@ -58,7 +58,8 @@ class MassMatrix:
         """
         frames, n = self._arm.link_frames(q), self._arm.joints
         axis, origin = frames[..., :n, :, 2], frames[..., :n, :, 3]
-        # Derivatives of frames with respect to joints: z x (x - o) for a joint that turns.
+        # Derivatives of frames with respect to joints: at a point p, z x (p - o) for a joint
+        # that turns about the axis z through o, and z for a joint that slides along z.
         about = frames.unsqueeze(-3) - _at_last(origin)[..., None, :, :, :]
         turned = torch.linalg.cross(axis[..., None, :, :, None], about, dim=-2)
         slid = _at_last(axis)[..., None, :, :, :].expand_as(turned)
@@ -83,7 +84,8 @@ def _inertia(arm: Arm, link: int) -> Float[np.ndarray, "4 4"]:
     found = pseudo_inertia(0.0 if capsules else mass, (0.0, 0.0, 0.0), np.zeros((3, 3)))
     for capsule in capsules:
         start, end = np.array(capsule.start), np.array(capsule.end)
-        # Point masses equal to a thin rod: a sixth at each end, the rest in the middle.
+        # Three point masses with the inertia of a thin rod: a sixth of the mass at each end,
+        # the rest in the middle.
         for part, point in ((1 / 6, start), (2 / 3, (start + end) / 2), (1 / 6, end)):
             found += pseudo_inertia(part * mass / len(capsules), point, np.zeros((3, 3)))
     return found

@@ -37,9 +37,9 @@ TASK_ROWS: dict[TaskSpace, int] = {
 }
 # Weight of angles relative to distances [m/rad]: 1 rad counts as much as this distance.
 _LEVER = 0.3
-# Singular values below these fractions of the largest one count as zero, in
-# `null_space_dimension` and in `task_rank`. The second ignores weak directions: the SO-101's
-# tool lies 8 mm off the axis of its last joint, which therefore hardly moves it.
+# Singular values below these fractions of the largest one count as zero: `_RANK` in
+# `null_space_dimension`, `_LED` in `task_rank`. `_LED` ignores weak directions: the SO-101's
+# tool lies 8 mm off the axis of the last joint, so this joint hardly moves the tool.
 _RANK, _LED = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
 _STARTS, _ROUNDS, _ITERATIONS = 24, 6, 40
@@ -56,7 +56,7 @@ class InverseSolution:
     """Joint positions that `solve_inverse` found."""
 
     position: Float[Tensor, "*batch joints"]
-    """[rad, m]; where no solution was found, `near` moved to the joint limits."""
+    """Joint positions [rad, m]; where no solution was found, `near` clamped to the limits."""
     found: Bool[Tensor, "*batch"]
     """True if the pose is reached within limits."""
 
@@ -124,10 +124,10 @@ _SAMPLES = 64  # joint positions at which `task_rank` looks: nearly all are regu
 def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
     """Number of task dimensions that an arm controls, away from its singularities.
 
-    It is six for a pose and six or more joints. For "position+axis" it is five, but four
-    (position and tilt) for an arm of five joints whose last joint turns the tool about its
-    axis. The remaining joint motion is null space. A direction that takes 50 times as much
-    joint motion as another one does not count.
+    The rank is six for the pose of an arm with six or more joints. For "position+axis" it is
+    five, but four (position and tilt) for a five-joint arm if the last joint turns the tool
+    about its z axis. The remaining joint motion is null space. A direction that takes 50 times
+    as much joint motion as another one does not count.
 
     Args:
         chain: The arm.
@@ -146,9 +146,10 @@ def position_first(J: Float[Tensor, "*batch 6 n"]) -> Float[Tensor, "*batch n 6"
     """Orthonormal basis of the tool's twists that an arm of three to five joints controls.
 
     Rows are the linear velocities, then the rotations that the joints cause while the position
-    rests: B = [I 0; 0 U^T], with U an orthonormal basis of the range of J_w Z, where J_v Z = 0.
-    Solving B J q_dot = B v moves the position as wanted, and turns the tool as near to the
-    wanted rotation as the joints can.
+    rests: B = [I 0; 0 U^T]. With J_v and J_w the linear and angular rows of J, and Z a basis of
+    the null space of J_v, U is an orthonormal basis of the range of J_w Z. Solving
+    B J q_dot = B v moves the position as wanted, and turns the tool as near to the wanted
+    rotation as the joints can.
 
     Args:
         J: Geometric Jacobian of the tool.
@@ -168,7 +169,7 @@ def task_basis(
     """Orthonormal basis B of the tool's twists in a task; the task's velocity is B J q_dot.
 
     Rows are linear velocities, then the rotations of the task. If the arm controls fewer
-    dimensions than the task has, rows span only those that it controls: the range of J there.
+    dimensions than the task has, the rows span only the dimensions that it controls.
 
     Args:
         J: Geometric Jacobian of the tool.
@@ -402,7 +403,7 @@ _STEP = 1e-5
 # Damping of the joint motion that turns the arm angle, as a squared rate [1]. Without it, the
 # motion is unbounded near configurations in which the null space does not move the elbow.
 _DAMPING = 1e-2
-# Singular value [1] and distance to a limit [rad] beyond which larger ones count the same.
+# A larger singular value [1], or a larger distance to a limit [rad], counts as much as these.
 _GOOD_SINGULAR_VALUE = 0.2
 _GOOD_DISTANCE = 0.5
 # Postures closer to each other than this count as the same [rad].

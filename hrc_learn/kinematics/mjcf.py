@@ -67,7 +67,7 @@ def _model_without_missing_meshes(path: Path, mujoco: Any) -> Any | None:
             spec.delete(geom)
         for mesh in missing:
             spec.delete(mesh)
-        # Bodies whose mass came from these meshes get `_NO_MASS`, by which they are recognised.
+        # A body that took its mass from these meshes gets `_NO_MASS`: its mass is unknown.
         spec.compiler.boundmass = spec.compiler.boundinertia = _NO_MASS
         model = spec.compile()
     except ValueError:

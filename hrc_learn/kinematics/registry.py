@@ -1,4 +1,7 @@
-"""Arms by name or file; registered_arms.toml says where descriptions are and what they lack."""
+"""Robot arms by registered name, or from a description file.
+
+registered_arms.toml lists where the descriptions of registered arms are and what they lack.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +118,7 @@ def arm(
     The other arguments apply to arms that are read from files: `panda` and `fr3` refuse them.
 
     Args:
-        name_or_file: One of `registered_arms()` or another usual name of one ("xarm",
+        name_or_file: One of `registered_arms()` or another usual name of such an arm ("xarm",
             "Franka"), the name of a description in an installed package ("ur10e", "iiwa14"; see
             `installed_descriptions`), or a path that ends in .urdf, .xml or .mjcf.
         base: Link or body that is the base; None: the registered one, or the root.

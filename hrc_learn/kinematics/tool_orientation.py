@@ -20,10 +20,11 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.store import Radians, read_json, write_json
 
 NEAR = 0.05
-"""Length of the last part of a path, whose direction is taken as the tangent [m]."""
+"""Length of the last part of a path [m]; the direction of this part is the tangent."""
 
-# Tangents are not used if they differ by more than this from their mean, or their mean from the
-# direction in which the end effector points [rad]: it then came to the object from the side.
+# Tangents are not used if they differ by more than this from their mean (root mean square), or
+# if their mean differs by more than this from the direction in which the end effector points
+# [rad]: the end effector then came to the object from the side.
 MAX_SPREAD = math.radians(30)
 # Shorter vectors are rounding noise and have no direction.
 _SHORTEST = 1e-12
@@ -39,9 +40,9 @@ def coarse_orientation(
 ) -> Float[Tensor, "*batch 4"]:
     """Orientation of the end effector as a function of its position.
 
-    The paper gives r_5 = beta_0 r_2 / Y_0, limited to +-beta_0, without saying about which
-    axis. We tilt the gripper-down frame by that angle about the base's x axis: a hand that
-    moves to the right (-y) points to the right.
+    With the y position r_2, the paper gives the angle r_5 = beta_0 r_2 / Y_0, limited to
+    +-beta_0, but not its axis. We tilt the gripper-down frame by this angle about the base's x
+    axis: a hand that moves to the right (-y) points to the right.
 
     Args:
         position: Position of the end effector [m].
@@ -78,8 +79,8 @@ def turn_about_vertical(
 class Approach:
     """Orientation of the end effector in front of an object, from demonstrated approaches.
 
-    It is given for a gripper that closes along x: turns about the vertical are removed, since
-    objects lie at any yaw. The fields are those of the saved file.
+    The orientation belongs to a gripper that closes along x: turns about the vertical are
+    removed, since objects lie at any yaw. The saved file has the same fields.
     """
 
     version: Literal[1] = 1

@@ -30,8 +30,8 @@ _NOT_FINITE = re.compile(r"\b(nan|inf|infinity)\b", re.IGNORECASE)
 
 
 def read_urdf(path: Path) -> Description:
-    """Read a URDF file. As in urdfdom, it may have blank first lines, undeclared namespaces and
-    unused xacro properties.
+    """Read a URDF file. As in urdfdom, the file may have blank first lines, undeclared
+    namespaces and unused xacro properties.
 
     Meshes `package://NAME/...` are looked for in the folders above the file and in
     ROS_PACKAGE_PATH. Missing meshes are left out, and a warning names the first one.
