@@ -1,4 +1,4 @@
-"""The control step for real-time loops: compiled ahead of time, NumPy in and out."""
+"""Compile a controller's step ahead of time, and run it on NumPy arrays in real-time loops."""
 
 from hrc_learn.deploy.export import export_step as export_step
 from hrc_learn.deploy.runner import EagerRunner as EagerRunner

@@ -1,4 +1,8 @@
-"""Ahead-of-time compilation of a control step into a folder named by a hash of its content."""
+"""Compile a controller's step ahead of time, and keep the machine code in a cache folder.
+
+The name of the folder is a hash of everything that determines the code, so that no step is
+compiled twice.
+"""
 
 from __future__ import annotations
 
@@ -40,16 +44,18 @@ def export_step(
     The machine code comes from LLVM, so no compiler needs to be installed. It runs only on
     processors like the one that built it. Next to it are `step.h`, a header for C and C++, and
     `step.json`, a description for other languages. The name of their folder is a hash of
-    torch's version, of the processor, of the source of this library, and of all settings and
-    weights of the controller. With classes from outside this library, whose source is unknown,
-    the hash is that of the traced step, which takes seconds longer.
+    torch's version, of the processor, of the parts of this library that a step uses
+    (`_SOURCES`), of all settings and weights of the controller, and of the example: names,
+    shapes and dtypes of its fields, and its constants. A controller that holds functions, or
+    objects of classes outside this library, is hashed by its traced step instead. Tracing takes
+    seconds.
 
     Args:
         controller: Controller with the step.
         observation: An example with exactly the fields of later observations. Missing fields,
             and a `dt` that is a number, become constants; so do the controller's goals if the
-            example has none. The example sets batch dimensions and dtype of the step; in
-            float32, interventions are counted up to 16 million only.
+            example has none. The step takes batch dimensions and dtype from the example. In
+            float32, the count of interventions ends at 16 million.
         folder: Folder of the compiled steps; default: the user's cache.
 
     Returns:
@@ -98,11 +104,15 @@ def _compile(step: PackedStep, observation: StepObservation, folder: Path) -> No
 def _few_arms(
     step: PackedStep, observation: StepObservation
 ) -> tuple[PackedStep, StepObservation]:
-    """The same step for a few arms of a batch: enough to check that they do not interact."""
+    """The step and its example for only a few arms of a batch; unchanged without a batch.
+
+    A few arms suffice to check that the arms of a batch do not affect each other.
+    """
     batch = step.layouts.state.batch
     if not batch:
         return step, observation
-    # Choose a size that no unbatched field has by chance, so that the layouts are equal.
+    # An unbatched field that happens to have this size would count as batched: try sizes until
+    # the layouts equal those of the whole batch.
     for size in (2, 3, 5, 11):
         part = (slice(size), *(slice(1) for _ in batch[1:]))
         few = _pytree.tree_map_only(
@@ -120,13 +130,13 @@ def _few_arms(
 
 
 def trace(step: PackedStep, observation: StepObservation) -> torch.export.ExportedProgram:
-    """Graph of a step."""
+    """Trace a step into a graph of PyTorch operations."""
     with torch.no_grad():
         return torch.export.export(step, tuple(step.example(observation)), strict=False)
 
 
 def _structure(observation: StepObservation) -> list[tuple[str, str]]:
-    """Structure of an example: all fields, with shapes and dtypes in place of tensors."""
+    """Name of each field of an example, with dtype and shape of a tensor, or else the value."""
     leaves, _ = _pytree.tree_flatten_with_path(observation)
     return [
         (
@@ -145,7 +155,8 @@ def _hash_of_trace(step: PackedStep, program: torch.export.ExportedProgram) -> s
     return content_hash(machine(), graph, fields, step.first_state, constants)
 
 
-# Sources of a compiled step, all hashed: equal hashes mean equal compiled code.
+# Parts of this library that a compiled step depends on. All their modules are hashed, so that
+# equal hashes mean equal compiled code.
 _ROOT = Path(__file__).parents[1]
 _SOURCES = (
     "pytree.py",
@@ -161,17 +172,18 @@ _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device)
 
 
 class UnknownCodeError(TypeError):
-    """The code of an object's class, or of a function it holds, is outside this library."""
+    """An object is a function, or its class is outside this library: its code is not hashed."""
 
 
 def content_hash(*objects: Any) -> str:
-    """Hash of all values in some objects, and of the source of this library.
+    """Hash of all values in some objects, and of the sources in `_SOURCES`.
 
     Args:
         objects: Modules, dataclasses and their contents.
 
     Raises:
-        UnknownCodeError: They hold an object of a class outside this library and torch.
+        UnknownCodeError: The objects hold a function (also one of this library), or an object
+            of a class outside this library and torch.
     """
     digest, seen = hashlib.sha256(_source_hash()), {}
     for x in objects:
@@ -181,11 +193,14 @@ def content_hash(*objects: Any) -> str:
 
 
 def _hashed(x: Any, seen: dict[int, Any]) -> Iterator[bytes]:
-    """All values in an object, in a fixed order; repeated objects only by their number.
+    """Bytes to hash: type and value of all parts of an object, in a fixed order.
+
+    A repeated object gives only the number of its first occurrence.
 
     Args:
         x: The object.
-        seen: Objects so far by their id; the dictionary keeps them alive, so ids stay unique.
+        seen: Objects so far, by their id. The dictionary keeps the objects alive, so that ids
+            stay unique.
     """
     kind = type(x)
     yield f"{kind.__module__}.{kind.__qualname__}\n".encode()
@@ -212,7 +227,8 @@ def _parts(x: Any) -> Iterable[Any]:
     if isinstance(x, list | tuple):
         return x
     if isinstance(x, SerialChain):
-        # The shape of an arm, which may be a function that reads it, does not affect a step.
+        # Everything that affects a step. The arm's shape is left out: it does not affect a
+        # step, and may be a function, which cannot be hashed.
         return x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds
     if type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(x, "__dict__"):
         return (x.__getstate__(),)

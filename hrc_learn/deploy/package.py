@@ -1,8 +1,8 @@
 """The control step as a function of vectors, and the file format of its compiled form.
 
 A compiled step reads and writes three vectors of numbers instead of dataclasses: any language
-can fill them, and a step allocates nothing. The file's metadata maps the named tensors of
-state, observation and command to the rows of the vectors.
+can fill them, and a step allocates nothing. The metadata (`step.json`) lists the rows that each
+named tensor of state, observation and command has in these vectors.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Field:
     name: str
     """Path in the dataclass, for example "safety.flags"."""
     dtype: torch.dtype
-    """Type of its elements."""
+    """Type of the tensor's elements."""
     batched: bool
     """True: one value for each element of the batch; False: one for the whole batch."""
     shape: tuple[int, ...]
@@ -71,10 +71,10 @@ class Field:
 
 @final
 class IOLayout:
-    """Positions of a dataclass's tensors in a vector (rows, *batch).
+    """Assignment of a dataclass's tensors to the rows of a vector (rows, *batch).
 
-    The batch is last in memory, so vector instructions work on rows: one quantity for all
-    elements of the batch. All numbers have one dtype, and flags are 0 or 1.
+    The batch axes come last, so that a row in memory is one quantity for all elements of the
+    batch, as vector instructions need it. All numbers have one dtype, and flags are 0 or 1.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class IOLayout:
 
     @staticmethod
     def of(tree: Any, batch: Sequence[int], dtype: torch.dtype = torch.float64) -> IOLayout:
-        """Layout of the tensors in a pytree, without its other leaves."""
+        """Layout of the tensors in a pytree; leaves that are no tensors are left out."""
         batch, fields = tuple(batch), []
         for path, x in _pytree.tree_flatten_with_path(tree)[0]:
             if isinstance(x, Tensor):
@@ -175,8 +175,9 @@ class StepLayouts(NamedTuple):
 class PackedStep(nn.Module):
     """Step of a controller that reads vectors and updates them in place.
 
-    It reads the vectors of state and observation, and writes those of the command and of the
-    next state. Missing fields of the observation, and a `dt` that is a number, are constants.
+    A step reads the vectors of state and observation, writes the command, and replaces the
+    state by the next one. Missing fields of the observation, and a `dt` that is a number, are
+    constants.
     """
 
     def __init__(self, controller: Steppable, observation: StepObservation):
@@ -230,7 +231,7 @@ def tensors_of(tree: object) -> list[Tensor]:
     return [x for x in _pytree.tree_leaves(tree) if isinstance(x, Tensor)]
 
 
-# Keys of the package's metadata; later versions must be able to read them.
+# Keys of the metadata. Later versions of this library must be able to read them.
 _LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtype"
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
@@ -242,10 +243,10 @@ CODE, DESCRIPTION = "step.o", "step.json"
 
 
 def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
-    """Metadata of a package, as text that any language can read.
+    """Metadata of a compiled step, as text that any language can read.
 
-    The layout has a line for each field: its vector, name, dtype, 1 if it is batched, and its
-    shape. Rows are in the order of the lines.
+    Its entry "hrc_learn.layout" has a line for each field: vector, name, dtype, 1 if batched or
+    else 0, and shape. The rows of a vector are in the order of the lines.
     """
     lines = [
         " ".join([vector, field.name, _name(field.dtype), str(int(field.batched)),

@@ -1,4 +1,4 @@
-"""Runners of a control step with NumPy arrays, and a fixed loop rate without drift."""
+"""Run a control step on NumPy arrays, and run a loop at a fixed rate without drift."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ type _Joints = Float[np.ndarray, "*batch n"]
 
 
 class StepRunner:
-    """A control step with its state, operated by writing into arrays.
+    """A control step with its state. The caller writes the observation into arrays.
 
         runner.observation["joint_position"][:] = q
         velocity = runner.step()
@@ -74,7 +74,7 @@ class StepRunner:
         joint_velocity: _Joints | None = None,
         joint_acceleration: _Joints | None = None,
     ) -> None:
-        """Reset the state to an arm at rest, or in motion: pass what is measured.
+        """Reset the state to an arm at rest, or in the measured motion.
 
         Args:
             joint_position: Joint positions [rad].
@@ -141,7 +141,9 @@ class EagerRunner(StepRunner):
 def open_step(
     controller: Steppable, observation: StepObservation, folder: Path | None = None
 ) -> StepRunner:
-    """The fastest available runner: compiled, or eager with a warning if that is not possible.
+    """The fastest available runner: compiled, or uncompiled with a warning.
+
+    The step runs uncompiled if it uses an operation without machine code.
 
     Args:
         controller: Controller with the step.
@@ -174,8 +176,8 @@ class Rate:
 
     Attributes:
         ticks: Number of returns of `wait`.
-        missed: Number of skipped ticks: the loop was busy, or woke up too late, until the
-            following tick was due.
+        missed: Number of skipped ticks. A tick is skipped if the loop was busy, or woke up too
+            late, until the following tick was due.
         latest: Largest lateness of a tick so far [s].
     """
 

@@ -1,9 +1,10 @@
-"""A traced step as straight-line arithmetic on single numbers.
+"""Unroll a traced step into straight-line arithmetic on single numbers.
 
-Each tensor of the trace becomes a tensor of value numbers, one for each element. PyTorch itself
-then carries out operations that only move elements (views, slices, concatenations); the
-remaining arithmetic becomes one instruction per element. Equal instructions are kept once, and
-instructions on constants are evaluated here.
+Each element of a tensor gets a value number: the index of the instruction that computes it. So
+each tensor of the trace becomes a tensor of value numbers. On these, PyTorch itself carries out
+the operations that only move elements (views, slices, concatenations). All other operations
+become one instruction per element. Equal instructions are kept once, and instructions on
+constants are evaluated here.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ class UnknownOperationError(NotImplementedError):
 
 
 type Instruction = tuple[Any, ...]
-"""Name of an operation, then the numbers of its operands.
+"""Name of an operation, then the value numbers of its operands.
 
-`("input", vector, row, element)` and `("constant", value)` have no operands.
+`("input", vector, row, element)` and `("constant", value)` have no operands; the element is an
+index in the flattened batch.
 """
 
 BOOLEAN = frozenset({"gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"})
-"""Operations with a truth value as their result; "select" has one if it selects truth
-values."""
+"""Operations whose result is a truth value. The result of "select" is one if both of its
+choices are truth values."""
 
 
 # Complements of comparisons, also true if a number is NaN.
@@ -68,11 +70,11 @@ class ScalarProgram:
         return self._add(("constant", repr(float(self.number(value)))), boolean=False)
 
     def input(self, vector: str, row: int, element: int) -> int:
-        """Value number of an input."""
+        """Value number of an input: one element of the batch in a row of a vector."""
         return self._add(("input", vector, row, element), boolean=False)
 
     def emit(self, name: str, *operands: int) -> int:
-        """Value number of an operation on values."""
+        """Value number of the result of an operation."""
         if name == "select":
             condition, yes, no = operands
             condition = self.as_truth(condition)
@@ -193,7 +195,8 @@ _FILLS = set(
     )
 )
 type _Each = Callable[..., Tensor]
-# Operations composed of others: the first argument emits one, the rest are as in PyTorch.
+# Operations composed of others. The first argument emits an elementwise operation; the other
+# arguments are those of PyTorch's operation.
 _COMPOSED: dict[str, _Each] = {
     "addcdiv": lambda of, x, a, b, value=1: of("add", x, of("div", of("mul", a, value), b)),
     "addcmul": lambda of, x, a, b, value=1: of("add", x, of("mul", of("mul", a, value), b)),
@@ -235,14 +238,14 @@ def scalar_program(program: ExportedProgram, dtype: torch.dtype) -> ScalarProgra
 
 @final
 class _Unroller:
-    """Walk over the nodes of a trace."""
+    """Walks over the nodes of a trace, and emits their instructions."""
 
     def __init__(self, result: ScalarProgram, program: ExportedProgram):
         self.result, self.program = result, program
         self.values: dict[Any, Any] = {}
 
     def run(self) -> dict[str, Tensor]:
-        """Value numbers that the step writes into its inputs."""
+        """Value numbers that the step writes, by the name of the vector that receives them."""
         signature = self.program.graph_signature
         stored: dict[str, Any] = self.program.state_dict | self.program.constants
         names = dict(signature.inputs_to_parameters) | dict(signature.inputs_to_buffers)
@@ -323,7 +326,7 @@ class _Unroller:
         return torch.tensor(kept, dtype=torch.int64).reshape(shape)
 
     def _joined(self, name: str, row: list[int]) -> int:
-        """Reduce pairwise: processors do independent operations at the same time."""
+        """Reduce a row pairwise: processors do independent operations at the same time."""
         while len(row) > 1:
             pairs = zip(row[::2], row[1::2], strict=False)
             row = [self.result.emit(name, a, b) for a, b in pairs] + row[len(row) & ~1 :]

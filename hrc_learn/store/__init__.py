@@ -1,8 +1,8 @@
-"""Files and folders that are complete or absent, even if their writing is interrupted.
+"""Write files and folders that are complete or absent, even if the writing is interrupted.
 
 A file or folder is written in a workspace next to its destination, on the same file system:
 
-    .NAME.writing/lock        locked by the only process that writes NAME; contains its number
+    .NAME.writing/lock        locked by the only process that writes NAME; contains its ID
     .NAME.writing/new         new content
     .NAME.writing/old         previous content
     .NAME.writing/owned.json  parts of `old` that may be deleted
@@ -17,8 +17,10 @@ how far a killed process got, and the next writer of NAME, or `recover`, cleans 
 
 Two renames are used instead of an exchange because every file system supports them.
 
-Only files that the manifest of an older result lists are ever deleted, and a folder with other
-files is not replaced. A path through a symbolic link keeps the link and replaces its target.
+When a folder is replaced, only files that its manifest lists, or that match the patterns of its
+kind (`Kind.files`), are deleted. A folder with other files is not replaced; only a kind with
+patterns carries them over. If a path is a symbolic link, the link stays and its target is
+replaced.
 """
 
 from hrc_learn.store._folder import DATASET as DATASET

@@ -20,7 +20,7 @@ from typing import Literal, TextIO
 from hrc_learn.store._reading import json_text, read_json
 
 MADE_BY = "made_by.json"
-"""File in each folder of results that records its inputs."""
+"""File in a folder of results that records the inputs of these results."""
 MANIFEST = ".manifest.json"
 """File that lists all other files of a folder, with their checksums."""
 # Errors of file systems without locks, such as some network ones.
@@ -28,7 +28,7 @@ _NO_LOCKS = {errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.ENOLCK, errno.
 
 
 SUFFIX = ".writing"
-"""Suffix of a workspace."""
+"""Suffix of the name of a workspace (see `hrc_learn.store`)."""
 DISK_ERRORS = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
     *(errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
@@ -51,14 +51,14 @@ def try_lock(file: TextIO) -> bool:
 
 
 def sign(file: TextIO) -> None:
-    """Write the number and host of this process into a locked file."""
+    """Write the ID and host of this process into a locked file."""
     os.truncate(file.fileno(), 0)
     # Unbuffered, so that on a full disk closing the file cannot fail, too.
     os.write(file.fileno(), f"{os.getpid()} {socket.gethostname()}\n".encode())
 
 
 def holder(path: Path) -> str:
-    """Holder of the lock on a file, in words."""
+    """Process that holds the lock on a file, in words."""
     with contextlib.suppress(OSError):
         number, _, host = path.read_text(encoding="utf-8").strip().partition(" ")
         if number:

@@ -112,7 +112,7 @@ def _finite(text: str) -> float:
 
 
 def _complaint(error: Exception) -> str:
-    """Field and text of an error from msgspec."""
+    """Text for an error of parsing: field and problem."""
     if isinstance(error, RecursionError):
         return "nested too deeply"
     if isinstance(error, UnicodeError) or type(error) is msgspec.DecodeError:

@@ -1,7 +1,7 @@
-"""Writing of files and folders that are complete or absent.
+"""Write files and folders so that they are complete or absent.
 
-A claim is the exclusive right to write a path. It replaces the content in steps, so that
-`recover` can complete or undo what a killed process left.
+A `Claim` is the exclusive right to write a path. A claim replaces the content in steps, so that
+`recover` can complete or undo what a killed process has begun.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ class Claim:
     Attributes:
         target: Path to be written, symbolic links resolved.
         workspace: Folder next to the target.
-        new: Place of the new content in the workspace.
+        new: Path of the new content, in the workspace.
         mended: Actions taken on the leftovers of an interrupted writer, in words.
     """
 
@@ -242,7 +242,7 @@ class Claim:
 
 
 def resolved(path: str | os.PathLike[str]) -> Path:
-    """Absolute path without symbolic links; it need not exist."""
+    """Absolute path without symbolic links; nothing has to exist there."""
     return Path(path).resolve()
 
 
@@ -292,7 +292,7 @@ def recover(path: str | os.PathLike[str]) -> list[str]:
 
 
 def settle(path: str | os.PathLike[str]) -> None:
-    """Complete an interrupted replacement that left nothing at `path`, before it is read."""
+    """Before `path` is read: complete an interrupted replacement that left nothing there."""
     place = resolved(path)
     while not place.exists():
         if _is_interrupted(place):
@@ -320,11 +320,11 @@ def _interrupted_below(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_file(path: str | os.PathLike[str] | Claim) -> Iterator[Path]:
-    """Temporary place for a new file, which takes its name when it is complete.
+    """Context for writing a file: in a temporary folder, then moved to its path when complete.
 
     Args:
-        path: Path of the file, whose folder must exist, or the claim to it, which stays held.
-            An existing file is replaced.
+        path: Path of the file, whose folder must exist, or a claim to the path. A claim stays
+            held. An existing file is replaced.
 
     Yields:
         Path to write to, with the same file name.
@@ -354,10 +354,10 @@ def replacing(
     *,
     source: str = "",
 ) -> Iterator[Path]:
-    """Temporary place for a new folder, which takes its name when it is complete.
+    """Context for writing a folder: in a temporary place, then moved to its path when complete.
 
     Args:
-        path: Path of the folder, or the claim to it, which stays held.
+        path: Path of the folder, or a claim to the path. A claim stays held.
         kind: Kind of the folder.
         overwrite: Replace an older folder of the same kind; others are never touched.
         source: Identifier of the source, for `source_of`.
@@ -381,11 +381,12 @@ def replacing(
 def new_folder(
     path: str | os.PathLike[str], made_by: Mapping[str, Any], overwrite: bool = False
 ) -> Iterator[Path]:
-    """Temporary folder for results, which takes its name when it is complete.
+    """Context for writing results in a temporary folder, moved to its path when complete.
 
     Args:
         path: Path of the folder.
-        made_by: Inputs of the results, saved in the folder as JSON; other values become text.
+        made_by: Inputs of the results, saved in the folder as JSON. Values that JSON does not
+            have become text.
         overwrite: Replace an older folder of results.
 
     Yields:
@@ -432,7 +433,7 @@ def write_json(path: str | Path, content: object) -> None:
 
 @contextlib.contextmanager
 def _claimed(path: str | os.PathLike[str] | Claim) -> Iterator[Claim]:
-    """A new claim for the duration of the context, or the given one, which stays held."""
+    """Claim to a path for the duration of the context; a given claim stays held after it."""
     if not isinstance(path, Claim):
         with disk.naming(path), Claim(path) as claim:
             yield claim
