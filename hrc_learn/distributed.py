@@ -1,4 +1,4 @@
-"""Work divided over processes.
+"""Divide work over processes.
 
 Most functions combine results of the processes that `torchrun` starts. In a single process they
 do nothing, so the same code runs with and without `torchrun`. `worker_pool` and `ByValue` are
@@ -78,9 +78,9 @@ def count() -> int:
 
 
 def local_items[T](items: Sequence[T]) -> Iterator[tuple[int, T]]:
-    """Items of this process, every n-th of the sequence, with their indices in the sequence.
+    """Items of this process with their indices: of n processes, each gets every n-th item.
 
-    The sequence is sliced: if it loads items on demand, it loads only these.
+    A sequence that loads items on demand loads only the items of this process.
     """
     mine = slice(rank(), None, count())
     return zip(range(len(items))[mine], items[mine], strict=True)

@@ -46,7 +46,7 @@ def write_model(
 
 
 class SavedModel:
-    """A saved model. Error messages name the file and the field."""
+    """A saved model, read and checked. Error messages name the file and the field."""
 
     def __init__(self, folder: str | Path, kind: str):
         self.folder = Path(folder)

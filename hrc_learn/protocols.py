@@ -114,8 +114,8 @@ class DrawnRegion:
 
 
 Request = Literal["start", "stop", "save", "discard", "home", "finish"]
-"""One-off request of a person: about the demonstration being recorded, about the arm ("home":
-back to where it started), or about the session.
+"""One-off request of a person: "start", "stop", "save" and "discard" concern a demonstration,
+"home" moves the arm back to where it started, and "finish" ends the session.
 """
 
 
@@ -174,10 +174,13 @@ Hindrance = Literal[
     "person",
     "stopped",
 ]
-"""Reason why an arm does not follow a person's guidance: a joint near its limit; a singularity
-ahead; an obstacle ahead; the speed limit of hand guiding; the task, whose end effector would
-have to move; a path without null-space motion; a posture that the arm could not return from; a
-task that waits until the arm is back; a person near the arm; the safety filter, which brakes.
+"""Reason why an arm does not follow a person's guidance.
+
+"joint_limit": a joint is near its limit. "singularity", "obstacle": there is one ahead.
+"speed": the speed limit of hand guiding. "task": the end effector of the task would have to
+move. "narrow_path": the path allows no null-space motion. "too_far": the arm could not return
+from the posture. "task_waits": the task waits until the arm is back. "person": a person is near
+the arm. "stopped": the safety filter brakes.
 """
 HINDRANCES: tuple[Hindrance, ...] = get_args(Hindrance)
 """All hindrances, in the order of the log's column "hindered"."""
@@ -202,8 +205,8 @@ class Feedback:
     """True while the person requests a motion."""
     followed: float = 1.0
     """Fraction of the requested motion that the arm follows, 0 to 1; 1 while no motion is
-    requested. For a push, the requested motion is its null-space motion. The arm's acceleration
-    phase does not lower it.
+    requested. For a push, this is the null-space motion that the push requests. An arm that is
+    still accelerating does not lower the fraction.
     """
     reasons: tuple[Reason, ...] = ()
     """Reasons why `followed` is below 1, the strongest first; empty while no motion is
@@ -243,7 +246,8 @@ class Human(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PersonObservation:
-    """Observed capsules of a person's body: all points within a radius of a segment."""
+    """Observed capsules of a person's body; a capsule is all points within a radius of a line
+    segment."""
 
     time: float
     """Time of exposure, not of arrival [s]."""
@@ -263,8 +267,7 @@ class PersonTracker(Protocol):
     """Tracks the people near an arm."""
 
     def read(self) -> PersonObservation | None:
-        """Return the newest observation that has arrived; None if there is none, for whatever
-        reason.
+        """Return the newest observation that has arrived; None if there is none for any reason.
 
         Callers must allow for the largest motion of a person since the time of exposure.
         """

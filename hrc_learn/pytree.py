@@ -1,4 +1,4 @@
-"""Frozen dataclasses of tensors as torch pytrees."""
+"""Register dataclasses of tensors as PyTorch pytrees, and select elements of their batches."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,16 +10,16 @@ from torch.utils import _pytree
 
 
 def static(default: Any) -> Any:
-    """Field of a pytree dataclass that is structure instead of a leaf.
+    """Field of a pytree dataclass that belongs to the structure and is no leaf.
 
     Use it for gains and names: `vmap` then maps the tensors only, and `torch.compile` and
-    `torch.export` treat the value as a constant.
+    `torch.export` treat the field's value as a constant.
     """
     return dataclasses.field(default=default, metadata={"static": True})
 
 
 def pytree[T](cls: type[T]) -> type[T]:
-    """Register a dataclass as a pytree: fields are children, `static` ones structure.
+    """Register a dataclass as a pytree: `static` fields are structure, other fields children.
 
     A field that is None has no child, so an optional tensor may be absent. Unlike
     `torch.export.register_dataclass`, this supports static fields for floats, because `vmap`
@@ -62,7 +62,7 @@ def pytree[T](cls: type[T]) -> type[T]:
 
 
 def zero_where[T](mask: Tensor, tree: T) -> T:
-    """A pytree with zeros, or False, in the elements of the batch where a mask holds.
+    """Copy of a pytree with zeros, or False, in the batch elements where a mask is true.
 
     Args:
         mask: Elements to clear, (*batch).
@@ -78,7 +78,7 @@ def zero_where[T](mask: Tensor, tree: T) -> T:
 def apply_where(
     mask: Tensor, function: Callable[[Any], Any], arguments: Any, otherwise: Any
 ) -> Any:
-    """Results of a batched function where a mask holds, and given values elsewhere.
+    """Results of a batched function where a mask is true, and given values elsewhere.
 
     To save time, the function is called on the selected elements of the batch only.
 
@@ -98,7 +98,7 @@ def apply_where(
 
 
 def chosen(mask: Tensor, one: Any, other: Any) -> Any:
-    """Elements of one batched pytree where a mask holds, elsewhere those of another.
+    """Batch elements of the pytree `one` where a mask is true, and of `other` elsewhere.
 
     Args:
         mask: Elements to take from `one`, (*batch).

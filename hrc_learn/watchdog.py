@@ -1,4 +1,4 @@
-"""Watchdog: stops an arm whose control loop no longer reports, retrying stops that fail."""
+"""Stop an arm whose control loop no longer reports, and retry stops that fail."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import final
 
 _FIRST_PAUSE = 0.02
 _LONGEST_PAUSE = 1.0
-"""Pauses between attempts to stop [s]: each is twice the one before, up to the longest. Network
+"""First and longest pause between attempts to stop [s]; each pause is twice the last. Network
 drivers recover within some tens of milliseconds, a control box within seconds."""
 
 
@@ -62,12 +62,12 @@ class Watchdog:
             arm.command(runner.step())
             watchdog.feed()
 
-    The watchdog runs in its own thread. It notices a loop that hangs, but neither one that
-    holds the interpreter lock nor a stopped or killed process: for a real arm use `ArmProcess`.
-    A stop that fails is retried, with growing pauses, until it succeeds or the loop reports
-    again. After a trip the arm is at rest and the controller's state is stale: start from
-    `initial_state` again. If the context ends with an exception, or with a stop still pending,
-    it stops the arm.
+    The watchdog runs in its own thread. It notices a loop that hangs. It does not notice a loop
+    that holds the interpreter lock, or a suspended or killed process: for a real arm use
+    `ArmProcess`. A stop that fails is retried, with growing pauses, until it succeeds or the
+    loop reports again. After a trip the arm is at rest and the controller's state is stale:
+    start from `initial_state` again. If the context ends with an exception, or while a stop is
+    pending, the watchdog stops the arm.
 
     Attributes:
         trips: Number of times the loop was silent for too long.
@@ -80,7 +80,7 @@ class Watchdog:
         *,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Set up the watchdog; its time starts with the first `feed`, or with the context.
+        """Set up the watchdog; silence counts from the first `feed`, or from entering `with`.
 
         Args:
             timeout: Longest silence [s]; noticed at most a quarter of this time late.

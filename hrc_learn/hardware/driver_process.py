@@ -1,8 +1,8 @@
-"""Drivers of arms and grippers in processes of their own, which answer one call at a time.
+"""Run the drivers of arms and grippers in processes of their own, which answer calls.
 
 An arm is brought to rest when its program ends, and when its control loop stalls, is suspended
-or dies. Each request is a heartbeat of the loop and each answer one of the driver's process, so
-both notice within the timeout if the other is gone.
+or dies. Each command shows the driver's process that the loop is alive, and each answer shows
+the loop that the process is alive. Both notice within the timeout if the other is gone.
 """
 
 from __future__ import annotations
@@ -70,11 +70,16 @@ class Connected(ABC):
 def checked_velocity(
     velocity: Float[np.ndarray, "..."], names: Sequence[str], fastest: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Check joint velocities and clip them to the fastest [rad/s].
+    """Check joint velocities, and clip them to the largest allowed ones [rad/s].
+
+    Args:
+        velocity: Joint velocities [rad/s].
+        names: Names of the joints.
+        fastest: Largest allowed velocity of each joint [rad/s].
 
     Raises:
-        ValueError: They have another shape, are not finite, or exceed the fastest by more than
-            rounding.
+        ValueError: The velocities have another shape, are not finite, or exceed `fastest` by
+            more than rounding.
     """
     velocity = np.asarray(velocity, dtype=float)
     if velocity.shape != (len(names),) or not np.isfinite(velocity).all():
@@ -94,7 +99,7 @@ class DriverProcess:
 
     Attributes:
         process: The process.
-        news: Number that came with the last answer of the process.
+        news: Number that the process sent with its last answer (see `answer_calls`).
     """
 
     def __init__(self, serve: Callable[..., None], *arguments: object, name: str):
@@ -234,8 +239,8 @@ def _described(error: Exception) -> str:
 
 
 _PATIENCE = 60.0
-"""Longest time for which the process keeps trying to stop an arm whose loop has died [s]; a
-control box restarts in less.
+"""Longest time for which the process keeps trying to stop an arm whose loop has died [s]. A
+control box needs less time to restart.
 """
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)
@@ -310,19 +315,20 @@ class StoppableArm(Arm, Gripper, Protocol):
 
 @final
 class ArmProcess:
-    """An `Arm` and a `Gripper` behind a driver that runs in another process.
+    """An `Arm` and a `Gripper` whose driver runs in another process.
 
     with ArmProcess(partial(FrankyArm, ip), timeout=0.15) as arm:
         while servoing():
             arm.command(velocity(arm.read()))
 
-    The process stops the arm if no command comes within the timeout, even if the loop's own
-    process blocks its interpreter, is suspended or is killed. It ignores Ctrl-C; on SIGTERM it
-    stops the arm and ends. If it dies itself, its connection to the arm is lost, which ends the
-    motion of any arm with a control box, and the loop's next request raises `WatchdogError`.
+    The driver's process stops the arm if no command comes within the timeout, even if the
+    loop's own process blocks its interpreter, is suspended or is killed. The driver's process
+    ignores Ctrl-C; on SIGTERM it stops the arm and ends. If it dies, its connection to the arm
+    is lost: this ends the motion of any arm with a control box, and the loop's next request
+    raises `WatchdogError`.
 
-    After such a stop (a trip), commands are ignored until an answer has updated `trips`, which
-    shows the loop that it has to start from rest.
+    After the process has stopped the arm (a trip), it ignores commands until an answer has
+    updated `trips`. The new number shows the loop that it has to start from rest.
 
     Every method raises `DriverError` with the driver's own exception, and `WatchdogError` if
     the process does not answer within the timeout.
@@ -417,7 +423,7 @@ def _serve(
                 return bring_to_rest(arm.stop, _PATIENCE)
             case "command":
                 velocity, trips = arguments
-                # If the loop did not know of a stop, the arm would jump to its velocity.
+                # A loop that does not know of the last stop would make the arm jump.
                 if trips == dog.trips:
                     arm.command(velocity)
                 dog.feed()

@@ -1,8 +1,9 @@
-"""A Franka arm at 1 kHz, through Franka's own binding pylibfranka.
+"""Drive a Franka arm at 1 kHz, through Franka's own binding pylibfranka.
 
-FR3 only: pylibfranka 0.21 speaks version 10 of the protocol, that of an FR3 with system 5.9 or
-later. A Panda (FER) needs libfranka 0.9 or earlier, version 5 of the protocol, for which no
-pylibfranka exists: use `FrankyArm` with franky's build for its server version.
+This works with an FR3 only: pylibfranka 0.21 uses version 10 of the network protocol, as does
+an FR3 with system 5.9 or later. A Panda (FER) uses version 5, with libfranka 0.9 or earlier,
+for which no pylibfranka exists. Use `FrankyArm` for it, with franky's build for its server
+version.
 
 Tested against the protocol simulators franka-sim, including all limits that it enforces, and
 franky-sim. NOT RUN ON HARDWARE.
@@ -42,8 +43,8 @@ _STALE = 0.2
 """Age of a reading at which the loop counts as stalled [s]: ten times what the control box
 allows before it stops the arm by itself."""
 _STALE_IN_LOCKSTEP = 2.0
-"""The same for a simulator [s], whose machine may be busy with the task. libfranka itself gives
-up a connection after 1 s."""
+"""The same age for a simulator [s], whose machine may be busy with the task. libfranka itself
+gives up a connection after 1 s."""
 _RECOVERY = 15.0
 """Timeout for recovery [s]; the control box needs some seconds."""
 _LOOK = 0.02
@@ -170,7 +171,7 @@ class FrankaArm(Connected):
         self._order(joint_velocity=velocity, stamp=time.monotonic(), stop=False)
 
     def stop(self) -> None:
-        """Bring the arm to rest, and wait for that.
+        """Bring the arm to rest, and wait until it rests.
 
         Raises:
             DriverError: The arm does not come to rest, or the loop has ended; in that case the
@@ -197,7 +198,7 @@ class FrankaArm(Connected):
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
 
-        Returns at once; failures appear on stderr and are raised by `gripper.check`.
+        Does not wait. Failures appear on stderr and are raised by `gripper.check`.
 
         Raises:
             DriverError: There is no gripper.
@@ -223,7 +224,7 @@ class FrankaArm(Connected):
         self._check()
 
     def close(self) -> None:
-        """Bring the arm to rest, end the motion, and end both processes."""
+        """Bring the arm to rest, and end the processes of the loop and the gripper."""
         self._order(end=True)
         self._process.join(self._rest)
         self._end()

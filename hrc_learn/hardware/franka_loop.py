@@ -1,4 +1,4 @@
-"""The 1 kHz loop of a Franka arm, in a process of its own.
+"""Run the 1 kHz loop of a Franka arm, in a process of its own.
 
 Each millisecond the control box sends the state of the arm and takes one answer. pylibfranka
 holds the GIL while it waits, and a busy interpreter answers late: so nothing else runs in this
@@ -32,17 +32,17 @@ from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shar
 from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig, RealtimeError
 
 _AGREES = 1e-5
-"""Largest rounding difference between the box's commanded velocity and the one sent [rad/s].
-The box reports single precision; after a lost cycle the difference is a step of the
-acceleration.
+"""Largest rounding difference between the commanded velocity that the box reports and the
+velocity sent [rad/s]. The box reports single precision. After a lost cycle, the difference is
+larger: acceleration times period.
 """
 _SAME = 1e-9
 """Largest difference between two reports of the same velocity [rad/s]."""
 _RESTS = 1e-6
-"""Commanded velocities below this are rest [rad/s]."""
+"""Commanded velocity below which the arm counts as at rest [rad/s]."""
 _SLOWEST, _FOLLOWS = 4.0, 0.02
-"""Longest real time per second of the robot's clock [s], and the gain with which a slow clock
-is tracked (over about 50 cycles).
+"""`_SLOWEST`: longest real time per second of the robot's clock [s]. `_FOLLOWS`: gain with
+which the speed of the robot's clock is tracked, over about 50 cycles.
 """
 _PARENT_EVERY = 50
 """Number of cycles between checks that the commanding process is alive."""
@@ -134,11 +134,11 @@ def serve(
 class Punctuality:
     """Detects answers that would be too late, from the clocks of this machine and the robot.
 
-    After a delay, the process reads a state whose cycle is over. An answer would be dropped or,
-    worse, be used in another cycle: sending none is better. The clock of a simulator on a busy
-    machine may run slower than real time; this alone makes no answer late. Of two successive
-    states, at least one is answered, however late, so that the arm moves even if each answer
-    takes longer than a cycle.
+    After a delay, the process reads a state whose cycle is over. The box would drop an answer
+    or, worse, use it in another cycle: sending none is better. A simulator's clock may run
+    slower than real time on a busy machine; an answer is not late for this alone. Of two
+    successive states, at least one is answered, however late, so that the arm moves even if
+    each answer takes longer than a cycle.
     """
 
     def __init__(self, *, lockstep: bool = False):
@@ -307,7 +307,7 @@ class ControlLoop:
             self._publish(Phase.MOVING)
 
     def _adopt(self, state: Any) -> None:
-        """Continue from the state of the box if it has missed the last answer."""
+        """Continue from the state of the control box if the box has missed the last answer."""
         reported, acceleration = np.array(state.dq_d), np.array(state.ddq_d)
         if answer_was_lost(reported, acceleration, self._reported, self._sent):
             self._runner.state["safety.velocity"][:] = reported
@@ -369,9 +369,9 @@ def answer_was_lost(
     """True if the control box has missed the last answer and extrapolates at constant
     acceleration.
 
-    The next answer must then start from the state of the box. An unchanged velocity despite an
-    acceleration is no such sign: it was reported before the box received the last answer, and
-    starting from it would be a jump back.
+    The next answer must then start from the state of the box. If the box reports the same
+    velocity twice despite an acceleration, the answer is not lost: the box sent that report
+    before it received the answer, and starting from it would be a jump back.
 
     Args:
         reported: Commanded velocity that the box reports [rad/s].

@@ -1,7 +1,7 @@
-"""Memory that the loop of a Franka arm shares with the process that commands it.
+"""Memory through which a Franka arm's 1 kHz loop and the process that commands it communicate.
 
-Orders go to the loop, reports come back; a mailbox for each holds the newest line of numbers,
-so neither side ever waits for the other.
+Orders go to the loop, and reports come back. A mailbox for the orders and one for the reports
+hold the newest values as a line of numbers, so that neither process waits for the other.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def _zeros() -> Float[np.ndarray, "7"]:
 
 
 class Numbers:
-    """Base of dataclasses that are stored as a line of numbers: their fields in order, each of
-    which has a default.
+    """Base of dataclasses that are stored as a line of numbers: all fields in order. Each field
+    has a default.
     """
 
     def line(self) -> Float[np.ndarray, " size"]:
@@ -60,9 +60,10 @@ class Numbers:
 class Mailbox[Line: Numbers]:
     """The newest line of numbers that one process writes and others read, without a lock.
 
-    The memory holds two lines and the number of lines written, from which follows which line is
-    the newest. The writer overwrites the older line, then increases the number. So a reader
-    always finds a complete line, even if the writer is suspended or dies while writing.
+    The memory holds two lines, and the number of lines written so far: even or odd, it says
+    which line is the newest. The writer overwrites the older line, then increases the number.
+    So a reader always finds a complete line, even if the writer is suspended or dies while
+    writing.
     """
 
     def __init__(self, line: Line):
@@ -129,7 +130,7 @@ class Report(Numbers):
     cost: float = 0.0
     """Time from reading the last answered state to sending its answer [s]."""
     resting: bool = True
-    """True if the velocity sent last is zero."""
+    """True if the velocity sent last is practically zero, or a fault has stopped the arm."""
     joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
     """[rad]"""
     joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)

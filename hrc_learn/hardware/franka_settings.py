@@ -14,7 +14,8 @@ from hrc_learn.geometry.numerics import ArrayLike, check_settings
 CYCLE = 1e-3
 """Period of Franka's control interface [s]."""
 _REST, _LATER = 3.0, 1.5
-"""Shortest timeout for coming to rest [s], and its smallest ratio to the time for braking."""
+"""`_REST`: shortest timeout for coming to rest [s]. `_LATER`: smallest ratio of the timeout to
+the time for braking."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +29,8 @@ class Load:
     inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
     """Inertia about the centre of mass, along the flange's axes [kg m^2]."""
     far_end: tuple[float, float, float] | None = None
-    """Point of the load farthest from the flange, in its frame [m]: `FrankaArm` limits its
-    speed like that of the tool. None: no such limit."""
+    """Point of the load farthest from the flange, in the flange's frame [m]. `FrankaArm` limits
+    the speed of this point like that of the tool. None: no such limit."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.mass < math.inf:
@@ -135,18 +136,19 @@ class FrankaConfig(FrankyConfig):
     """Settings of an arm's 1 kHz loop.
 
     If an answer is late, the loop cannot know in which cycle the control box uses it. In a
-    wrong cycle, the change of acceleration is off by up to the acceleration itself. With
-    dynamics of 0.3 this is still allowed on an FR3: 3 rad/s^2 within 1 ms plus 1500 rad/s^3
-    make 4500 rad/s^3, below its limit of 5000.
+    wrong cycle, the acceleration changes in addition by up to its own value. With `dynamics` of
+    0.3, an FR3 still allows this: 3 rad/s^2 within 1 ms are a jerk of 3000 rad/s^3; with the
+    planned 1500 rad/s^3, the sum is 4500 rad/s^3, below the limit of 5000.
 
     Without real-time scheduling, some answers are late; the control box tolerates up to 20
-    missing answers in a row. Even then, the loop sets real-time priority if it is allowed to.
+    missing answers in a row. With `realtime=False`, too, the loop sets real-time priority if it
+    is allowed to.
     """
 
     grip_force: float = 40.0
     """Grasping force [N]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Settings of the safety filter, which uses these limits."""
+    """Settings of the safety filter, which enforces the arm's limits, reduced by `dynamics`."""
     lockstep: bool = False
     """True for a simulator that waits for each answer, and stands still while no command comes:
     no answer is ever late, and each state is answered.

@@ -1,7 +1,7 @@
-"""A Franka arm as an `Arm` and a `Gripper`, driven through the package `franky`.
+"""Drive a Franka arm as an `Arm` and a `Gripper`, through the package `franky`.
 
-Run with franky 2.0 (PyPI: franky-control) against simulators of the arm's network protocol; NOT
-RUN ON HARDWARE.
+Tested with franky 2.0 (PyPI: franky-control) against simulators of the arm's network protocol;
+NOT RUN ON HARDWARE.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ _JOINTS = tuple(f"joint {k}" for k in range(1, 8))
 class FrankyArm(Connected):
     """A Franka arm and its gripper.
 
-    A velocity holds for at most the config's `timeout`; then the driver brings the arm to rest;
-    a command that comes meanwhile starts from the remaining velocity. If this process dies, its
-    connection drops, which ends the motion at once.
+    A velocity holds for at most the config's `timeout`. Then the driver brakes the arm to rest;
+    a command during the braking starts from the velocity that remains. If this process dies,
+    its connection drops, which ends the motion immediately.
 
     After a reflex, a user stop or a lost connection every command raises `ArmFaultError` until
     `recover` has succeeded. The gripper has its own threads (`GripperThread`): the arm never
@@ -120,7 +120,7 @@ class FrankyArm(Connected):
         """Bring the arm to rest.
 
         Raises:
-            ArmFaultError: The connection is lost. The control box then brings it to rest.
+            ArmFaultError: The connection is lost. The control box then brings the arm to rest.
         """
         if not self._fault:
             try:
@@ -155,7 +155,7 @@ class FrankyArm(Connected):
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
 
-        Returns at once; failures appear on stderr and are raised by `gripper.check`.
+        Does not wait. Failures appear on stderr and are raised by `gripper.check`.
         """
         self.gripper.move(width)
 
@@ -229,7 +229,7 @@ class FrankyArm(Connected):
             os.sched_setscheduler(0, *before)
 
     def _is_moving(self) -> bool:
-        """True during a motion; raises the error that ended the last one, once."""
+        """True during a motion. If an error ended the last motion, raises this error once."""
         # The result of poll_motion is not usable: contrary to its documentation, it is True
         # at rest (franky 2.0).
         self._robot.poll_motion()

@@ -1,4 +1,4 @@
-"""Grippers driven by threads, so that no control loop waits for the fingers."""
+"""Drive grippers by threads, so that no control loop waits for the fingers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from hrc_learn.hardware.driver_process import (
 )
 
 _NARROW = 0.005
-"""Requests below this opening squeeze; changes below it are ignored [m]. A typical
-object is ten times as wide."""
+"""Opening below which a request squeezes, and change below which a new request is ignored [m].
+A typical object is ten times as wide."""
 _BETWEEN_READINGS = 0.02
 """Period of the width readings [s]: fingers at 0.1 m/s move 2 mm per period, and skills act on
 motions of millimetres.
@@ -67,10 +67,10 @@ class GripperThread(Connected):
             gripper.width  # newest reading
             gripper.check()  # raises what has failed since `move`
 
-    One thread reads the width. Another executes the requests; after each, it continues with the
-    newest one. A lost connection is reopened. Failures are printed on stderr and kept until the
-    next move, so that a task can check for them at a suitable moment while the
-    control loop continues.
+    One thread reads the width. Another thread executes the requests: after each request, it
+    continues with the newest. A lost connection is reopened. Failures are printed on stderr and
+    kept until the next move, so that a task can check for failures at a suitable moment while
+    the control loop continues.
 
     Attributes:
         failure: Failure since the last new opening was requested; None if there was none.
@@ -225,8 +225,8 @@ class GripperThread(Connected):
 class GripperProcess:
     """A gripper driver whose calls are made in another process, one at a time.
 
-    For drivers that hold the GIL during a call, as pylibfranka does. Reading the width
-    waits until the fingers have stopped.
+    This suits drivers that hold the GIL during a call, as pylibfranka does. While the fingers
+    move, `read_width` waits.
     """
 
     def __init__(self, open_driver: Callable[[], GripperDriver]):

@@ -1,7 +1,7 @@
-"""An arm driven by LeRobot, such as the SO-101 follower, as an `Arm` and a `Gripper`.
+"""Use a robot of LeRobot, such as the SO-101 follower, as an `Arm` and a `Gripper`.
 
-Run with LeRobot's driver and the maker's SDK against a simulation of the servos' bus; NOT RUN
-ON HARDWARE.
+Tested with LeRobot's driver and the maker's SDK against a simulation of the servos' bus; NOT
+RUN ON HARDWARE.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ _SLOPE = 5
 _STATUS = 0.5
 """Time between two readings of the servos' status [s]."""
 _CONFIRMED, _LATE = 3, 0.005
-"""Number of readings that confirm an alarm, and the wait for late replies before each [s]."""
+"""`_CONFIRMED`: number of readings that confirm an alarm. `_LATE`: wait for late replies before
+each of these readings [s]."""
 _ALARMS = ("voltage", "angle sensor", "temperature", "current", "", "overload")
 """Meaning of the bits of a Feetech servo's register "Status"."""
 
@@ -68,10 +69,10 @@ class LeRobotArm(Connected):
     """A position-controlled robot of LeRobot, driven by velocities.
 
     A thread reads the positions, integrates the velocities and sends the resulting positions.
-    Without a command for the config's `timeout`, these stay constant and the servos hold the
-    arm. A servo that reports a fault and a joint that lags behind stop the arm: every command
-    raises `ArmFaultError` until `recover` succeeds. While the bus is silent, commands
-    raise it, too.
+    Without a command for the config's `timeout`, the positions sent stay constant and the
+    servos hold the arm. If a servo reports a fault, or a joint lags behind, the arm stops:
+    every command raises `ArmFaultError` until `recover` succeeds. Commands also raise
+    `ArmFaultError` while the bus is silent.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class LeRobotArm(Connected):
             raise
         self._thread = threading.Thread(target=self._keep_going, name="lerobot", daemon=True)
         self._thread.start()
-        # If the program ends without `close`, LeRobot's setting for the torque applies, too.
+        # LeRobot's setting for the torque must also apply if the program does not call `close`.
         atexit.register(self.close)
 
     def read(self) -> ArmState:
@@ -166,7 +167,7 @@ class LeRobotArm(Connected):
     def stop(self) -> None:
         """Let the servos hold the arm at the present commanded positions.
 
-        On a silent bus, they hold the last positions sent, so this needs no reply.
+        On a silent bus, the servos hold the last positions sent: no reply is needed.
         """
         with self._lock:
             self._advance()
@@ -257,7 +258,7 @@ class LeRobotArm(Connected):
         return ""
 
     def _advance(self) -> None:
-        """Integrate the velocity until now, or until it has expired."""
+        """Move the goal by the velocity, until now or until the velocity has expired."""
         now = time.monotonic()
         until = min(now, self._commanded_at + self.config.timeout)
         elapsed = max(0.0, until - self._moved_at)

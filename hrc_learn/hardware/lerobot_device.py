@@ -1,4 +1,4 @@
-"""Robots and teleoperators of LeRobot by their settings, and the units of their joints."""
+"""Open robots and teleoperators of LeRobot, and convert the units of their joints."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ class LeaderArm:
 
         Args:
             settings: LeRobot's settings of the teleoperator: type, port, id and others.
-            joint_names: Joints of the arm that follows it.
+            joint_names: Joints of the arm that follows the leader.
 
         Raises:
             ValueError: There is no such type, or its joints are different.

@@ -1,13 +1,12 @@
-"""Cameras, streams and video files that OpenCV opens, as a `Camera`, and the delay of their
-images.
+"""Use OpenCV's cameras, streams and video files as a `Camera`, and measure the delay of images.
 
-Neither lens nor camera pose has to be known. Each image carries its time, from which the
-controller finds the arm's position at exposure.
+Neither lens nor camera pose has to be known. Each image has an age, from which the controller
+finds the arm's position at exposure.
 
 The delay is measured by moving the robot: a joint turns back and forth, and the position of its
-marker in the images lags behind the joint. No calibration is needed: over such a small motion a
-pixel is a smooth function of one joint position, which is fitted for each candidate delay. The
-delay with the smallest residual is the camera's.
+marker in the images lags behind the joint. No calibration is needed: over such a small motion,
+the marker's pixel is a smooth function of the joint position. This function is fitted for each
+candidate delay; the delay with the smallest residual is the result.
 """
 
 from __future__ import annotations
@@ -89,7 +88,7 @@ class CaptureCamera(Connected, TimedCamera):
 
     @property
     def age(self) -> float:
-        """Age of the image that `read` returned last, at that time [s]."""
+        """Age that the last image had when `read` returned it [s]."""
         return self._age
 
     def read(self) -> RGB:
@@ -224,7 +223,7 @@ def _as_rgb(image: np.ndarray, name: str) -> RGB:
     """Convert a BGR image to RGB.
 
     Raises:
-        CameraError: It is not an 8-bit colour image.
+        CameraError: The image is not an 8-bit colour image.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise CameraError(
@@ -239,16 +238,17 @@ def _as_rgb(image: np.ndarray, name: str) -> RGB:
 _SLOWEST, _FASTEST = 0.4, 1.0
 # Largest joint velocity [rad/s]: a marker at 0.5 m moves at 75 mm/s, by 3 cm to each side.
 _SPEED = 0.15
-# Period of the readings of arm and camera, and the longest delay searched [s].
+# `_DT`: period of the readings of arm and camera [s]. `_LONGEST`: longest delay searched [s].
 _DT, _LONGEST = 0.01, 0.5
 # Degree of the polynomial that is fitted to the pixels: perspective makes it nonlinear.
 _POWERS = 3
 # Step between the delays tried [s]; the minimum is interpolated between them.
 _STEP = 2e-3
-# Fewest images, and smallest explained fraction of the pixels' motion, for a valid delay.
+# For a valid delay: fewest images, and smallest fraction of the pixels' variance that the fit
+# must explain.
 _FEWEST, _EXPLAINED = 30, 0.9
-# Return of the joint to its start: decay rate [1/s], position error at which it ends [rad], and
-# longest duration [s].
+# Return of the joint to its start. `_RETURN`: decay rate [1/s]. `_BACK`: position error at
+# which the return ends [rad]. `_LONGEST_WAY_BACK`: longest duration [s].
 _RETURN, _BACK, _LONGEST_WAY_BACK = 2.0, 1e-3, 3.0
 
 

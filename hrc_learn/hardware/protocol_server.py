@@ -1,10 +1,10 @@
-"""The simulated workplace behind the network protocol of a Franka arm.
+"""Serve the simulated workplace over the network protocol of a Franka arm.
 
-A driver for the real arm connects over sockets and controls the simulated arm in cycles of 1
-ms. The package franky-sim implements the protocol, `World` the physics. The server reports a
-Franka Research 3 (server version 10), whereas the physics is a Panda with our limits. Joint
-velocities and positions are not affected, as their limits are up to the driver. Poses are those
-of the Research 3 model; dynamics are not reported, and torque commands have no effect.
+A driver for the real arm connects over sockets and controls the simulated arm in cycles of
+1 ms. The package franky-sim implements the protocol, `World` the physics. The server reports a
+Franka Research 3 (server version 10), but the physics is a Panda with our limits. This does not
+affect joint velocities and positions, whose limits the driver enforces. Poses are those of the
+Research 3 model; dynamics are not reported, and torque commands have no effect.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ network requirements)."""
 
 
 class ArmServer:
-    """Steps a world in cycles of the arm's protocol.
+    """Server that steps a world in cycles of the arm's protocol.
 
         with serve_world(world) as server:
             arm = FrankyArm(server.address, FrankyConfig(realtime=False))
@@ -94,7 +94,7 @@ class ArmServer:
 
     @property
     def clock_offset(self) -> float:
-        """Offset of the world's clock from the arm's, which starts with a connection [s]."""
+        """World time minus the arm's time, which starts at 0 with each connection [s]."""
         # Cycles are numbered from 0; the number of the last one is the driver's time.
         return self.world.time - (self._sent - 1) * CYCLE
 
@@ -207,7 +207,7 @@ class ArmServer:
 
 @final
 class ServedArm:
-    """Driver of an arm that an `ArmServer` serves, whose world stands still between calls.
+    """Driver of an arm that an `ArmServer` serves; the world stands still between calls.
 
     Times are those of the world's clock.
     """

@@ -1,7 +1,7 @@
-"""An arm behind ROS 2 topics: it publishes joint states, and stock controllers take commands.
+"""Drive an arm over ROS 2 topics: joint states come in, commands go to standard controllers.
 
-Run over real middleware against our simulated arm; NOT RUN ON HARDWARE. If the system's ROS 2
-has been sourced, it is used, otherwise the wheels of `hrc-learn[ros2]`.
+Tested over real middleware against our simulated arm; NOT RUN ON HARDWARE. If the system's
+ROS 2 has been sourced, this ROS 2 is used, otherwise the wheels of `hrc-learn[ros2]`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from hrc_learn.protocols import ArmState
 from hrc_learn.watchdog import Watchdog
 
 _CLOCK_RESET = 1.0
-"""Backward step of the stamps above which the clock was reset, not a message reordered [s]."""
+"""Backward step of the time stamps [s] above which the clock must have been reset. After a
+smaller step, the message was only reordered."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +58,9 @@ class Ros2Config:
     opening: float = 0.08
     """Opening of the gripper [m] at `gripper_open`."""
     gripper_open: float = 0.04
-    """Position of its joint when open."""
+    """Position of `gripper_joint` when open, in its own unit."""
     gripper_closed: float = 0.0
-    """Position of its joint when closed."""
+    """Position of `gripper_joint` when closed."""
 
     def __post_init__(self) -> None:
         check_settings(self, finite=("timeout", "silence", "startup", "lag"))
@@ -74,15 +75,15 @@ class Ros2Arm(Connected):
 
     A velocity holds for at most the config's `timeout`. Reordered or incomplete joint states
     are ignored; once the newest is older than `silence`, `read` and `command` raise
-    `ArmFaultError` until new ones come. A trajectory ends at rest by itself, and a position is
-    held. A velocity controller would hold its last command for ever if this process died: in
-    that case, a guard in a process of its own sends zeros.
+    `ArmFaultError` until new ones come. If this process dies, a trajectory ends at rest by
+    itself, and a position is held. A velocity controller would hold its last command for ever:
+    therefore, a guard in a process of its own then sends zeros.
 
     Attributes:
         session: The node.
         ignored: Number of joint states with all joints that were reordered, or lacked a finite
             position of a joint.
-        received: Arrival time of the newest one, by this machine's monotonic clock [s].
+        received: Arrival time of the newest joint state, by this machine's monotonic clock [s].
     """
 
     def __init__(self, chain: SerialChain, config: Ros2Config | None = None):
@@ -237,11 +238,12 @@ class Ros2Arm(Connected):
             self._commanded_at = time.monotonic()
 
     def _send(self, velocity: np.ndarray, state: ArmState) -> None:
-        """Continue with a velocity from where the previous one has moved the goal by now."""
+        """Send a velocity, starting from where the previous one has moved the goal by now."""
         now, config, rest = time.monotonic(), self.config, self.config.timeout
         elapsed = now - self._moved_at
         if config.interface == "trajectory":
-            # Way along the last trajectory, which brakes after its step.
+            # Distance along the last trajectory, as a time at its velocity: the trajectory
+            # keeps the velocity for its step, then brakes.
             coast = np.clip(elapsed - self._step, 0, rest)
             moved = min(elapsed, self._step) + coast * (1 - 0.5 * coast / rest)
         else:

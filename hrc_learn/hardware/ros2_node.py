@@ -1,4 +1,4 @@
-"""The adaptive controller with its safety filter as a lifecycle node of ROS 2."""
+"""Run the adaptive controller with its safety filter as a lifecycle node of ROS 2."""
 
 from __future__ import annotations
 
@@ -239,7 +239,8 @@ class ControllerNode:
         return state.time
 
     def _checked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Callback that logs a message that is refused; an error would end its thread."""
+        """Wrap a callback: errors about refused messages are logged, or they would end the
+        thread."""
 
         def guarded(message: Any) -> None:
             try:
@@ -358,8 +359,8 @@ class ControllerNode:
         return self.node.trigger_configure() == done and self.node.trigger_activate() == done
 
     def figures(self, recent: int = 0) -> dict[str, float]:
-        """Number of commands, numbers of steps in which each limit of the safety filter acted,
-        and latency from joint state to command [ms].
+        """Number of commands; number of steps in which the safety filter intervened, by limit;
+        and percentiles of the latency from joint state to command [ms].
 
         Args:
             recent: Number of newest commands whose latency counts; 0: all.

@@ -1,4 +1,4 @@
-"""Access to ROS 2: the installation in use, a node with a thread, and quality of service.
+"""Use ROS 2: report the installation, run a node in a thread, and set the quality of service.
 
 Run as a program, this module guards a velocity controller: see `guard_velocities`. It imports
 nothing of this package, so that the guard is ready in half a second.
@@ -164,7 +164,7 @@ def start_guard(topic: str, joints: int, timeout: float, controllers: int) -> su
 def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) -> None:
     """Send zeros once the last command is a nonzero velocity and older than the timeout.
 
-    After the death of the process that started the guard, it sends zeros for another second.
+    After the process that started the guard has died, the guard sends zeros for another second.
     """
     from std_msgs.msg import Float64MultiArray
 
@@ -192,8 +192,8 @@ def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) 
         time.sleep(timeout / 5)
         if newest["moving"] and time.monotonic() - newest["time"] > timeout:
             zeros.publish(rest)
-    # Receiving its own zeros proves nothing: a controller that has not received them yet loses
-    # them when the publisher leaves the graph.
+    # That the guard receives its own zeros proves nothing: a controller that has not received
+    # them yet loses them when the publisher leaves the graph.
     end = time.monotonic() + _FAREWELL
     while time.monotonic() < end:
         zeros.publish(rest)

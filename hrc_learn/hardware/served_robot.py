@@ -1,6 +1,6 @@
-"""A simulated arm as a robot of franky-sim, which implements the protocol of a Franka arm.
+"""Connect a simulated arm to franky-sim, which implements the protocol of a Franka arm.
 
-Imported on demand: it needs the package franky-sim.
+This module needs the package franky-sim, so it is imported on demand.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ServedRobot(BaseRobot):
 
     Attributes:
         answered: True once a command has come in this cycle.
-        reading: Reading of the arm before this cycle.
+        reading: Reading of the arm at the beginning of this cycle.
         velocity: Commanded joint velocities [rad/s].
     """
 
@@ -112,11 +112,12 @@ class ServedRobot(BaseRobot):
 class PunctualServer(FrankaRobotServer):
     """Server that drops answers to earlier states.
 
-    If one were accepted in this cycle, all later answers would be a cycle late, too.
+    If it accepted such an answer in this cycle, all later answers would be a cycle late, too.
     """
 
     def _handle_udp_command(self, command_data: bytes) -> None:
-        # An answer has the number of its state; the counter is one ahead after sending that.
+        # An answer has the number of its state. Once the state is sent, the counter is one
+        # ahead.
         counted = self._FrankaServer__message_id  # pyright: ignore[reportAttributeAccessIssue]
         if int.from_bytes(command_data[:8], "little") == counted - 1:
             super()._handle_udp_command(command_data)

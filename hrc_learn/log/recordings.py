@@ -1,8 +1,8 @@
-"""Step logs of control loops and recordings of runs, in NumPy; `hrc_learn.viz` draws them.
+"""Log the steps of control loops and record runs, in NumPy, for drawing by `hrc_learn.viz`.
 
 A log has columns of equal length, one row per step, and is cheap to append to. Times of a
 recording are in seconds from its start. If a field of a recording is None or empty, the panel
-or figure that would show it is left out.
+or figure that would show this field is left out.
 """
 
 import os
@@ -57,7 +57,7 @@ class LoggedSteps:
         return name in self.names
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Copy of one column, (T, ...)."""
+        """Copy of one column, (steps, ...)."""
         if name not in self:
             raise KeyError(f"{name!r} is not logged; the columns are {list(self.names)}.")
         return np.concatenate([block[name] for block in self.blocks()])
@@ -93,13 +93,13 @@ Value = np.ndarray | np.generic | float | int | bool
 class StepLog(LoggedSteps):
     """Columns of the quantities that a loop measures, one row per step.
 
-    The first row determines the columns and their shapes; every later row must have the same
-    ones. Numbers become float64, even if the first value is an integer (`time=0`); booleans
-    stay boolean. Memory is allocated in blocks and never moved, so that no step has to copy it.
+    The first row determines the columns and their shapes, which every later row must have, too.
+    Numbers become float64, even if the first value is an integer (`time=0`); booleans stay
+    boolean. Memory is allocated in blocks and never moved, so that no step has to copy the log.
 
         log = StepLog()
         log.append(time=t, joint_position=q, feature=x, pushed=True)
-        log["joint_position"]      # (T, 7)
+        log["joint_position"]      # (steps, 7)
     """
 
     def __init__(self, block: int = 8192):
@@ -185,7 +185,7 @@ class StepLog(LoggedSteps):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointRanges:
-    """Joint ranges, drawn with joint positions."""
+    """Ranges of the joints, drawn together with the joint positions."""
 
     lower: Float[np.ndarray, " joints"]
     """[rad]"""
@@ -247,7 +247,8 @@ class RunRecording:
     """[rad/s]"""
     joint_limits: JointRanges | None = None
     demo_joint_position: Float[np.ndarray, "time joints"] | None = None
-    """Demonstrated joint positions at the same fraction of the motion [rad]; NaN elsewhere."""
+    """Demonstrated joint positions at the same fraction of the motion [rad]; NaN at steps
+    outside the motion."""
 
     position: Float[np.ndarray, "time 3"]
     """Tool centre point in the base frame [m]."""
@@ -299,7 +300,8 @@ class RunRecording:
 
     worker_distance: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
     """Distances between a worker and the robot with its load, by name [m]: the true smallest
-    one, the one seen by the robot, and the protective distance; NaN while unknown."""
+    distance, the smallest distance seen by the robot, and the protective distance; NaN while
+    unknown."""
     worker_nearest: Float[np.ndarray, "time 2 3"] | None = None
     """Nearest points of robot and worker [m]."""
 
