@@ -246,8 +246,7 @@ class Human(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PersonObservation:
-    """Observed capsules of a person's body; a capsule is all points within a radius of a line
-    segment."""
+    """Observed body of a person, as capsules: all points within a radius of a line segment."""
 
     time: float
     """Time of exposure, not of arrival [s]."""

@@ -239,8 +239,7 @@ class ControllerNode:
         return state.time
 
     def _checked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Wrap a callback: errors about refused messages are logged, or they would end the
-        thread."""
+        """Wrap a callback so that its errors are logged; else they would end the thread."""
 
         def guarded(message: Any) -> None:
             try:
