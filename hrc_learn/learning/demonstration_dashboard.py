@@ -59,7 +59,8 @@ class ShownDataset:
     arm: DatasetArm | None = None
     """Arm to draw; None draws the path of the end effector alone."""
     units: Mapping[str, UnitDecision] = field(default_factory=dict)
-    """Units on disk by role; joints are plotted in these units, or in rad if not given."""
+    """Units on disk by role. Joints are plotted in their unit on disk, or in rad if the units
+    are not given."""
     images: Callable[[Demonstration], Mapping[str, CameraImages]] = lambda demo: {}
     """Images of a demonstration by camera."""
     cameras: Sequence[str] = ()
@@ -176,7 +177,7 @@ def _send_images(
 
 
 def _episode_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
-    """Plots of all quantities recorded in an episode, commanded and measured in one plot."""
+    """One plot for each recorded quantity of an episode, with commanded and measured values."""
     limits, plots = _limits(shown), []
     for chart in demonstration_charts(demo, shown.units):
         path, is_joint = f"episode/{chart.key}", chart.key.startswith("joint_")

@@ -124,7 +124,8 @@ def record_fit(path: str | os.PathLike[str], fit: ShownFit) -> None:
 
     Args:
         path: File to write; it appears only when complete.
-        fit: Demonstrations and reproductions; each of the first `_MOST_TABS` gets a tab.
+        fit: Demonstrations and reproductions; each of the first `_MOST_TABS` demonstrations
+            gets a tab.
     """
     tabs = [_tab(fit, i) for i in range(min(_MOST_TABS, len(fit.demos)))]
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
@@ -214,7 +215,7 @@ _MOST_PATHS = 30
 """Largest number of paths drawn; more would hide each other."""
 _BELOW = 0.03
 """Distance of the error map below the lowest path, so that both are visible [m]."""
-_THICKNESS = 0.002  # half thickness of the error map's cells [m]
+_THICKNESS = 0.002  # half the thickness of the error map's cells [m]
 _ROUND = "round"
 """Timeline of learning, with one step per round."""
 
@@ -226,7 +227,7 @@ def record_learning(
 
     Args:
         path: File to write; it appears only when complete.
-        skill: Skill that was just fitted; a loaded one has no held-out errors.
+        skill: Skill that was just fitted; a loaded skill has no held-out errors.
         demos: Demonstrations of the skill; the first `_MOST_PATHS` are drawn.
         title: Title of the recording.
     """
@@ -288,7 +289,7 @@ def _error_map(cells: CellErrors, height: float) -> rr.Boxes3D:
     relative, flat = errors[known], np.full(int(known.sum()), _THICKNESS)
     middle = np.meshgrid(*((axis[1:] + axis[:-1]) / 2 for axis in edges), indexing="ij")
     size = np.meshgrid(*(np.diff(axis) for axis in edges), indexing="ij")
-    # From pale blue to a shade on which black numbers can still be read.
+    # The darkest blue is limited so that black numbers on it can still be read.
     shades = matplotlib.colormaps["Blues"](0.15 + 0.5 * relative / relative.max(initial=1e-12))
     centers = [*(grid[known] for grid in middle), np.full_like(flat, height)]
     return rr.Boxes3D(

@@ -1,4 +1,4 @@
-"""Fitted model in a folder: its primitives by channel, its units, and the arm it moves."""
+"""Load a fitted model from its folder, convert its units, and find the arm that it fits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ CHANNELS = ("joint", "pose", "position")
 _RAD = {"rad": 1.0, "deg": math.pi / 180}
 """Radians per unit, for joint units of a fixed size."""
 _SAME_TOOL = 0.02
-"""Largest distance between the model's first position and the tool at its first joints [m]."""
+"""Largest distance between the start of the model's pose primitive and the arm's tool at the
+start of the model's joint primitive [m]."""
 KINDS = "joints", "position", "pose"
 """Kinds of goals."""
 
@@ -86,11 +87,11 @@ class FittedModel:
         """Parse a start or goal from the words of an option.
 
         Args:
-            words: Numbers, which may follow "joints", "position" or "pose".
+            words: Numbers, optionally after one of the words "joints", "position" and "pose".
             option: Name of the option, for errors.
 
         Raises:
-            ValueError: The words name no target of this model.
+            ValueError: The words describe no target of this model, or more than one.
         """
         counts = {"position": 3, "pose": 7}
         if self.joint is not None:
@@ -152,7 +153,9 @@ class FittedModel:
 
 
 def arm_for(model: FittedModel, name: str) -> Arm:
-    """Arm with the tool to which the model's poses belong: its described tool, or our hand.
+    """Arm with the tool to which the model's poses belong.
+
+    The tool is the one in the arm's description, or the Franka hand.
 
     Args:
         model: The model.

@@ -1,11 +1,12 @@
-"""Detection of tool and object in demonstration videos, without markers or calibration.
+"""Find the tool and an object in demonstration videos, without markers or calibration.
 
-The pixels of the moving arm differ from the background image. Features of these pixels are
-tracked through frames of all demonstrations. Every point fixed to a link of the arm moves
-according to the kinematics and is seen by one unknown camera. Therefore, a camera fitted to one
-such track (`fit_camera`) predicts all other tracks of that link, and the camera that explains
-most tracks is chosen. These tracks become the points of the tool. The object is what changes
-its position between demonstrations and lies where their motion ends.
+The pixels of the moving arm differ from the background image. The image features among these
+pixels are matched across frames of all demonstrations. The pixels of one feature over time are
+a track. A point fixed to a link of the arm moves with the known kinematics of that link, and
+one unknown camera sees all points. Therefore a camera fitted to one track (`fit_camera`)
+predicts the tracks of all other points of the same link. The camera that explains most tracks
+is chosen, and the explained tracks give the points of the tool. The object is what differs in
+position between demonstrations and lies ahead of the tool when a demonstration ends.
 """
 
 from __future__ import annotations
@@ -55,45 +56,54 @@ from hrc_learn.vision.landmarks import (
 )
 from hrc_learn.vision.markers import as_grey
 
-# Number of frames, over all demonstrations, that are searched for tracks; of frames from whose
-# features tracks start; and of frames whose median is the background image.
+# Approximate numbers of frames, over all demonstrations.
+# `_FRAMES`: least number that is searched for tracks, if demonstrations are long enough.
+# `_STARTS`: frames whose features start a track. `_USUAL`: fewest frames whose median is the
+# background image.
 _FRAMES, _STARTS, _USUAL = 72, 10, 31
-# Fewest frames of a track; least spread of its pixels; number of tracks to which cameras are
-# fitted; number of explained tracks at which the search for a camera stops; and largest error
-# of a point that moves with its link. Pixels are those of an image 1440 px wide.
+# `_SHORTEST`: fewest frames in which a track is seen.
+# `_STILL`: least median distance of a track's pixels from their median, and between two tracks
+# to which cameras are fitted [px at an image width of 1440].
+# `_TRIED`: largest number of tracks to which cameras are fitted.
+# `_ENOUGH`: number of explained tracks at which the search for a camera stops.
+# `_AGREES`: error below which a pixel agrees with the camera [px at an image width of 1440].
 _SHORTEST, _STILL, _TRIED, _ENOUGH, _AGREES = 10, 20.0, 12, 150, 4.0
-# Error beyond which pixels count less in each of three bundle adjustments [px of 1440].
+# Errors beyond which a pixel counts less, one for each of three successive bundle adjustments
+# [px at an image width of 1440].
 _CLOSER = (8.0, 4.0, 2.0)
-# Largest distance of a point from the origin of its link [m].
+# Largest distance of a tool point from the origin of its link [m].
 _NEAR = 0.35
-# Number of frames, over all demonstrations, in which the tool is finally detected.
+# Least number of frames, over all demonstrations, in which the finished tool is searched for
+# (all frames if there are fewer).
 _FOLLOWED = 320
-# Largest width of each image in the picture of the findings [px].
+# Largest width of one image in the picture of the findings [px].
 _TILE = 720
-# Length of the line ahead of the tool on which the object lies at the end [m]; number of images
-# per demonstration from which the object is learned, while the tool is far from it.
+# `_DEEPEST`: length of the line ahead of the tool on which the object lies when a demonstration
+# ends [m]. `_CLEAR`: images of each demonstration from which the object is learned: those in
+# which the tool is farthest from the object.
 _DEEPEST, _CLEAR = 0.25, 7
 
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerlessFit:
-    """Demonstrations with the tool and object found in their video."""
+    """Tool and object found in the videos of demonstrations."""
 
     demos: DemonstrationSet
-    """Demonstrations with the image features found, in place of recorded ones."""
+    """The demonstrations. The pixels found for tool and object replace recorded features."""
     landmarks: Landmarks
     """Tool and object, for detection at run time."""
     camera: Float[Tensor, "13"]
     """Camera that explains the motion of the tool (see `jacobian.perspective`)."""
     seen: float
-    """Fraction of the searched frames in which the tool was found."""
+    """Fraction of the frames searched by `_Search.follow` in which the tool was found."""
     deviation: float
-    """Median standard deviation of the tool's pixel [px]."""
+    """Standard deviation of the tool's pixel, median over the frames with the tool [px]."""
     picture: UInt8[np.ndarray, "height width 3"]
-    """First and last image with the tool of up to three demonstrations, findings drawn in."""
+    """First and last image that show the tool, for up to three demonstrations; tool and object
+    are drawn into them."""
 
     def figures(self) -> dict[str, float]:
-        """Measured values by name."""
+        """Measured values of the fit, by name."""
         return {
             "tool_points": len(self.landmarks.tool.points),
             "tool_seen": self.seen,
@@ -108,23 +118,25 @@ class MarkerlessFit:
 
 
 class _Link(NamedTuple):
-    """Poses of a link in the searched frames, and the axis on which its `Tool.place` lies."""
+    """A link of the arm to which the tracked points may be fixed."""
 
     pose: Pose
+    """Poses of the link in the base frame, one for each searched frame."""
     axis: tuple[np.ndarray, np.ndarray] | None = None
-    """Point on the axis of the last joint, and its direction, in the link's frame [m]."""
+    """Axis of the last joint, on which `Tool.place` must lie: a point on the axis [m] and the
+    direction of the axis, both in the link's frame. None: `Tool.place` may lie anywhere."""
 
 
 def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> MarkerlessFit:
-    """Find tool and object in the video of demonstrations.
+    """Find the tool and the object in the videos of demonstrations.
 
     Args:
         source: Demonstrations that end above an object, with video.
         camera: Name of the camera; None: the only one.
 
     Raises:
-        ValueError: There is no video, no pose, nothing moves as the arm does, or the tool is
-            not found again.
+        ValueError: The dataset has no video or no poses, nothing in the video moves like the
+            arm, or the finished tool is found in no frame.
     """
     reader = ImageReader(source.folder)
     key = camera_key(reader.cameras, camera)
@@ -153,8 +165,8 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
     _, link, fit = best
     tool, adjusted = _tool(tracks, link, fit.camera, (width, height))
     landmarks = Landmarks(tool=tool, image_size=(width, height))
-    # The place in the tool frame. A place on the wrist link lies on the axis of the last joint,
-    # so it is fixed in the tool frame, too.
+    # Convert `tool.place` from the frame of the link to the tool frame. For the wrist link, the
+    # place lies on the axis of the last joint, so it is fixed in the tool frame, too.
     place = poses[0].inverse().apply(link.pose[0].apply(torch.from_numpy(tool.place)))
     seen_by = torch.cat([adjusted[: MARKER.start], place])
     found = search.follow(landmarks, seen_by)
@@ -187,14 +199,14 @@ class _Search:
         ]
 
     def features(self) -> list[Features]:
-        """Features of the picked frames where they differ from the background image."""
+        """For each picked frame, the features of the pixels that differ from the background."""
         images = [image for rows in self._pictures(self.picked) for image in rows]
         stride = max(1, len(images) // _USUAL)
         usual = np.median(np.stack(images[::stride]), axis=0).astype(np.uint8)
         return [changed_features(image, usual) for image in images]
 
     def _pictures(self, rows: Sequence[Sequence[int]]) -> Iterator[list[np.ndarray]]:
-        """Grey images of some frames, demonstration by demonstration."""
+        """Yield the grey images of the frames `rows[k]` of each demonstration k."""
         for demo, frames in zip(self._demos, rows, strict=True):
             shown = self._reader.stream(demo.episode, self._key, frames)
             yield [as_grey(image) for _, image in shown]
@@ -202,19 +214,25 @@ class _Search:
     def follow(
         self, landmarks: Landmarks, camera: Float[Tensor, "13"]
     ) -> list[list[Finding | None]]:
-        """Tool in each frame of every demonstration; None if not found or not searched."""
+        """Find the finished tool in frames of all demonstrations.
+
+        Returns:
+            For each demonstration, the tool in each frame. None: the tool was not found, or
+            the frame was not searched.
+        """
         found: list[list[Finding | None]] = []
         stride = max(1, sum(map(len, self._demos)) // _FOLLOWED)
         for demo in self._demos:
             detector = LandmarkDetector(landmarks)
             row: list[Finding | None] = [None] * len(demo)
-            # Count back from the last frame, at which the target is learned.
+            # Count back from the last frame: the visual target is learned there.
             wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
             expected = marker_pixels(camera, _pose_of(demo))[0].numpy()
             most = 4 * _AGREES * self._size[0] / 1440
             for k, image in self._reader.stream(demo.episode, self._key, wanted):
                 seen = detector.find(image, ["tool"]).get("tool")
-                # A few points may agree by chance, but not with the motion of the arm.
+                # A few wrong matches may agree by chance, but then rarely lie where the camera
+                # and the kinematics predict the tool.
                 if seen is not None and np.linalg.norm(seen.pixel - expected[k]) < most:
                     row[k] = seen
             found.append(row)
@@ -229,7 +247,10 @@ class _Search:
     def picture(
         self, found: Sequence[Sequence[Finding | None]], objects: Sequence[Finding | None]
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """First and last image with the tool of three demonstrations, findings drawn in."""
+        """First and last image that show the tool, for up to three demonstrations (RGB).
+
+        Tool and object are drawn into the images.
+        """
         rows, smaller = [], -(-self._size[0] // _TILE)
         for demo, tools, item in list(zip(self._demos, found, objects, strict=True))[:3]:
             seen = [k for k, finding in enumerate(tools) if finding is not None] or [0]
@@ -243,11 +264,17 @@ class _Search:
         return np.vstack(rows)
 
     def object(self, camera: Float[Tensor, "13"]) -> tuple[Object, list[Finding | None]] | None:
-        """Views of the object, and its place in each demonstration; None if not found."""
+        """Find the object near the line ahead of the tool.
+
+        Returns:
+            Views of the object, and its finding in each demonstration (None: not found there).
+            None: fewer than two demonstrations show the same object.
+        """
         below = [_below(demo, camera) for demo in self._demos]
         rows = []
         for demo, line in zip(self._demos, below, strict=True):
-            # While the tool is far from the object or outside the image, nothing hides it.
+            # While the tool is far from the object or outside the image, the arm does not hide
+            # the object.
             tool = marker_pixels(camera, _pose_of(demo))[0].numpy()
             away = np.linalg.norm(tool[:, None] - line, axis=-1).min(axis=1)
             rows.append(sorted(np.argsort(away)[-_CLEAR:].tolist()))
@@ -258,15 +285,20 @@ class _Search:
 
 
 class _Tracks(NamedTuple):
-    """Features tracked through the searched frames."""
+    """Features, each with its pixels in all searched frames."""
 
     pixels: Float[np.ndarray, "tracks frames 2"]
-    """Pixels (u, v) [px]; NaN where a feature is not seen."""
+    """Pixels (u, v) of each feature [px]; NaN in frames in which the feature is not seen."""
     descriptors: UInt8[np.ndarray, "tracks 128"]
 
 
 def _tracks(features: Sequence[Features], width: int) -> _Tracks:
-    """Features of some frames, matched in all frames; only features that moved are kept."""
+    """Match the features of `_STARTS` frames in all frames; keep tracks that move.
+
+    Args:
+        features: Features of each searched frame.
+        width: Width of the images [px].
+    """
     tracks, descriptors = [], []
     starts = np.unique(np.linspace(0, len(features) - 1, _STARTS).astype(int))
     for start in starts:
@@ -290,7 +322,10 @@ def _tracks(features: Sequence[Features], width: int) -> _Tracks:
 def _cameras(
     tracks: _Tracks, links: Sequence[_Link], image_size: tuple[int, int]
 ) -> Iterator[CameraFit]:
-    """Cameras fitted to single tracks, the longest first, each as a point of every link."""
+    """Fit one camera for each pair of a track and a link, as if the link carried the track.
+
+    Tracks seen in most frames come first. At most `_TRIED` tracks are used.
+    """
     pixels = tracks.pixels
     chosen: list[np.ndarray] = []
     for k in np.argsort(-np.isfinite(pixels[..., 0]).sum(1)):
@@ -310,7 +345,9 @@ def _points(
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " tracks"]]:
     """Point of each track in the frame of a link [m], and True if it moves with the link.
 
-    Robust least squares: a camera at e sees a point m in direction d, so d x (p + T m - e) = 0.
+    With p and T the position and rotation matrix of the link, a point m of the link lies at
+    p + T m. A camera at e sees the point in direction d, so d x (p + T m - e) = 0. These
+    equations of all frames are solved for m by robust least squares.
     """
     position, turn = pose.position.numpy(), quaternion.to_matrix(pose.orientation).numpy()
     pixels = torch.from_numpy(tracks.pixels)
@@ -342,7 +379,14 @@ def _points(
 def _tool(
     tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], image_size: tuple[int, int]
 ) -> tuple[Tool, Float[Tensor, "13"]]:
-    """Tool made of the points that move with a link, and the camera adjusted to all of them."""
+    """Tool made of the points that move with a link, and the camera refined with these points.
+
+    Args:
+        tracks: Tracks of the video.
+        link: Link that carries the tool.
+        camera: Camera fitted to one of the tracks.
+        image_size: Width and height of the image [px].
+    """
     width = image_size[0]
     for reach in _CLOSER:
         points, agrees = _points(tracks, link.pose, camera, width)
@@ -357,7 +401,7 @@ def _tool(
     points = points[agrees]
     place = np.median(points, axis=0)
     if link.axis is not None:
-        # The nearest point on the axis of the last joint: this joint does not move it.
+        # Use the nearest point on the axis of the last joint: the last joint does not move it.
         origin, direction = link.axis
         place = origin + ((place - origin) @ direction) * direction
     f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
@@ -371,7 +415,7 @@ def _tool(
 
 
 def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> DemonstrationSet:
-    """Demonstrations with the tool's pose, computed from joints where it is not recorded."""
+    """Demonstrations with tool poses: recorded ones if all have them, else from the joints."""
     if all(d.position is not None and d.orientation is not None for d in demos):
         return demos
     arm = arm_of_dataset(source)
@@ -386,7 +430,7 @@ def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> Demonst
 
 
 def _poses(demos: DemonstrationSet, picked: Sequence[Sequence[int]]) -> Pose:
-    """Poses of the tool in picked frames of all demonstrations."""
+    """Poses of the tool in the picked frames of all demonstrations, as one batch (frames,)."""
     parts = [_pose_of(d)[torch.tensor(k)] for d, k in zip(demos, picked, strict=True)]
     return Pose(
         torch.cat([part.position for part in parts]),
@@ -397,7 +441,7 @@ def _poses(demos: DemonstrationSet, picked: Sequence[Sequence[int]]) -> Pose:
 def _wrist(
     source: DemonstrationSource, demos: DemonstrationSet, picked: Sequence[Sequence[int]]
 ) -> Iterator[_Link]:
-    """The link before the last joint, if arm and joint positions are known."""
+    """Yield the link before the last joint; nothing if arm or joint positions are unknown."""
     joints = [d.joint_position for d in demos]
     rows = [q[k] for q, k in zip(joints, picked, strict=True) if q is not None]
     try:
@@ -415,17 +459,19 @@ def _wrist(
 
 
 def _pose_of(demo: Demonstration) -> Pose:
+    """Poses of the tool in all frames of a demonstration, (frames,)."""
     assert demo.position is not None
     assert demo.orientation is not None
     return Pose(torch.from_numpy(demo.position), torch.from_numpy(demo.orientation))
 
 
 def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray, "points 2"]:
-    """Pixels of the line along which the tool points at the end of a demonstration."""
+    """Pixels of 16 points on the line ahead of the tool when a demonstration ends [px]."""
     end = _pose_of(demo)[-1]
     depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)[:, None]
     points = end.position + depth * quaternion.to_matrix(end.orientation)[:, 2]
-    # With the marker at the origin of the tool frame, poses at the points give their pixels.
+    # `marker_pixels` projects a marker on the tool. A marker at the origin of the tool frame
+    # and poses at the points give the pixels of the points.
     bare = torch.cat([camera[:10], camera.new_zeros(3)])
     pixels, _ = marker_pixels(bare, Pose(points, end.orientation.expand(len(depth), 4)))
     return pixels.numpy()
@@ -434,12 +480,22 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
 def _common_object(
     seen: Sequence[Features], lines: Sequence[Float[np.ndarray, "points 2"]], width: int
 ) -> tuple[Object, list[Finding | None]] | None:
-    """Object of the view that most others match near where their motion ends."""
+    """Object that most demonstrations show near the line ahead of the tool at their end.
+
+    Args:
+        seen: Features of each demonstration that may belong to the object.
+        lines: Pixels of the line ahead of the tool at the end of each demonstration [px].
+        width: Width of the images [px].
+
+    Returns:
+        The object, and its finding in each demonstration (None: not found there). None: fewer
+        than two demonstrations show the same object.
+    """
     rows: list[list[Finding | None]] = []
     for features, line in zip(seen, lines, strict=True):
         first = replace(features, pixels=features.pixels - line[len(line) // 2])
         found = [match_view(first, other, width) for other in seen]
-        # The object lies near the line ahead of the tool.
+        # Drop findings far from the line ahead of the tool.
         near = [
             f if f and np.linalg.norm(end - f.pixel, axis=1).min() < ASIDE * width else None
             for f, end in zip(found, lines, strict=True)
@@ -462,7 +518,7 @@ def _described(
     tools: Sequence[Sequence[Finding | None]],
     objects: Sequence[Finding | None],
 ) -> DemonstrationSet:
-    """Demonstrations with the findings in the columns that markers would give."""
+    """Demonstrations with the findings in the columns that detected markers would fill."""
     result = []
     for demo, found, item in zip(demos, tools, objects, strict=True):
         visible = np.array([f is not None for f in found])

@@ -1,4 +1,8 @@
-"""Choice of the model that predicts held-out demonstrations best; see `dmp.learned_motion`."""
+"""Choose the model that predicts held-out demonstrations best (see `dmp.learned_motion`).
+
+A model predicts a motion from its context: values known before the motion, by default its
+start and goal.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +21,9 @@ from hrc_learn.learning.primitive_fitting import FittedPrimitives, Motions, load
 from hrc_learn.store import read_json, write_json
 
 CHOICE = "prediction.json"
-"""File in a model's folder that names the model of each channel."""
+"""File in a model's folder that names the best kind of model for each channel."""
 LEARNED = "learned"
-"""Folder of the best models."""
+"""Subfolder of the best models."""
 LINEAR = ("joint", "position")
 """Channels whose models are compared."""
 
@@ -29,9 +33,9 @@ class _Choice:
     """Content of the file `CHOICE`."""
 
     models: dict[str, Kind]
-    """Best model by channel."""
+    """Kind of the best model, by channel."""
     context: tuple[str, ...]
-    """Columns whose first row is the context."""
+    """Columns whose first row is the context; empty: start and goal are the context."""
 
 
 def contexts(
@@ -73,7 +77,7 @@ def keep_best(
     *,
     regression_only: bool = False,
 ) -> dict[str, float]:
-    """Compare models, and save the best one of each channel.
+    """Compare models, and save the best one for each channel.
 
     Args:
         fitted: Primitives of the demonstrations.
@@ -83,8 +87,8 @@ def keep_best(
         regression_only: True to choose only among regressions on the context.
 
     Returns:
-        Median held-out errors, `held_out_CHANNEL_MODEL_nrmse_median`, of the best model of each
-        kind.
+        Median held-out error of the best model of each kind, by the name
+        `held_out_CHANNEL_KIND_nrmse_median`.
 
     Raises:
         ValueError: A demonstration lacks a column or, with `regression_only`, there is no
@@ -112,7 +116,7 @@ def keep_best(
 
 
 def best_models(folder: Path) -> dict[str, str]:
-    """Kind of the best model of each channel; channels for which the mean is best are left out.
+    """Kind of the best model by channel, without the channels for which the mean is best.
 
     Raises:
         ValueError: The file is damaged.
@@ -131,7 +135,7 @@ def predict(folder: Path, channel: str, motions: Motions, demos: DemonstrationSe
     """Motions that the best model predicts from context, start, goal and duration.
 
     Args:
-        folder: Folder of `hrc fit`.
+        folder: Folder written by `hrc fit`.
         channel: Channel to predict.
         motions: Padded demonstrations.
         demos: The same demonstrations, with the columns of the context.
@@ -153,8 +157,8 @@ def predicted_primitive(
 ) -> JointDMP:
     """Primitive that the best model predicts for one start and goal.
 
-    It is the mean primitive if no model was chosen, or if the model's context is not start and
-    goal.
+    If no model was chosen, or its context is not start and goal, the result is the mean
+    primitive.
 
     Raises:
         FileNotFoundError: The folder holds no model.

@@ -1,4 +1,4 @@
-"""Motion of a fitted model to a goal, in its own coordinates or on an arm within its limits."""
+"""Play a fitted model to a goal: in the model's own coordinates, or on an arm in its limits."""
 
 from __future__ import annotations
 
@@ -24,16 +24,19 @@ from hrc_learn.learning.model_choice import predicted_primitive
 DT = 0.02
 """Time between samples [s]."""
 _DEVIATION = 2e-3
-"""Largest distance of the motion from the planned path [rad]: 1 mm at a lever of 0.5 m."""
+"""Largest distance of a joint from the planned path [rad]: 1 mm at a lever of 0.5 m."""
 _KINDS = "velocity", "acceleration"
 """Limits checked on the planned path; the motion filter enforces the jerk limit."""
+# `_SLOWER`: factor on the duration if the jerk limit distorts the path. `_ATTEMPTS`: durations
+# tried.
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
-"""Longest time after the end of the path for the motion to settle there [s]."""
+"""Longest time that a motion may take to settle after the end of its path [s]."""
 _TURNS = 30
-"""Steps towards an orientation that an arm of fewer than six joints may not reach."""
+"""Steps of inverse kinematics that turn an arm of fewer than six joints to an orientation,
+which the arm may not reach."""
 _MISSED = 1e-3
-"""Error that counts as out of reach [m, rad]."""
+"""Smallest error of a pose that counts as out of reach [m, rad]."""
 
 
 class BeyondLimitsError(RuntimeError):
@@ -53,7 +56,8 @@ class PlayedMotion:
     orientation: Float[np.ndarray, "samples 4"] | None = None
     """Unit quaternions (w, x, y, z)."""
     planned_duration: float
-    """Requested duration [s]; the motion takes longer if the limits require it."""
+    """Requested duration [s]; the motion takes longer if the arm's limits require a longer one.
+    """
     slowed_by: str = ""
     """First limit that made the motion slower; empty if none did."""
     goal_errors: Mapping[str, float]
@@ -70,12 +74,13 @@ def play_path(
 
     Args:
         model: The model.
-        start: Start; None: the model's.
+        start: Start; None: the model's start.
         goal: Goal.
-        duration: Duration [s]; None: the model's.
+        duration: Duration [s]; None: the model's duration.
 
     Raises:
-        ValueError: The model has no primitive for such a goal, or the start is of another kind.
+        ValueError: The model has no primitive for such a goal, or only one of start and goal is
+            given in joints.
     """
     kind = "joint" if goal.joints is not None else "pose"
     if kind == "pose" and model.pose is None:
@@ -122,9 +127,9 @@ def play_on_arm(
     Args:
         model: The model.
         robot: The arm, from `arm_for`.
-        start: Start; None: the model's.
+        start: Start; None: the model's start.
         goal: Goal.
-        duration: Duration [s]; None: the model's.
+        duration: Duration [s]; None: the model's duration.
 
     Raises:
         ValueError: The model's joint unit has no fixed size.
@@ -171,9 +176,9 @@ def play_on_arm(
 def _planner(
     model: FittedModel, robot: Arm, start: Target | None, goal: Target
 ) -> tuple[str, Callable[[float], Float[Tensor, "samples joints"]]]:
-    """Channel that plans the motion, and its function from duration [s] to joint path [rad].
+    """Channel that plans the motion, and a function that maps duration [s] to joint path [rad].
 
-    The joints follow the tool's primitive by inverse kinematics, or their own primitive.
+    The path follows the tool's primitive by inverse kinematics, or else the joints' primitive.
     """
     tool = "pose" if model.pose is not None else "position"
     if goal.joints is None and tool in model.primitives:
@@ -211,7 +216,7 @@ def _times(duration: float) -> Float[Tensor, " samples"]:
 def _joint_path(
     model: FittedModel, start: Tensor | None, goal: Tensor, duration: float
 ) -> Float[Tensor, "samples joints"]:
-    """Joint positions from rest in the model's unit, by the model that predicts best."""
+    """Joint positions, starting at rest, that the best model predicts, in the model's unit."""
     joint = model.joint
     assert joint is not None
     start = joint.start if start is None else start
@@ -222,7 +227,7 @@ def _joint_path(
 
 @torch.no_grad()
 def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration: float) -> Pose:
-    """Poses of the end effector; a model of positions keeps the goal's orientation."""
+    """Poses of the end effector from rest; a model of positions has the goal's orientation."""
     time, pose = _times(duration), model.pose
     assert goal.position is not None
     if pose is None:
@@ -239,6 +244,7 @@ def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration:
 
 
 def _completed(target: Target | None, usual: Pose) -> Pose:
+    """Pose of a target; what the target does not give is taken from the usual pose."""
     if target is None or target.position is None:
         return usual
     turned = usual.orientation if target.orientation is None else target.orientation
@@ -249,7 +255,7 @@ def _completed(target: Target | None, usual: Pose) -> Pose:
 def _joints_along(
     model: FittedModel, robot: Arm, first: Tensor, goal: Target, duration: float
 ) -> Float[Tensor, "samples joints"]:
-    """Joint positions [rad] along the model's poses, from the joints at the start.
+    """Joint positions [rad] along the model's poses, starting at the joints `first` [rad].
 
     In the null space, the arm moves towards the model's joints at its goal; an arm of fewer
     than six joints moves towards joints that turn the tool to the goal's orientation.
@@ -299,7 +305,7 @@ def _first_joints(model: FittedModel, robot: Arm, start: Target | None) -> Tenso
 def _joints_at(
     model: FittedModel, robot: Arm, target: Target | None, near: Tensor, usual: Pose
 ) -> Float[Tensor, " joints"]:
-    """Joint positions [rad] that reach a pose, near given ones.
+    """Joint positions [rad] that reach a target, near the joint positions `near` [rad].
 
     An arm of fewer than six joints reaches the position, and the orientation as far as it can.
     """
@@ -331,7 +337,7 @@ def _require_range(robot: Arm, path: Float[Tensor, "samples joints"]) -> None:
 def _within_limits(
     robot: Arm, path: Float[Tensor, "samples joints"]
 ) -> Float[np.ndarray, "moments joints"]:
-    """Motion along a path within all limits, from rest to rest."""
+    """Motion along a path within all limits, from rest to rest, sampled every `DT` [rad]."""
     names = ("velocity", "acceleration", "jerk", "lower", "upper")
     limits = {name: getattr(robot.limits, name).double().numpy() for name in names}
     smoother, state = MotionFilter(DT, **limits), MotionState.moving(path[0].numpy())
@@ -350,14 +356,14 @@ def _within_limits(
 def _distance(
     joints: Float[np.ndarray, "moments joints"], path: Float[Tensor, "samples joints"]
 ) -> float:
-    """Largest distance of a motion from a path, regardless of time [rad]."""
+    """Largest distance of any joint of a motion from a path, regardless of time [rad]."""
     between = torch.linspace(0, 1, 5, dtype=path.dtype)[:-1, None, None]
     fine = torch.cat([torch.lerp(path[:-1], path[1:], between).flatten(0, 1), path[-1:]])
     return float(torch.cdist(torch.from_numpy(joints), fine, p=torch.inf).amin(1).max())
 
 
 def _pose_errors(pose: Pose, goal: Target) -> dict[str, float]:
-    """Distance and angle between the last pose and the goal."""
+    """Distance [mm] and angle [deg] between the last pose and the goal, by name."""
     errors = {}
     if goal.position is not None:
         apart = (pose.position[-1] - goal.position).norm()

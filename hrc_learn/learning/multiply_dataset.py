@@ -1,8 +1,8 @@
-"""Episodes of new motions, with the columns of the demonstrations they were made from.
+"""Write new motions as episodes that have the same columns as the original demonstrations.
 
 Columns whose meaning is known (joints, commands, tool, gripper, objects) get the values of the
-new motion; all others are copied from the demonstration at corresponding frames. Every episode
-stores its provenance, so that an interrupted job continues where it stopped.
+new motion. All other columns are copied from corresponding frames of a demonstration. Every
+episode stores its provenance, so that an interrupted job continues where it stopped.
 """
 
 import re
@@ -29,22 +29,23 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm
 from hrc_learn.store import Claim, json_text, parse_json
 
-# Names of the components of an object's pose: NAME.x, NAME.y, NAME.z, and its orientation.
+# Names of the components of an object's pose: NAME.x, NAME.y and NAME.z, and likewise wx to wz
+# of a rotation vector or qw to qz of a quaternion.
 _AXES = re.compile(r"(?P<name>.+?)[._](?P<axis>[xyz]|w[xyz]|q[wxyz])(?:[._]pos)?$")
 _POSE = ("x", "y", "z", "wx", "wy", "wz", "qw", "qx", "qy", "qz")
 _JOINTS = ("joint_position", "joint_velocity", "command_position", "command_velocity")
 _TOOL = ("position", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw")
-# Quantities that a new motion does not have: images, forces, and the recorder's own clock.
+# Quantities that a new motion does not have: image features, efforts, and the recorder's clock.
 _LEFT_OUT = ("feature", "feature_visible", "human_effort", "joint_effort", "time")
-# Largest number of distinct values of a switch column; switches are not interpolated.
+# A column with at most this many distinct values is a switch, which is not interpolated.
 _LEVELS = 5
 
 type Place = tuple[str, int]
-"""Feature of a component, and its index there."""
+"""Place of one number in a frame: name of a feature, and index within this feature."""
 
 
 class MultipliedColumns:
-    """Columns of new episodes.
+    """Makes the columns of new episodes from a motion and the original demonstrations.
 
     Attributes:
         features: Features of the new dataset, without LeRobot's index columns.
@@ -64,7 +65,8 @@ class MultipliedColumns:
             source: Demonstrations.
             taught: Arm of the demonstrations.
             robot: Arm of the new motions.
-            objects: Columns of objects that names do not reveal, as FEATURE[FIRST:LAST].
+            objects: By name of an object, the columns of its pose as FEATURE[FIRST:LAST]; only
+                needed where the names of the columns do not reveal them.
 
         Raises:
             ValueError: Columns in `objects` do not exist, or do not form a pose.
@@ -88,7 +90,8 @@ class MultipliedColumns:
             self._places[f"object {name}"] = places
             first = np.stack([self._first(places, main) for main in range(len(source))])
             self.objects[name] = pose_of(torch.from_numpy(first))
-        # A command of the tool is its next pose, as LeRobot's robots expect.
+        # The commanded tool pose of a frame is the tool pose of the next frame, as LeRobot's
+        # robots expect.
         shown = {
             self._old[k].component(i): (r, n)
             for r in _TOOL
@@ -111,7 +114,7 @@ class MultipliedColumns:
             self.features[key] = content
 
     def _object_columns(self, given: Mapping[str, str]) -> dict[str, list[Place]]:
-        """Components of the pose of each object."""
+        """Places of the numbers of each object's pose, by name of the object."""
         taken = {place for places in self._places.values() for place in places}
         found: dict[str, dict[str, Place]] = {}
         for key, feature in self._old.items():
@@ -135,7 +138,7 @@ class MultipliedColumns:
         return np.array([float(self._frames[main][key][0, i]) for key, i in places])
 
     def _rename(self, names: dict[str, np.ndarray]) -> None:
-        """Replace the joint names by those of another arm."""
+        """Replace the demonstrated arm's joint names, in place, by those of the new arm."""
         old, new = self._taught.arm.joint_names[0], self._robot.joint_names
         patterns = {}
         for role in filter(self._places.__contains__, _JOINTS):
@@ -147,8 +150,9 @@ class MultipliedColumns:
     def _put_joints(
         self, made: dict[str, np.ndarray], values: Mapping[str, np.ndarray]
     ) -> None:
-        """Replace the demonstrated joints by those of the new motions."""
-        # The last columns first, since the number of joints may change.
+        """Replace the joint columns, in place, by the values of the new arm, by role."""
+        # Begin with the last columns: the number of joints may change, which shifts columns
+        # further back.
         for role in sorted(values, key=lambda role: self._places[role][0], reverse=True):
             key, columns = self._places[role][0][0], [i for _, i in self._places[role]]
             if self._same:
@@ -158,7 +162,12 @@ class MultipliedColumns:
             made[key] = np.insert(np.delete(made[key], columns, 1), at, values[role], axis=1)
 
     def gripper(self, main: int, phase: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-        """Commanded opening of the gripper, or the measured one if none was commanded."""
+        """Opening of the gripper in a demonstration: commanded, else measured, else zero.
+
+        Args:
+            main: Index of the demonstration.
+            phase: Fractional frames of the demonstration.
+        """
         commands = [
             (key, i)
             for key, feature in self._old.items()
@@ -172,7 +181,7 @@ class MultipliedColumns:
     def _along(
         self, main: int, key: str, phase: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T _components"]:
-        """Columns of a demonstration at fractional frames; switches are not interpolated."""
+        """A feature of a demonstration at fractional frames; switches are not interpolated."""
         values, made = self._frames[main][key].astype(float), []
         for column in values.T:
             smooth = len(np.unique(column)) > _LEVELS
@@ -196,8 +205,8 @@ class MultipliedColumns:
             phase: Fractional frame of that demonstration for each new frame.
             joints: Joint positions [rad].
             sent: Commanded joint positions [rad].
-            gripper: Measured opening; None: that of the demonstration.
-            objects: Pose of each object.
+            gripper: Measured opening of the gripper; None: copied from the demonstration.
+            objects: Pose of each object over time: position [m] and quaternion (w, x, y, z).
         """
         tool = self._robot.forward(torch.from_numpy(joints))
         made = {key: self._along(main, key, phase) for key in self._old}
@@ -227,20 +236,31 @@ class MultipliedColumns:
     def _pose_columns(
         self, role: str, pose: Pose, main: int, of: str = ""
     ) -> Float[np.ndarray, "T _numbers"]:
-        """Poses of the tool or of an object in the representation of a role."""
+        """Numbers of the poses of the tool or of an object, in the representation of a role.
+
+        Args:
+            role: One of `_TOOL`.
+            pose: Poses over time, (T,).
+            main: Index of the demonstration.
+            of: Role of an object; empty for the tool.
+        """
         if role == "position":
             return pose.position.numpy()
         q = quaternion.continuous(pose.orientation)
         if role != "rotation_vector":
             return q.numpy() if role == "quaternion_wxyz" else q.roll(-1, -1).numpy()
-        # Continue from the demonstration's rotation vector: at half a turn there are two.
+        # Near half a turn, two rotation vectors describe one orientation: choose the one close
+        # to the first vector of the demonstration.
         places = self._places.get(of, ())[3:6] if of else self._places.get(role, ())
         near = torch.from_numpy(self._first(places, main) if len(places) == 3 else np.zeros(3))
         vectors = torch.cat([near[None], quaternion.log(q)])
         return quaternion.unwrap_log(vectors)[1:].numpy()
 
     def _on_disk(self, role: str, values: np.ndarray) -> np.ndarray:
-        """Joint values in the dataset's convention; the inverse of `DatasetArm.positions`."""
+        """Convert joint values [rad] to the dataset's units, zeros and directions.
+
+        This is the inverse of `DatasetArm.positions`.
+        """
         count = max(self._made.columns) + 1
         zero, one = self._made.positions(np.stack([np.zeros(count), np.ones(count)]))
         if role.endswith("position"):
@@ -253,7 +273,7 @@ class MultipliedColumns:
 
 
 def pose_of(values: Float[torch.Tensor, "*batch numbers"]) -> Pose:
-    """Pose from a position alone, with a rotation vector, or with a quaternion."""
+    """Pose from a position (3 numbers), alone or with rotation vector (6) or quaternion (7)."""
     turned = values[..., 3:]
     if turned.shape[-1] == 4:
         return Pose(values[..., :3], quaternion.normalize(turned))
@@ -262,7 +282,7 @@ def pose_of(values: Float[torch.Tensor, "*batch numbers"]) -> Pose:
 
 
 class MultipliedWriter:
-    """Writer of episodes that continues where an interrupted one stopped.
+    """Writes episodes, and continues an interrupted recording where it stopped.
 
     Attributes:
         provenance: Provenance of each episode written so far.
@@ -276,11 +296,11 @@ class MultipliedWriter:
         source: DemonstrationSource,
         made_by: Mapping[str, Any],
     ):
-        """Prepare the description of the dataset; `claimed` begins to write.
+        """Prepare the description of the dataset; nothing is written before `claimed`.
 
         Args:
             root: Folder of the dataset.
-            robot_type: Robot of the new episodes.
+            robot_type: LeRobot's name for the robot of the new episodes.
             columns: Columns of the new episodes.
             source: Demonstrations.
             made_by: Settings of the job; an interrupted recording with the same settings is
@@ -308,11 +328,11 @@ class MultipliedWriter:
 
     @contextmanager
     def claimed(self) -> Iterator[None]:
-        """Claim the folder, continue an interrupted recording, complete the dataset at the end.
+        """Lock the folder and begin or continue the recording; on exit, complete the dataset.
 
         Raises:
             BusyError: Another process writes to the folder.
-            FileExistsError: The folder holds something else.
+            FileExistsError: The folder exists, or an interrupted recording has other settings.
         """
         self.root.parent.mkdir(parents=True, exist_ok=True)
         with Claim(self.root) as claim:
@@ -329,6 +349,7 @@ class MultipliedWriter:
             finish(self.root, claim)
 
     def _continue(self) -> None:
+        """Count the episodes of an interrupted recording."""
         for path in recorded.staged_paths(self._staging):
             staged, table = recorded.read_episode(path)
             if staged.header.sidecar.details != self.header.sidecar.details:
@@ -346,7 +367,7 @@ class MultipliedWriter:
     def write(
         self, values: Mapping[str, np.ndarray], task: str, provenance: Mapping[str, Any]
     ) -> None:
-        """Write one episode; it is on disk when this returns."""
+        """Write one episode to disk before the method returns."""
         path = recorded.episode_path(self._staging, len(self.provenance))
         frames = len(next(iter(values.values())))
         index = np.full(frames, self._tasks.get(task, len(self._tasks)))

@@ -1,11 +1,12 @@
-"""New motions from a few demonstrations: object-centred segments, joined in new scenes.
+"""Make many new motions of an arm from a few demonstrations, for scenes with moved objects.
 
-A demonstration is cut where the gripper begins to move. Each segment becomes a pose primitive
-in the frame in which its ends agree best over the demonstrations: an object's frame, a frame at
-the object that does not turn with it, or the base frame. In a new scene, the primitives of the
-demonstrations are mixed and move with their frames. Each segment begins with the final pose and
-velocity of the previous one, and joins its own path along a minimum-jerk curve, over the part
-in which the demonstrations still differ.
+Each demonstration is cut into segments where the gripper begins to move. A segment becomes a
+pose primitive in the frame in which the segment's final poses agree best over the
+demonstrations: an object's frame, a frame at the object that does not turn with the object, or
+the base frame. In a new scene, the primitives of all demonstrations are averaged with random
+weights, and move with their frames. A segment begins with the final pose and velocity of the
+previous segment. Over the part in which the demonstrations still differ, it joins its own path
+along a minimum-jerk curve.
 """
 
 from __future__ import annotations
@@ -31,22 +32,25 @@ BASE, POSITION_ONLY = "base", " position"
 """Name of the base frame, and suffix for a frame at an object that does not turn with it."""
 # Smallest number of frames of a segment: fewer do not determine a primitive.
 _SHORTEST = 6
-# A gripper signal switches only if its range exceeds this fraction of its largest value, and
-# moves while its steps between frames exceed this fraction of its range.
+# `_CONSTANT`: a gripper signal counts as constant if its range is at most this fraction of its
+# largest value. `_MOVING`: the gripper moves while the change from frame to frame exceeds this
+# fraction of the range.
 _CONSTANT, _MOVING = 0.05, 0.02
-# Lever that converts angles to lengths [m/rad], and tremor of a hand [m]: a frame with at most
-# 1.5 times the least spread plus the tremor is preferred if it is nearer.
+# `_LEVER`: lever that converts angles to lengths [m/rad]. `_TREMOR`: tremor of a hand [m], a
+# difference between demonstrations that does not count.
 _LEVER, _TREMOR = 0.1, 1e-3
-# Frames per basis function, and smallest and largest number of basis functions.
+# `_PER_FUNCTION`: frames per basis function. `_FEWEST`, `_MOST`: smallest and largest number of
+# basis functions.
 _PER_FUNCTION, _FEWEST, _MOST = 3, 8, 50
-# Number of times at which demonstrations are compared, and their `_free_fraction` if they do
-# not differ.
+# `_COMPARED`: number of times at which demonstrations are compared. `_USUALLY_FREE`: result of
+# `_free_fraction` if the demonstrations do not differ.
 _COMPARED, _USUALLY_FREE = 50, 0.6
 # Iterations of inverse kinematics from the initial posture to the first pose of a path.
 _FIRST = 12
 # Largest error of inverse kinematics: 1 mm or 1 mrad.
 _REACHED = 1e-3
-# Speed of a motion relative to the fastest one within the limits, and attempts to slow it down.
+# `_USABLE`: largest speed of a motion, relative to the fastest speed within the arm's limits.
+# `_SLOWER`: largest number of times that a motion beyond the limits is slowed down.
 _USABLE, _SLOWER = 0.975, 3
 # Largest factor by which one attempt slows a motion down.
 _JUMP = 3.0
@@ -62,10 +66,10 @@ class Segmentation:
     """Frame of each segment: "base", an object, or "OBJECT position" for a frame at the object
     that does not turn with it."""
     cuts: dict[int, tuple[int, ...]]
-    """First frame of each segment and last frame of the last one, by episode."""
+    """By episode: first frame of each segment, then the last frame of the last segment."""
 
     def rows(self, demos: Sequence[Demonstration]) -> list[tuple[str, ...]]:
-        """Table of the segments with its header: frame, and times by episode [s]."""
+        """Table of the segments, with a header: frame of each segment, times by episode [s]."""
         header = ("segment", "frame", *(f"episode {demo.episode}" for demo in demos))
         rows: list[tuple[str, ...]] = [header]
         for k, frame in enumerate(self.frames):
@@ -77,9 +81,10 @@ class Segmentation:
         """Check that the segments fit the demonstrations.
 
         Raises:
-            ValueError: A frame or an episode is unknown, or cuts do not increase.
+            ValueError: There is no frame, a frame or an episode is unknown, or cuts are too
+                close or beyond the end of an episode.
         """
-        for frame in self.frames or [""]:  # no frame is unknown, too
+        for frame in self.frames or [""]:  # an empty list of frames fails, too
             if frame != BASE and frame.removesuffix(POSITION_ONLY) not in objects:
                 known = ", ".join([BASE, *objects])
                 raise ValueError(f"segments: no frame {frame!r}; there are {known}")
@@ -137,7 +142,13 @@ def find_segments(
 
 
 def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> list[int]:
-    """Frames at which a two-level signal begins to change its level."""
+    """Frames at which the gripper begins to change between closed and open.
+
+    Args:
+        values: Opening of the gripper in one demonstration.
+        low: Smallest opening in all demonstrations.
+        high: Largest opening in all demonstrations.
+    """
     if high - low <= _CONSTANT * max(abs(low), abs(high)):
         return []
     level = (values - low) / (high - low)
@@ -151,7 +162,11 @@ def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> 
 
 
 def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
-    """Frame in which the ends of all demonstrations agree; of several, the nearest one."""
+    """Name of the frame in which a segment's final poses agree over the demonstrations.
+
+    Frames whose spread is at most 1.5 times the least spread, plus the tremor, are as good as
+    the best frame. The nearest of these frames is chosen.
+    """
     names = [*objects, *(f"{name}{POSITION_ONLY}" for name in objects), BASE]
     spread: dict[str, float] = {}
     distance: dict[str, float] = {}
@@ -162,12 +177,12 @@ def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
         spread[name] = float((apart[:3].sum() + _LEVER**2 * apart[3:].sum()).sqrt())
         distance[name] = math.inf if name == BASE else float(local.position.norm(dim=-1).mean())
     good = [name for name in names if spread[name] <= 1.5 * min(spread.values()) + _TREMOR]
-    # Of equally near frames the first: an object's own frame before its position-only frame.
+    # If two frames are equally near, an object's own frame precedes its position-only frame.
     return min(good, key=lambda name: round(distance[name], 6))
 
 
 def frame_of(objects: Mapping[str, Pose], name: str, like: Pose) -> Pose:
-    """Pose of a frame in the base frame, for each element of a batch of poses."""
+    """Poses of the frame `name` in the base frame; the base frame gets the batch of `like`."""
     still = torch.zeros_like(like.orientation)
     still[..., 0] = 1.0
     if name == BASE:
@@ -203,7 +218,8 @@ class NewMotion:
     joints: Float[Tensor, "T joints"]
     """Joint positions [rad]."""
     phase: Float[Tensor, "T"]
-    """Fractional frame of the main demonstration that corresponds to each frame."""
+    """For each frame of the motion, the corresponding fractional frame of the main
+    demonstration."""
     source: int
     """Index of the main demonstration, the one with the largest weight."""
     reason: str
@@ -217,14 +233,17 @@ class _Poses:
     pose: Pose
     """Poses in the base frame, (B, T)."""
     body: Float[Tensor, "B T joints"] | None
-    """Joint positions of the demonstrated posture [rad]; None for another arm."""
+    """Joint positions of the demonstrated posture [rad]; None if another arm was
+    demonstrated."""
     phase: Float[Tensor, "B T"]
+    """Fractional frame of the main demonstration (see `NewMotion`)."""
     length: Int[Tensor, "B"]
+    """Number of samples of each motion, without the padding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Segment:
-    """One segment of all demonstrations in its frame."""
+    """The same segment of all demonstrations, given in the segment's frame."""
 
     frame: str
     dmp: PoseDMP
@@ -233,7 +252,7 @@ class _Segment:
     last: Float[Tensor, "n"]
 
     def span(self, main: Int[Tensor, "B"]) -> Float[Tensor, "2 B 1"]:
-        """First frame and number of further frames of the segment in main demonstrations."""
+        """First frame of the segment and number of frames after it, by main demonstration."""
         return torch.stack([self.first, self.last - self.first])[:, main, None]
 
     def mixed(self, weights: Float[Tensor, "B n"], speed: Float[Tensor, "B"]) -> PoseDMP:
@@ -259,7 +278,8 @@ def _turned(frame: Pose, twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
 def _free_fraction(dmp: PoseDMP) -> float:
     """Fraction of a segment after which the demonstrations agree in its frame.
 
-    Until then the demonstrations come from different places, so a new motion may do so, too.
+    Before that, the demonstrations come from different positions, so a new motion may come from
+    yet another position.
     """
     s = torch.linspace(0, 1, _COMPARED, dtype=torch.float64)
     position = dmp.rollout(s * dmp.duration[:, None]).position
@@ -282,7 +302,7 @@ class MotionSource:
     """Joint positions near the first pose [rad]."""
     segments: tuple[_Segment, ...] = field(repr=False)
     obstacles: Float[Tensor, "boxes 6"]
-    """Centre and half edges of boxes to keep clear of [m]."""
+    """Boxes to avoid: centre and half edges [m]."""
 
     @classmethod
     def fit(
@@ -303,10 +323,10 @@ class MotionSource:
             objects: Poses of each object at the start of each demonstration, (n).
             segmentation: Segments and their frames.
             robot: Arm of the new motions.
-            near: Joint positions along each demonstration [rad] if the same arm was
-                demonstrated, whose posture is then kept; else joint positions near the first
-                pose.
-            obstacles: Boxes that the arm keeps clear of.
+            near: Joint positions along each demonstration [rad] if `robot` was demonstrated:
+                the new motions keep the demonstrated posture. Else joint positions near the
+                first pose [rad].
+            obstacles: Boxes to avoid: centre and half edges [m].
 
         Raises:
             ValueError: The segmentation does not fit the demonstrations.
@@ -354,9 +374,9 @@ class MotionSource:
             poses = self.poses(part)
             q, missed = self._joint_paths(part, poses)
             factor, limit = self.robot.limits.excess(q, 1 / self.fps)
-            # Joints of a motion that does not reach its poses may jump at any speed.
+            # The joints of a motion that does not reach its poses may jump, whatever its speed.
             factor = (factor / _USABLE).clamp(max=_JUMP)
-            # A motion that misses its poses is retried once, slower: its joints then jump less.
+            # Such a motion is slowed down and retried only once.
             again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
             where = self._collisions(q[~again])
             for k in (~again).nonzero()[:, 0].tolist():
@@ -419,7 +439,11 @@ class MotionSource:
     def _joint_paths(
         self, draws: Draws, poses: _Poses
     ) -> tuple[Float[Tensor, "B T joints"], Float[Tensor, "B"]]:
-        """Joint positions near the demonstrated posture, and errors (0 if small enough)."""
+        """Joint positions along the poses [rad], and the largest error of each motion.
+
+        The joints stay near the demonstrated posture. An error of at most `_REACHED` is
+        returned as 0.
+        """
         order = torch.arange(-_FIRST, poses.phase.shape[1]).clamp(min=0)
         path, wish, start = poses.pose[:, order], None, self.near[draws.weights.argmax(-1)]
         if poses.body is not None:
@@ -435,7 +459,7 @@ class MotionSource:
         return q, torch.where(worst > _REACHED, worst, 0.0)
 
     def _collisions(self, q: Float[Tensor, "B T joints"]) -> list[str]:
-        """Collision of each motion with the arm itself or a box, as text; empty if clear."""
+        """For each motion, its collision with the arm itself or a box in words; empty: none."""
         q, (centre, half) = q[:, ::_CHECKED], self.obstacles.split(3, dim=-1)
         frames = self.robot.link_frames(q)
         hit = (self.robot.whole.self_distance(q, frames) < 0).any(-1)

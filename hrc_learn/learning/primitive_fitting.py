@@ -1,4 +1,8 @@
-"""Movement primitives of demonstrations by channel: one for each, their mean, streamed fits."""
+"""Fit movement primitives to demonstrations: one to each demonstration, and their mean.
+
+The primitives are fitted by channel: joints, position, orientation or pose of the end effector.
+A dataset too large for memory is sampled, or streamed into one common primitive.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +43,7 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "orientation": ("orientation",),
     "pose": ("position", "orientation"),
 }
-"""Columns that each channel is learned from."""
+"""Columns from which each channel is learned."""
 CLASSES = {
     "joint": JointDMP,
     "position": JointDMP,
@@ -47,17 +51,18 @@ CLASSES = {
     "pose": PoseDMP,
 }
 EACH = "each"
-"""Folder of the primitives of single demonstrations."""
+"""Subfolder of a model for the primitives of single demonstrations."""
 _APPROACH = 0.6
 """Fraction of a motion that adapts to a new goal; the rest, such as an insertion, keeps its
 shape."""
 _LEAST_MOTION = 1e-4
 """Smallest motion above the noise of encoders and trackers [rad, m, quaternion components]."""
 HELD_AT_ONCE = 700_000
-"""Largest number of values of a channel in memory: padded frames times joints, or times 7 for a
-pose. Their fit and the comparison of models take up to 300 MB."""
+"""Largest number of values of a channel in memory: demonstrations times frames of the longest
+one times columns (joints, at least the 7 of a pose). Fitting them and comparing models takes up
+to 300 MB."""
 LONGEST = 5_000
-"""Largest number of frames of one demonstration; enough for 100 basis functions."""
+"""Largest number of frames of a demonstration in a sample; enough for 100 basis functions."""
 
 
 def require_motion(demo: Demonstration, source: str) -> None:
@@ -83,7 +88,7 @@ class Motions:
     joint_names: tuple[str, ...]
     source: str
     joint_unit: str = "rad"
-    """Unit of the joint positions, "1" for fractions of the joints' ranges."""
+    """Unit of the joint positions; "1": fractions of the joints' ranges."""
 
     @classmethod
     def of(cls, demos: DemonstrationSet) -> "Motions":
@@ -161,7 +166,11 @@ class Motions:
 
     @torch.no_grad()
     def adapted(self, channel: str, primitive: Primitive) -> Any:
-        """Motion of a common primitive with start, goal and duration of each demonstration."""
+        """Motions of a common primitive, adapted to each demonstration.
+
+        Each motion has the start, goal and duration of its demonstration, and the same time
+        stamps.
+        """
         last = (self.demos.length - 1)[:, None]
         columns = [self.column(name) for name in CHANNELS[channel]]
         starts = [x[:, 0] for x in columns]
@@ -172,11 +181,15 @@ class Motions:
         return cast(Any, primitive).rollout(time, start, goal, lasting)
 
     def error(self, channel: str, made: Any) -> ReproductionError:
-        """Errors of reproductions of a channel at the time stamps of the demonstrations."""
+        """Errors of reproduced motions `made`, sampled at the demonstrations' time stamps."""
         return reproduction_error(self.demos, CHANNELS[channel][0], made)
 
     def _body_shape(self) -> Tensor | None:
-        """Arm angle of a Franka arm [rad], unwrapped over time and over the starts."""
+        """Arm angle of a Franka arm [rad], (demos, frames, 1); None for other arms.
+
+        The angle is continuous over time, and its first value is continuous from each
+        demonstration to the next.
+        """
         franka = {arm.joint_names: arm for arm in (panda, fr3)}
         if self.demos.joint_position is None or self.joint_names not in franka:
             return None
@@ -197,7 +210,7 @@ def load_primitive(folder: Path, channel: str) -> Primitive:
 
 
 def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Channels to learn: those given, or else joints and pose as far as they were recorded.
+    """Channels to learn: the wanted ones, or else joints and pose as far as they were recorded.
 
     Raises:
         ValueError: The demonstrations lack a column of a channel, or hold no motion at all.
@@ -247,7 +260,8 @@ class FittedPrimitives:
     def metrics(self) -> dict[str, float]:
         """Errors of the primitives, by name.
 
-        `mean_` marks the mean primitive, given start, goal and duration of each demonstration.
+        Names with `mean_` are for the mean primitive, adapted to each demonstration's start,
+        goal and duration.
         """
         count = float(len(self.motions.demos.length))
         values = {"demonstrations": count, "basis_functions": float(self.n_basis)}
@@ -331,8 +345,8 @@ def _select(
 def sampled(source: DemonstrationSource) -> DemonstrationSet:
     """All demonstrations, or an evenly spread sample of them if the dataset is too large.
 
-    In a sample, demonstrations longer than twice the median or `LONGEST` frames are thinned. A
-    note describes this.
+    In a sample, demonstrations longer than twice the median length, or than `LONGEST` frames,
+    are thinned. A note of the result describes the sample.
 
     Args:
         source: Demonstrations on disk.

@@ -24,7 +24,7 @@ class ReproductionError:
     goal_error: Float[Tensor, " demos"] | None = None
     """Distance between the last samples [rad] or [m]."""
     jerk: Float[Tensor, " demos"] | None = None
-    """Ratio of the dimensionless jerk to that of the demonstration; smoother if below 1."""
+    """Dimensionless jerk divided by the jerk of the demonstration; below 1: smoother."""
     turn_rmse: Float[Tensor, " demos"] | None = None
     """Root mean square angle between orientations [deg]."""
     turn_at_goal: Float[Tensor, " demos"] | None = None

@@ -1,4 +1,4 @@
-"""Fit of a visual servoing skill: image Jacobian, target in the image, approach."""
+"""Fit a visual servoing skill to demonstrations: image Jacobian, visual target, approach."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -38,10 +38,10 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 from hrc_learn.vision.landmarks import Landmarks
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
-"""Demonstrations in memory, or read one by one."""
+"""Demonstrations in memory, or demonstrations on disk that are read one by one."""
 
 _REST = 0.3
-"""Time at the end of a demonstration in which the end effector rests above the object [s]."""
+"""Duration of the rest above the object at the end of each demonstration [s]."""
 
 
 def fit_visual_servo(
@@ -52,16 +52,18 @@ def fit_visual_servo(
     on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
     landmarks: Landmarks | None = None,
 ) -> VisualServoSkill:
-    """Fit the image Jacobian and, if an object was observed, target and approach.
+    """Fit the image Jacobian and, if an object was observed, visual target and approach.
 
     Args:
-        demos: Demonstrations with image features and end-effector poses, or a Panda's joints.
+        demos: Demonstrations with image features, and with end-effector poses or the joint
+            positions of a Panda.
         neurons: Neurons of the network. Default: around the demonstrated poses.
-        config: Noise, prior and key-frame selection of the camera's residual.
-        learning: Settings for learning neurons, noise and prior. With None, or too few
-            demonstrations to hold one out, they are not learned.
-        on_round: Called after every round of learning.
-        landmarks: Landmarks whose pixels the demonstrations contain; None: pixels of markers.
+        config: Noise, prior and key frames for the network, which learns the residual of the
+            fitted camera.
+        learning: Settings for learning neurons, noise and prior. These are not learned if it
+            is None or there are fewer than `learning.hold_out` demonstrations.
+        on_round: Called with the number and result of each round of learning.
+        landmarks: Landmarks that gave the image features; None: markers gave them.
 
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
@@ -134,7 +136,14 @@ def _pose(demo: Demonstration) -> Pose | None:
 
 
 class _End(NamedTuple):
-    """Final state of a demonstration, at rest above the object."""
+    """End of a demonstration, at rest above the object.
+
+    Attributes:
+        object_pixel: Pixel of the object's marker, mean over the rest [px].
+        pose: Pose of the end effector at rest.
+        path: Poses of the end effector along the whole demonstration.
+        angle: Direction of the object's marker in the image [rad]; None: not recorded.
+    """
 
     object_pixel: Float[np.ndarray, "2"]
     pose: Pose
@@ -143,7 +152,7 @@ class _End(NamedTuple):
 
 
 def _ends(demos: Demonstrations) -> list[_End]:
-    """Final states of all demonstrations, or none if no object was observed."""
+    """Ends of all demonstrations; an empty list if no object was observed."""
     ends, without = [], []
     for demo in demos:
         if OBJECT_FEATURE in demo.extra:
@@ -158,7 +167,7 @@ def _ends(demos: Demonstrations) -> list[_End]:
 
 
 def _end(demo: Demonstration, source: str) -> _End:
-    """Final state of a demonstration, averaged over the rest at its end."""
+    """End of a demonstration, with positions and pixels averaged over the rest."""
     watched = _watched(demo, source)
     at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
     last = (watched.visible & at_rest).nonzero()[:, 0]
@@ -180,7 +189,9 @@ def _end(demo: Demonstration, source: str) -> _End:
 def _marker_angle(
     ends: Sequence[_End], camera: Float[Tensor, "13"], target: VisualTarget
 ) -> MarkerAngle | None:
-    """Learned direction of the object's marker; None if it was not recorded."""
+    """Turn of the end effector relative to the object's marker; None if no demonstration has
+    a direction of that marker.
+    """
     known = [end for end in ends if end.angle is not None and np.isfinite(end.angle)]
     if not known:
         return None
