@@ -1,4 +1,4 @@
-"""Visual servoing, grasping, placing, pick and place. Skills know protocols, not devices."""
+"""Skills: visual servoing, grasping, placing, pick and place. They know no device drivers."""
 
 from hrc_learn.skills.arm_motion import PositionServo as PositionServo
 from hrc_learn.skills.arm_motion import joint_line as joint_line

@@ -17,10 +17,11 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState
 from hrc_learn.skills.person_watch import PersonWatch
 
-# Mean angular speed on a straight line whose rotation takes longer than its translation
+# Mean angular speed on a straight line, if the rotation takes longer than the translation
 # [rad/s].
 _TURNING_SPEED = 0.6
-# Steps of Newton's method, each of which doubles the correct digits: from 1 cm to below 1e-9 m.
+# Steps of Newton's method. Each step doubles the number of correct digits, so these reduce an
+# error of 1 cm to below 1e-9 m.
 _ITERATIONS = 4
 
 
@@ -41,7 +42,7 @@ class StraightLine:
         """
         self._start, self._twist = start, start.twist_to(goal)
         distance, turn = float(self._twist[:3].norm()), float(self._twist[3:].norm())
-        # At least 0.3 s: the safety filter limits the accelerations that less would need.
+        # A duration below 0.3 s would need accelerations beyond the safety filter's limits.
         self.duration = max(distance / speed, turn / _TURNING_SPEED, 0.3)
 
     def at(self, time: float) -> tuple[Pose, Float[Tensor, "6"]]:
@@ -75,12 +76,12 @@ def joint_line(
 def joints_near(
     chain: SerialChain, pose: Pose, near: Float[Tensor, " joints"]
 ) -> Float[Tensor, " joints"]:
-    """Joint positions with the end effector at a pose, close to given ones [rad].
+    """Joint positions [rad] with the end effector at a pose, close to `near`.
 
     Args:
         chain: Kinematics of the arm.
         pose: Pose of the end effector. If it is out of reach, the result only comes closer.
-        near: Joint positions whose end effector is about a centimetre away [rad].
+        near: Joint positions that bring the end effector to about a centimetre from it [rad].
     """
     q = near
     for _ in range(_ITERATIONS):
@@ -96,7 +97,8 @@ class PositionServoConfig:
     gain: float = 8.0
     """Decay rate of the tracking error [1/s]."""
     lag: float = 0.1
-    """Tracking error of a joint beyond which the motion restarts where the arm is [rad]."""
+    """If the tracking error of a joint is larger, the motion restarts from the arm's present
+    position [rad]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter applied to every velocity."""
 
@@ -107,8 +109,8 @@ class PositionServoConfig:
 class PositionServo:
     """Tracks joint positions by velocities within the limits.
 
-    Targets that keep the limits are reached when the next one is due. Others are smoothed by
-    `MotionFilter`, so that the arm does not jump when the target does.
+    A target that keeps the limits is reached by the time of the next target. Other targets are
+    smoothed by `MotionFilter`, so that the arm does not jump when the target does.
 
     Attributes:
         config: Settings of the tracking.
@@ -131,8 +133,8 @@ class PositionServo:
             arm: Driver of the arm.
             dt: Time between targets [s].
             config: Settings of the tracking.
-            watch: Distances from tracked people, near whom the arm slows down or waits; None:
-                people are not tracked.
+            watch: Source of the distances from tracked people; the arm slows down or waits near
+                people. None: people are not tracked.
 
         Raises:
             ValueError: dt is longer than the longest step for which the safety filter
@@ -148,7 +150,7 @@ class PositionServo:
                 f"targets must come within {config.safety.longest_step:g} s of each other, but "
                 f"dt is {dt:g} s: raise the frame rate."
             )
-        # Tighter than the limits of the safety filter, which then need not intervene.
+        # These limits are tighter than those of the safety filter, so it need not intervene.
         limits, margin = chain.limits, 1.5 * config.safety.margin
         self.limits = replace(
             limits,
@@ -174,14 +176,15 @@ class PositionServo:
     def follow(
         self, target: Float[np.ndarray, " joints"]
     ) -> tuple[ArmState, Float[np.ndarray, " joints"]]:
-        """Command the velocity that reaches the target, or comes nearer to it, within dt.
+        """Command the velocity that reaches the target within dt, or comes nearer to it.
+
+        The caller lets dt pass before the next call.
 
         Args:
             target: Joint positions [rad]. A joint with NaN keeps its present motion.
 
         Returns:
-            The reading of the arm that was used, and the commanded positions [rad]. The caller
-            lets dt pass.
+            The reading of the arm that was used, and the commanded joint positions [rad].
         """
         state, before = self._arm.read(), self._motion
         here, q = state.joint_position, torch.from_numpy(state.joint_position)

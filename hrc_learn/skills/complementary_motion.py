@@ -30,35 +30,36 @@ from hrc_learn.skills.step_report import PersonFeedback
 
 # Longest step of the loop between two actions of the policy [s].
 _STEP = 0.01
-# Distance from a joint limit that a push leaves to the policy [rad].
+# A push ends at this distance from a joint limit, which leaves the rest to the policy [rad].
 _LIMIT_MARGIN = 0.05
 # Fraction of the limits of acceleration and jerk that the loop uses. The correction of the end
 # effector at the end of each step needs the rest.
 _EFFORT = 0.9
 # Time after which joints that find no way back in the null space return directly [s].
 _DIRECT_RETURN_AFTER = 5.0
-# Distance of the joints from the policy's posture below which they are on it [rad].
+# Joints within this distance of the policy's posture count as being in that posture [rad].
 _SAME = 1e-6
-# Distance of postures below which a policy counts as waiting for the motion [rad].
+# If the policy's newest posture is within this distance of the present one, the policy counts
+# as having waited, too [rad].
 _MET_AGAIN = 0.02
 # Reduction of the clearance in one step that counts as rounding [m].
 _ROUNDING = 1e-3
 
 
 class ComplementaryMotion:
-    """Joint positions from a policy for the end effector and a person for the null space.
+    """Combines a policy, which moves the end effector, with a person, who moves the null space.
 
-    The policy requests joint positions, its posture. Without a push, they are passed on
-    unchanged. While a person pushes the joints aside, the end effector stays where the policy's
-    posture has it, within the joint limits and clear of obstacles: `ArmLoop` moves an ideal arm
-    that way. After the push, the joints return to the policy's posture, or stay aside
-    (`YieldingConfig.after_push`). Where the arm that was pushed aside cannot follow, the motion
-    waits, and later continues from there.
+    The policy requests joint positions, called its posture. Without a push, they are passed on
+    unchanged. While a person pushes the joints aside, the end effector keeps the pose that it
+    has in the policy's posture, and the arm stays within its joint limits and clear of
+    obstacles. `ArmLoop` computes this motion for an ideal arm. After the push, the joints
+    return to the policy's posture, or stay aside (`YieldingConfig.after_push`). Where an arm
+    that was pushed aside cannot follow the policy, the motion waits, and later continues.
 
     Attributes:
         human: Person that pushes the arm.
         posture: Present joint positions of the policy [rad]; None before the first step.
-        joints: Joint positions commanded instead [rad].
+        joints: Commanded joint positions [rad]; None before the first step.
         offset_velocity: Rate of change of `offset` [rad/s].
     """
 
@@ -78,12 +79,13 @@ class ComplementaryMotion:
 
         Args:
             chain: Kinematics of the arm.
-            human: Person who pushes the arm.
+            human: Person that pushes the arm.
             dt: Time between two steps [s].
             limits: Limits within which the arm follows the positions exactly.
             config: Response of the null space to a push.
-            clearance: Distance of the arm at given joint positions from itself and its
-                surroundings [m]; None: a push can move the arm anywhere within its limits.
+            clearance: Function from joint positions [rad] to the distance of the arm from
+                itself and its surroundings [m]; None: a push can move the arm anywhere within
+                its limits.
         """
         self._chain, self.human, self._dt = chain, human, dt
         self._steps = max(1, math.ceil(dt / _STEP - 1e-9))
@@ -106,14 +108,14 @@ class ComplementaryMotion:
         self.restart()
 
     def restart(self) -> None:
-        """Start again without a push at the next step."""
+        """Forget all motion; the next step is the first one, without a push."""
         still = torch.zeros(len(self._chain.joint_names), dtype=torch.float64)
         self._feedback = PersonFeedback(self._chain)
         self.posture = self.joints = None
         self.offset_velocity = still
         self._state = self._loop.initial_state(still)
-        # Postures and gripper openings of the policy from the present one on. More than one
-        # remains while the motion waits.
+        # Queue of the policy's postures and gripper openings; the present one comes first.
+        # While the motion waits, further ones gather behind it.
         self._wishes: deque[tuple[Tensor, float]] = deque()
         self._progress = 0.0
 
@@ -124,7 +126,7 @@ class ComplementaryMotion:
 
     @property
     def waits(self) -> bool:
-        """True while the motion waits, or has yet to regain its own speed."""
+        """True while the motion waits, or moves more slowly than the policy after a wait."""
         return float(self._state.path.rate) < 1.0
 
     @property
@@ -141,8 +143,9 @@ class ComplementaryMotion:
 
         Args:
             state: Newest reading of the arm, passed on to the person.
-            wish: Joint positions of the policy for that time [rad].
-            width: Gripper opening of the policy for that time [m]; it waits with the motion.
+            wish: Joint positions that the policy requests for the next step [rad].
+            width: Gripper opening that the policy requests for the next step [m]. If the motion
+                waits, the gripper waits, too.
 
         Returns:
             Joint positions [rad] and opening of the gripper [m].
@@ -174,16 +177,16 @@ class ComplementaryMotion:
         return self.joints.numpy(), width
 
     def _take(self, wish: Float[Tensor, " joints"], width: float) -> None:
-        """Add a posture of the policy."""
+        """Add a posture [rad] and a gripper opening [m] of the policy to the queue."""
         if self._wishes and not self.waits:
             near = float((wish - self._wishes[0][0]).norm()) < _MET_AGAIN
             if near and len(self._wishes) > 1:
-                # The policy has waited too, or come to its end: nothing is left to catch up.
+                # The policy has waited, too, or has ended: there is nothing to catch up.
                 self._wishes, self._progress = deque([self._wished()]), 0.0
         self._wishes.append((wish, width))
 
     def _go_on(self, steps: float) -> None:
-        """Advance by a number of steps of the policy."""
+        """Advance in the queue of postures by a number of steps of the policy."""
         self._progress += steps
         while self._progress >= 1.0 and len(self._wishes) > 1:
             self._wishes.popleft()
@@ -192,7 +195,7 @@ class ComplementaryMotion:
             self._progress = 0.0
 
     def _wished(self, ahead: float = 0.0) -> tuple[Float[Tensor, " joints"], float]:
-        """Posture and gripper opening of the policy, some of its steps from now."""
+        """Posture [rad] and gripper opening [m] of the policy, `ahead` policy steps ahead."""
         at = self._progress + ahead
         k = min(int(at), len(self._wishes) - 1)
         joints, width = self._wishes[k]
@@ -222,24 +225,24 @@ class ComplementaryMotion:
         queue = deque(self._wishes), self._progress
         self._go_on(float(state.path.progress) / self._steps)
         if not state.path.direct_return.active:
-            # The loop corrects the end effector over several steps; here it can be exact.
+            # The loop corrects the end effector over several steps. An ideal arm can be exact.
             q = joints_near(self._chain, self._chain.forward(self._wished()[0]), q)
         if self._comes_too_near(joints, q):
             (self._wishes, self._progress), q = queue, joints
             state = self._stopped(state)
         if state.path.direct_return.blocked:
-            # The return is tried again later; until then the person can push the arm clear.
+            # The return is tried again later. Meanwhile the person can push the arm free.
             direct, none = DirectReturn.none(q), torch.zeros_like(state.path.waited)
             state = replace(state, path=replace(state.path, direct_return=direct, waited=none))
         back = float((q - self._wished()[0]).abs().max()) < _SAME and not state.aside
         self.joints, self._state = self._wished()[0] if back else q, state
 
     def _request(self) -> FollowPath:
-        """The policy's postures of this step, and its velocity."""
+        """Request to follow the policy's path during this step."""
         fractions = [k / self._steps for k in range(self._steps + 3)]
         position = torch.stack([self._wished(at)[0] for at in fractions])
         velocity = position.diff(dim=0) / self._loop.config.dt
-        # A velocity is a difference of two postures: the last posture has none.
+        # A velocity is a difference of two postures, so the last posture has no velocity.
         position = position[:-1]
         ends = torch.stack([position[0], position[0] + 0.2 * velocity[0]])
         narrow, ahead = smallest_singular_value(self._chain, ends) < NARROW
@@ -269,7 +272,12 @@ class ComplementaryMotion:
     def _comes_too_near(
         self, joints: Float[Tensor, " joints"], reached: Float[Tensor, " joints"]
     ) -> bool:
-        """True if a step reduces the clearance below its margin."""
+        """True if a step reduces the clearance, and to less than the configured clearance.
+
+        Args:
+            joints: Joint positions before the step [rad].
+            reached: Joint positions after the step [rad].
+        """
         if self._loop.clearance is None:
             return False
         now, then = self._loop.clearance(torch.stack([joints, reached])).tolist()
@@ -280,7 +288,7 @@ class ComplementaryMotion:
         return near
 
     def _stopped(self, state: ArmLoopState) -> ArmLoopState:
-        """The state of an arm that stops at once."""
+        """The state with all velocities and accelerations set to zero."""
         still = torch.zeros_like(state.null_velocity)
         path = replace(state.path, rate=torch.zeros_like(state.path.rate))
         safety = replace(state.safety, velocity=still, acceleration=still)

@@ -1,8 +1,8 @@
-"""Goals drawn by a person: a region or a target for the end effector, and a turn.
+"""Goals from a person's drawing: a region or a target for the end effector, and a turn.
 
 The paper's expert draws the Cartesian region in the AR interface and adjusts the coarse
-orientation (section VII). As in the paper (CaFun), the region is a box. Its walls are the walls
-that were drawn.
+orientation (section VII). As in the paper (CaFun), the region is a box, given by the walls that
+the person drew.
 """
 
 import math
@@ -29,7 +29,7 @@ class DrawnGoalsConfig:
     """Rate at which the end effector returns into a region [1/s], equal to that of the planned
     box. Arms with a delay of 30 ms return without overshoot."""
     target_half_size: float = 0.003
-    """Half edges of the box around a drawn target [m]; equal to the half height of the planned
+    """Half edge of the box around a drawn target [m], equal to the half height of the planned
     box."""
     wall: float = 0.02
     """Depth inside the walls of a region over which vision feedback fades in [m]: the distance
@@ -38,8 +38,8 @@ class DrawnGoalsConfig:
     """Largest turn relative to the planned orientation [rad]. The marker on the end effector is
     detected up to about twice that tilt."""
     settling: float = 0.15
-    """Time without changes until a drawing that keeps changing is applied [s]: a dragged
-    pointer changes it 25 times a second, and each change would have to be checked."""
+    """A changed drawing is applied after this time without further changes [s]: a dragged
+    pointer changes the drawing 25 times a second, and an applied change has to be checked."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=vars(self))
@@ -72,10 +72,10 @@ def drawn_position(
 ) -> PositionRegion:
     """Position region of the controller for a drawing.
 
-    Its vertical walls are those of the drawn box, moved inwards by the margin over which vision
-    feedback fades. The image shows little about height, so the region stays as flat as planned,
-    at the planned height or the nearest one within the drawn box. A target gets a small box of
-    its own, within the region.
+    The region's vertical walls are those of the drawn box, moved inwards by the margin over
+    which vision feedback fades. The image shows little about height, so the region stays as
+    flat as planned. Its height is the planned height, or the nearest one in the drawn box. For
+    a target, the region is a small box around the target, within the drawn box.
 
     Args:
         drawing: Drawn region, target or both.
@@ -106,14 +106,14 @@ def drawn_position(
 def vision_scale(
     box: DrawnRegion, position: Float[Tensor, "3"], config: DrawnGoalsConfig
 ) -> float:
-    """Scale of vision feedback, 0 to 1: zero at the vertical walls of a box and outside.
+    """Scale of vision feedback, 0 to 1; it is zero at the vertical walls of a box and outside.
 
-    Thus a visual target outside the box cannot pull the end effector out of it.
+    Therefore a visual target outside the box cannot pull the end effector out of the box.
 
     Args:
         box: Drawn box.
         position: Position of the end effector [m].
-        config: Settings, with the depth inside the walls from which the scale is 1.
+        config: Settings; `wall` is the depth inside the walls at which the scale reaches 1.
     """
     middle, half = position.new_tensor(box.centre), position.new_tensor(box.half_size)
     behind = half[:2] - (position - middle)[:2].abs()
@@ -122,7 +122,7 @@ def vision_scale(
 
 def _margin(half_size: Float[Tensor, "3"], config: DrawnGoalsConfig) -> Float[Tensor, "2"]:
     """Margin between the vertical walls of a drawn box and of the controller's region [m]."""
-    # At most half of a narrow box.
+    # In a narrow box, the margin is half of the half edge.
     return (half_size[:2] / 2).clamp(max=config.wall)
 
 
@@ -156,7 +156,7 @@ class DrawnGoals:
     def __init__(
         self, config: DrawnGoalsConfig, refusal: Callable[[Pose], str] = lambda pose: ""
     ):
-        """Set the effect of drawings, and the check of them.
+        """Set the effect of drawings, and the function that checks them.
 
         Args:
             config: Effect of drawings.
@@ -169,7 +169,7 @@ class DrawnGoals:
         return DrawnGoalsState(turn=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
 
     def restarted(self, state: DrawnGoalsState) -> DrawnGoalsState:
-        """State for another target: the drawing is checked again, the turn is kept."""
+        """State for another target: the turn is kept, and the drawing is checked again."""
         return DrawnGoalsState(turn=state.turn)
 
     def read(
@@ -189,7 +189,8 @@ class DrawnGoals:
         drawing = Drawing(human.region, human.target)
         waited = time - state.changed >= self._config.settling
         if drawing != state.drawing:
-            # The first of several changes is applied at once, and so is the end of a drawing.
+            # The first of several changes is applied immediately, and so is the removal of a
+            # drawing.
             state = replace(state, drawing=drawing, changed=time, checked=False)
             if waited or not drawing:
                 return self._checked(state, planned)
@@ -202,8 +203,9 @@ class DrawnGoals:
     ) -> tuple[Goals, DrawnGoalsState]:
         """The goals with the active drawing in place of the planned region.
 
-        Vision feedback acts within a region (`vision_scale`), but not on the way to a target.
-        A joint-space approach that would end elsewhere is omitted.
+        Vision feedback acts within a drawn region (`vision_scale`), but not if a target was
+        drawn. If the drawing is away from the planned region, there is no joint-space approach,
+        since it would end in the planned region.
 
         Args:
             state: State after `read`.
@@ -229,7 +231,7 @@ class DrawnGoals:
     def turned(
         self, state: DrawnGoalsState, requested: tuple[float, float, float] | None, most: float
     ) -> DrawnGoalsState:
-        """State turned further towards a requested rotation, within the largest turn.
+        """State with the turn moved towards a requested rotation, within the largest turn.
 
         Args:
             state: State after the last step.

@@ -4,9 +4,9 @@
       ^         |                    |
       +---------+---- start over ----+
 
-Servo consists of the paper's joint-space approach and its vision-based control. In interact,
-servoing continues while a person pulls the elbow, if the job gives time for that.
-Recoveries from failures are noted in the job:
+In "servo", the arm approaches in joint space and is then controlled by vision, as in the paper.
+In "interact", servoing continues while a person pulls the elbow, if the job gives time for
+this. Recoveries from failures are noted in the job:
 
 - occluded marker of the end effector: the controller holds the end effector until the marker is
   detected again; after a timeout the arm goes home and starts over;
@@ -42,8 +42,8 @@ from hrc_learn.skills.work_cell import (
 )
 
 OPEN, CLOSED = 0.08, 0.0
-"""Commanded gripper widths [m]: the full stroke, of the Franka hand or of a smaller one; and
-zero, which squeezes the object."""
+"""Commanded gripper widths [m]. `OPEN`: full stroke of the Franka hand; smaller hands open to
+their own full stroke. `CLOSED`: zero, which squeezes an object between the fingers."""
 JOINT_SPEED = 0.6
 """Largest joint speed between postures [rad/s]: about a quarter of the Panda's lowest limit."""
 DESCENT_SPEED = 0.08
@@ -70,11 +70,12 @@ _LONGEST_FINGER_MOTION = 4.0
 # rest if it changes by less than a tenth of that within _FINGERS_REST [s]. Grippers report the
 # opening at 50 Hz.
 _FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
-# Distance by which the marker plate protrudes from the arm's capsules [m].
+# Clearance to keep from objects, since the marker plate protrudes from the arm's capsules [m].
 _PLATE_CLEARANCE = 0.06
-# Clearance is checked at every fifth sample: at JOINT_SPEED the arm moves 3 cm in between.
+# The clearance is checked at every fifth sample of a path: at `JOINT_SPEED`, the arm moves 3 cm
+# between the checked samples.
 _CHECK_EVERY = 5
-# Number of joint-7 values tried for a pose requested by a person: each takes a millisecond.
+# Number of joint-7 values tried for a pose requested by a person; a trial takes a millisecond.
 _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
@@ -82,10 +83,11 @@ UNMARKED = CameraConfig(pixel_noise=0.4, bump=6.0)
 """Settings for a tool without markers, whose features are found less exactly than the corners
 of a marker. With this noise, the predicted error above the object agrees with the true one
 (bench_markerless.py)."""
-# Fractions of the probe height to try, and required distance of the joints from their limits
-# [rad]: the arm is slow close to a limit.
+# `_PROBE_FRACTIONS`: fractions of the probe height to try. `_PROBE_MARGIN`: required distance
+# of the joints from their limits [rad], since the arm is slow close to a limit.
 _PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
-# Uncertainty of the table height before and after the fingers touch it [m].
+# `_TABLE_RANGE`: uncertainty of the table height before the fingers touch the table [m].
+# `_OBJECT_RANGE`: uncertainty after the touch [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 
 
@@ -105,9 +107,9 @@ class GraspingConfig:
     detection_timeout: float = 5.0
     """Give up after an object is undetected for this long [s]."""
     lift: float = 0.20
-    """Height by which an object is lifted [m], for the Franka hand; scaled to other hands."""
+    """Height by which the Franka hand lifts an object [m]; it is scaled to other hands."""
     attempts: int = 3
-    """Largest number of starts, including those that end before the fingers close."""
+    """Largest number of starts, including starts that fail before the fingers close."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +117,7 @@ class Recovery:
     """A failure from which the job recovered."""
 
     time: float
-    """Time [s]."""
+    """Time of the recovery [s]."""
     mishap: Mishap
     """Kind of failure."""
     what: str
@@ -133,7 +135,7 @@ class GraspJob:
     servo_time: float = float("nan")
     """Duration of the last visual servoing [s]."""
     pixel_error: float = float("nan")
-    """Pixel error at the start of the descent [px]."""
+    """Distance of the marker from its target at the start of the descent [px]."""
     picked_up: Pose | None = None
     """Pose of the end effector at the grasp."""
     attempts: int = 1
@@ -248,7 +250,8 @@ class Grasping:
             self._cell.begin_phase(INTERACT)
             self.servo.hold(target, job.time_for_person)
             job.time_for_person = 0.0
-            # After a push, up to twice the tolerance is accepted; otherwise servo again.
+            # After a push, an error of up to twice the tolerance is accepted. With a larger
+            # error, servo again.
             on_target = self.servo.error(target) < 2 * self._config.servo.tolerance
             target = replace(target, posture=None)
             if not on_target:
@@ -309,10 +312,10 @@ class Grasping:
         return seen[item.marker.id]
 
     def _posture(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table with free paths from here and to home [rad].
+        """Joint positions above the table, with free paths to them and from them to home [rad].
 
         If there are none, the arm goes home first. The positions of objects on the table are
-        not known yet, so the path avoids the whole region of the objects.
+        not known yet, so the path to the posture avoids the whole region of the objects.
         """
         posture = self._via(self._size * _PLATE_CLEARANCE)
         if posture is None:
@@ -321,7 +324,14 @@ class Grasping:
         return posture
 
     def _via(self, clearance: float | None) -> Float[Tensor, " joints"] | None:
-        """The first posture above the table with free paths from here and to home, if any."""
+        """The first posture above the table with free paths to it and from it to home [rad].
+
+        Args:
+            clearance: Clearance of the path to the posture from objects [m]; None: not checked.
+
+        Returns:
+            The posture; None if there is none.
+        """
         here, home = self._cell.joints, self._workplace.home_joints()
         for posture in self._workplace.hover_postures():
             if self._free(here, posture, clearance) and self._free(posture, home):
@@ -329,7 +339,7 @@ class Grasping:
         return None
 
     def refusal(self, pose: Pose) -> str:
-        """Reason why the end effector cannot go to a pose from here; empty if it can.
+        """Reason why the end effector cannot go to a pose now; empty if it can.
 
         Args:
             pose: Pose requested by a person.
@@ -360,7 +370,7 @@ class Grasping:
         self._cell.move_straight(height, speed=DESCENT_SPEED)
         move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
-            # The contact may not have been with the table.
+            # The fingers may have touched something else than the table: forget its height.
             self._table = 0.0, self._size * _TABLE_RANGE
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Check that {item.name!r} is under its "
@@ -375,7 +385,7 @@ class Grasping:
         the object is then grasped at about the right distance below its top. Without contact,
         the estimate does not change.
         """
-        # First contact: the fingers with the table, or the palm with the top of a tall object.
+        # Either the fingers meet the table first, or the palm meets the top of a tall object.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
         height, margin = self._table
         expected = height + reach
@@ -385,7 +395,7 @@ class Grasping:
             self._table = float(met.position[2]) - reach, self._size * _OBJECT_RANGE
 
     def _at_height(self, height: float) -> Pose:
-        """Pose of the end effector after moving along its own axis to a height [m]."""
+        """Pose of the end effector after a motion along its z axis to a height [m]."""
         position = self._cell.pose.position
         orientation = self.servo.orientation(self._workplace.hover().orientation)
         direction = quaternion.to_matrix(orientation)[:, 2]
@@ -393,7 +403,7 @@ class Grasping:
         return Pose(position + distance * direction, orientation)
 
     def lift(self) -> None:
-        """Lift the end effector straight up."""
+        """Lift the end effector straight up by the configured height."""
         self._cell.begin_phase("lift")
         self._cell.move_straight(raised(self._cell.pose, self._size * self._config.lift))
 
@@ -415,7 +425,7 @@ class Grasping:
         self.move_joints(home)
 
     def move_joints(self, goal: Float[Tensor, " joints"]) -> None:
-        """Move the joints on a straight line in joint space [rad].
+        """Move the joints on a straight line in joint space to `goal` [rad].
 
         Raises:
             BlockedPathError: The path is blocked.
@@ -430,7 +440,13 @@ class Grasping:
         goal: Float[Tensor, " joints"],
         clearance: float | None = None,
     ) -> bool:
-        """True if a straight line in joint space is free, with a clearance to objects [m]."""
+        """True if a straight line in joint space is free.
+
+        Args:
+            start: First joint positions [rad].
+            goal: Last joint positions [rad].
+            clearance: Required distance from the region of the objects [m]; None: not checked.
+        """
         plan = joint_plan(self._cell, start, goal)
         try:
             self._check(plan)
@@ -446,7 +462,7 @@ class Grasping:
         return self._workplace.robot.whole.box_distance(q, *self._workplace.object_region())
 
     def start_over(self) -> None:
-        """Open the fingers and go home, away from the table and out of the camera's view."""
+        """Open the fingers and go home, where the arm does not hide the table."""
         self._cell.tracked_markers = ()
         self._cell.load = None
         move_fingers(self._cell, OPEN, _OPENING_TIME)
@@ -456,9 +472,10 @@ class Grasping:
 
 
 def _reachable_probe(workplace: Workplace, probe: float) -> float:
-    """Largest height of a probe from which the arm reaches the whole region of the objects [m].
+    """Largest height of a probe at which the arm reaches the whole region of the objects [m].
 
-    If no fraction of the wanted height allows that, the smallest one is returned.
+    Fractions of the wanted height are tried. If the arm reaches the region at none of them, the
+    smallest is returned.
 
     Args:
         workplace: Workplace with the region of the objects.
@@ -488,7 +505,7 @@ def joint_plan(
 
 
 def as_load(item: GraspObject) -> GraspedBox:
-    """Load of a grasped object: gripped along its x axis, with its top towards the palm."""
+    """Load for a grasped object; the fingers grip its x faces, its top points to the palm."""
     x, y, z = item.half_size
     return GraspedBox(half_size=(y, x, z))
 
@@ -505,7 +522,7 @@ def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
         at_least: Shortest time to hold still [s].
     """
     before, begun = cell.state.gripper_width, cell.time
-    width = min(width, _stroke(cell))  # else open fingers are expected to open further
+    width = min(width, _stroke(cell))  # fingers that are already open cannot open further
     cell.gripper.move(width)
     cell.hold_pose(at_least - _FINGERS_REST)
     expected = abs(width - before) > _FINGERS_MOVED

@@ -1,4 +1,8 @@
-"""Fixed camera that finds tool and objects with or without markers; delayed and lost images."""
+"""Find tool and objects in the images of a fixed camera, with or without markers.
+
+Images may arrive late or be lost (`DelayedDetection`), and markers may be half hidden
+(`MarkerConsistency`).
+"""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -19,7 +23,7 @@ from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, angle, centre
 from hrc_learn.vision.landmarks import Finding, LandmarkDetector, Landmarks, draw_finding
 
-# Standard deviation beyond which a landmark counts as not found [px].
+# A landmark whose pixel has a larger standard deviation counts as not found [px].
 _UNSURE = 2.5
 
 
@@ -33,7 +37,7 @@ class SeenFeature(NamedTuple):
 
 
 class FeatureSensor(ABC):
-    """Camera that finds tool and objects, identified by marker number even without markers."""
+    """Camera that finds tool and objects; each has a marker number, even without a marker."""
 
     def __init__(self, camera: Camera):
         """Take images from a camera."""
@@ -50,7 +54,7 @@ class FeatureSensor(ABC):
 
     @abstractmethod
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
-        """Take an image, and find features in it, by number; those not found are left out.
+        """Take an image and return the features found in it, by marker number.
 
         Args:
             ids: Numbers to search for; None: all. Searching for an invisible marker takes ten
@@ -58,7 +62,7 @@ class FeatureSensor(ABC):
         """
 
     def detect(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
-        """Take an image; return the pixel (u, v) of each feature in it, as `features` does."""
+        """Take an image, find features as `features` does, and return their pixels (u, v)."""
         return {number: seen.pixel for number, seen in self.features(ids).items()}
 
 
@@ -76,7 +80,7 @@ class MarkerSensor(FeatureSensor):
         self._detector = MarkerDetector(marker_ids)
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
-        """Take an image; centre and direction of each marker in it, by number."""
+        """Take an image; return centre and direction of each marker in the image, by number."""
         found = self.corners(ids).items()
         return {id: SeenFeature(centre(corners), angle(corners)) for id, corners in found}
 
@@ -99,10 +103,10 @@ class LandmarkSensor(FeatureSensor):
         super().__init__(camera)
         self._names, self._detector = names, LandmarkDetector(landmarks)
         self._found: dict[str, Finding] = {}
-        self._is_fresh = False  # searched since the last image was shown
+        self._is_fresh = False  # True if features were searched after the last `read`
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Take an image for display; draw the landmarks found since the last one on it."""
+        """Take an image for display, and draw the landmarks found since the last display."""
         image = self._camera.read().copy()
         for finding in self._found.values() if self._is_fresh else ():
             draw_finding(image, finding)
@@ -110,10 +114,11 @@ class LandmarkSensor(FeatureSensor):
         return image
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
-        """Take an image; return the landmarks located in it with certainty, by number."""
+        """Take an image; return the landmarks that are located well in it, by number."""
         wanted = [i for i in (self._names if ids is None else ids) if i in self._names]
         found = self._detector.find(self._camera.read(), [self._names[i] for i in wanted])
-        # Objects are located before the tool covers them, and still drawn while it does.
+        # Landmarks that were not searched for, such as an object under the tool, are drawn
+        # where they were last found.
         gone = {self._names[i] for i in wanted} - set(found)
         self._found = {k: v for k, v in self._found.items() if k not in gone} | found
         self._is_fresh = True
@@ -127,11 +132,11 @@ class LandmarkSensor(FeatureSensor):
 def feature_sensor(
     camera: Camera, landmarks: Landmarks | None, tool: int, objects: Iterable[int]
 ) -> FeatureSensor:
-    """Sensor of landmarks if there are any, else of markers.
+    """Sensor that finds landmarks if there are any, else markers.
 
     Args:
         camera: Source of the images.
-        landmarks: Landmarks of a model fitted without markers; None: markers.
+        landmarks: Landmarks of a model fitted without markers; None: markers are detected.
         tool: Marker number of the end effector.
         objects: Marker numbers of the objects; landmarks describe one kind of object only.
     """
@@ -148,9 +153,9 @@ class MarkerObservation:
     time: float = -np.inf
     """Time at which the image was taken [s]."""
     joints: Float[Tensor, " joints"] | None = None
-    """Joint positions at that time [rad]."""
+    """Joint positions when the image was taken [rad]."""
     features: Mapping[int, SeenFeature] = field(default_factory=dict)
-    """Markers in it, by number."""
+    """Markers in the image, by number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,8 +163,8 @@ class LatencyConfig:
     """Delay and loss of images between the camera and the controller."""
 
     delay: float = 0.0
-    """Time from the exposure of an image until its markers are available [s]. Markers are held
-    back until then; the age that a `TimedCamera` reports for its image counts towards it."""
+    """Time from the exposure of an image until its markers are available [s]. Markers found
+    earlier are held back. The age that a `TimedCamera` reports is a part of this time."""
     frame_loss: float = 0.0
     """Fraction of lost images."""
 
@@ -167,13 +172,17 @@ class LatencyConfig:
         check_settings(self, not_negative=["delay"], below_one=["frame_loss"])
 
 
-# Difference in time below which two images are the same one, with its age read from another
-# clock [s]. Time for which joint positions are stored, longer than any camera's delay [s].
+# `_SAME_IMAGE`: two images whose times differ by less are the same image [s]: the age of an
+# image comes from another clock. `_REMEMBERED`: time for which joint positions are stored,
+# longer than the delay of any camera [s].
 _SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
 
 
 class DelayedDetection:
-    """Detected markers with delay and loss, each with the joint positions of its image."""
+    """Detects markers, and delays or loses the results.
+
+    Each observation holds the joint positions at the time of its image.
+    """
 
     def __init__(
         self,
@@ -192,7 +201,7 @@ class DelayedDetection:
         """
         self._sensor, self._latency, self._rng = sensor, latency, rng
         self._pending: deque[MarkerObservation] = deque()
-        self._taken = -np.inf  # the newest image [s]
+        self._taken = -np.inf  # time of the newest image [s]
         self._joints: deque[tuple[float, np.ndarray]] = deque(maxlen=round(_REMEMBERED / dt))
 
     def image(self) -> UInt8[np.ndarray, "height width 3"] | None:
@@ -200,7 +209,7 @@ class DelayedDetection:
         return None if self._sensor is None else self._sensor.read()
 
     def remember(self, time: float, joints: Float[np.ndarray, " joints"]) -> None:
-        """Store joint positions at a time [s, rad]."""
+        """Store the joint positions [rad] at a time [s]."""
         self._joints.append((time, joints))
 
     def detect(
@@ -230,7 +239,11 @@ class DelayedDetection:
         )
 
     def newest(self, time: float) -> MarkerObservation | None:
-        """Newest observation that has arrived by a time [s] since the last call; None: none."""
+        """Newest observation that has arrived since the last call; None: none has arrived.
+
+        Args:
+            time: Present time [s].
+        """
         arrived = None
         # Clocks sum rounded steps, so a nanosecond early counts as in time.
         taken_by = time - self._latency.delay + 1e-9
@@ -241,7 +254,13 @@ class DelayedDetection:
     def _joints_at(
         self, time: float, now: float, joints: Float[Tensor, " joints"]
     ) -> Float[Tensor, " joints"]:
-        """Joint positions at a time [s], as far back as stored [rad]."""
+        """Joint positions at a time [rad]; the oldest stored ones if that time is earlier.
+
+        Args:
+            time: Time of the wanted positions [s].
+            now: Present time [s].
+            joints: Present joint positions [rad].
+        """
         if time >= now or not self._joints:
             return joints
         times, passed = zip(*self._joints, (now, joints.numpy()), strict=True)
@@ -249,13 +268,13 @@ class DelayedDetection:
         return torch.tensor([np.interp(time, times, column) for column in columns])
 
 
-# Distance of the end effector from the middle of the table within which the camera should see
+# If the end effector is within this distance of the middle of the table, the camera should see
 # its marker [m]: the view of the camera reaches about 0.25 m to each side.
 _OVER_TABLE = 0.22
 
 
 def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialChain) -> float:
-    """Longest time without a detection while the end effector was over the table [s].
+    """Longest time with the end effector over the table, but without a detection [s].
 
     Args:
         log: Log of a work cell.
@@ -296,9 +315,9 @@ class MarkerConsistency:
     start: Pose | None = None
     """Pose of the end effector at the first image; None: no image so far."""
     pixel: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
-    """Mean pixel of the first images, moved to the first pose [px]."""
+    """Mean pixel of the first images, each converted to the pixel at the first pose [px]."""
     images: int = 0
-    """Number of images in that mean."""
+    """Number of images in the mean."""
 
     def updated(
         self,
@@ -307,13 +326,13 @@ class MarkerConsistency:
         pose: Pose,
         jacobian: Float[np.ndarray, "2 6"],
     ) -> "MarkerConsistency":
-        """The test after an image; unchanged by an image seen before.
+        """State of the test after an image; an image seen before changes nothing.
 
         Args:
             time: Time at which the newest image was taken [s].
-            pixel: Pixel of the marker in it [px]; NaN if it is not detected.
-            pose: Pose of the end effector at that time.
-            jacobian: Image Jacobian there [px/m, px/rad].
+            pixel: Pixel of the marker in the image [px]; NaN if the marker is not detected.
+            pose: Pose of the end effector when the image was taken.
+            jacobian: Image Jacobian at this pose [px/m, px/rad].
         """
         if time <= self.time:
             return self

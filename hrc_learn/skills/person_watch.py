@@ -19,17 +19,16 @@ from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
-# Time in which an arm comes to rest [s]: a joint of a Panda brakes from 0.8 rad/s with 0.7 of
-# its highest acceleration, as drivers plan. Without the speed scale that this time defines, the
-# arm came too close to a worker in up to 7 of 60 jobs.
+# Time in which an arm comes to rest [s]: as drivers plan, a joint of a Panda brakes from 0.8
+# rad/s with 0.7 of its highest acceleration. This time determines a speed scale near people.
+# Without the scale, the arm came too close to a worker in up to 7 of 60 jobs.
 _COMING_TO_REST = 0.15
 
 NEAR_PEOPLE = ConstraintConfig(distance_weight=0.1)
-"""Constraint layer of an arm near people. The arm can always stop, so it need not leave its
-path: the path has priority over the distance, and the arm brakes on the path within the
-reaction time that the protective distance includes. The end effector then deviates from its
-path by 0.5 mm; with priority for the distance, by 6 mm. In steps that are not compiled, the
-solver stops once it has converged."""
+"""Constraint layer of an arm near people. The path has priority over the distance: the arm need
+not leave its path, since it can brake on the path within the reaction time that the protective
+distance includes. The end effector then deviates from its path by 0.5 mm; if the distance had
+priority, by 6 mm. In steps that are not compiled, the solver stops once it has converged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,22 +40,22 @@ class PersonWatchConfig:
     with 1 to 2 m/s^2; a hand that reaches for an object near the arm accelerates with up to
     9 m/s^2. With 3 m/s^2, 3 of 1000 jobs near such hands came too close."""
     pairs: int = 8
-    """Number of pairs (a part of the arm, a part of a person) that are kept apart: the most
-    urgent ones."""
+    """Number of pairs (a part of the arm, a part of a person) that are kept apart. The most
+    urgent pairs are chosen."""
     contact: float = 0.03
     """Observed distance below which a person may already touch the arm [m]: three standard
     deviations of a tracker's noise. The arm stops, as the direction away from the person is
     unknown. Where contact is allowed, only the limits of lasting contacts apply."""
     fastest: float = 0.5
-    """Speed from which the arm is assumed to need 0.15 s to come to rest [m/s], for the speed
-    cap."""
+    """Assumption for the speed cap: from this speed, the arm needs 0.15 s to come to rest
+    [m/s]."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
 
 
 class PersonWatch:
-    """Distances that a safety filter keeps, from the observations of a tracker."""
+    """Turns the observations of a tracker into distances that a safety filter keeps."""
 
     def __init__(
         self,
@@ -71,13 +70,13 @@ class PersonWatch:
         Args:
             tracker: Tracker of the people.
             arm: Capsules of arm and tool.
-            separation: Protective distance, and the mode: with power and force limiting the
-                contact speeds of all pairs are computed as well.
+            separation: Protective distance and mode. With power and force limiting, the
+                highest contact speeds of all pairs are computed, too.
             config: Assumptions about people.
             furniture: Boxes against which the arm may clamp people, in the base frame.
 
         Raises:
-            ValueError: The mode needs the masses of the arm, and it has none.
+            ValueError: The mode needs the masses of the arm, but the arm has none.
         """
         self._tracker, self._arm = tracker, arm
         self._separation = separation or SeparationConfig()
@@ -99,7 +98,7 @@ class PersonWatch:
         Args:
             time: Reading of the clock [s].
             joints: Joint positions [rad].
-            load: Object in the gripper; None: none.
+            load: Object in the gripper; None: no object.
         """
         seen, number = self._tracker.read(), self._config.pairs
         if seen is None:
@@ -139,13 +138,13 @@ def watched_people(
     """Distances to keep from people, and limits of the speed near them.
 
     The protective distance limits only the speed towards people. An arm that moves past people
-    or makes way for them could still move when they reach it. Therefore a speed scale brings it
-    to rest by the time at which people who keep accelerating may touch any part of it. People
-    who move away count as at rest: a hand can reverse its motion faster than a tracker, which
-    averages over several images, can show.
+    or makes way for them could still move when they reach it. Therefore a speed scale brings
+    the arm to rest before accelerating people can touch any part of it. People moving away
+    count as at rest: a tracker averages over several images, and a hand can reverse its motion
+    faster than the tracker shows.
 
-    Where contact is allowed, a speed cap replaces the speed scale: by that time the arm is at
-    rest, or slow enough for a contact in any direction.
+    Where contact is allowed, a speed cap replaces the speed scale: before people can touch the
+    arm, it is at rest or slow enough for a contact in any direction.
 
     Args:
         found: Distances between the arm as it is now and people as they were observed.
@@ -157,8 +156,8 @@ def watched_people(
     """
     a, rate = config.acceleration, found.person_rate(velocity)
     late = (age + separation.reaction_time)[..., None, None]
-    # Speed of people towards the arm, with what they may gain from the observation until the
-    # arm reacts.
+    # Speed of people towards the arm, plus the speed that they may gain between the observation
+    # and the reaction of the arm.
     towards = (a * late - rate).clamp(min=0).flatten(-2)
     distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
     # A contact that has begun may last, so the quasi-static limits apply to it.
@@ -167,7 +166,7 @@ def watched_people(
         speed = torch.where(near, contact.lasting, contact.first).flatten(-2)
         near = near & (contact.first <= 0)
     allowed = separation.allowed_speed(distance, towards, speed)
-    # Among pairs that allow no approach, the nearest are the most urgent.
+    # Among pairs that allow no approach, the nearest pairs are the most urgent.
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
     touching = near.flatten(-2).any(-1, keepdim=True)
@@ -180,7 +179,7 @@ def watched_people(
     )
 
     coming = (-rate).clamp(min=0)
-    # The root t of  coming t + a t^2/2 = distance.
+    # The arrival time t solves  coming t + a t^2/2 = gap.
     gap = (found.distance - config.contact).clamp(min=0)
     arrival = 2 * gap / (coming + (coming**2 + 2 * a * gap).sqrt()).clamp(min=1e-9)
     scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)

@@ -4,13 +4,13 @@
       ^      |         |
       +------+---------+-- put back -> over
 
-Picking is `Grasping.grasp`, or a hand-over by a person; home to release is the placing. Each
-phase is a method that does its work and returns the next phase. In addition to the recoveries
-of grasping, these are noted in the job:
+Phase "pick" is `Grasping.grasp`, or a hand-over by a person; the phases from "home" to
+"release" place the object. Each phase is a method that does its work and returns the next
+phase. In addition to the recoveries of grasping, these recoveries are noted in the job:
 
 - dropped object: the arm starts over from home, up to a number of attempts;
-- blocked path: another height, via point or arm angle, then waiting; finally the object is put
-back.
+- blocked path: the arm tries another height, via point or arm angle, then waits; finally it
+puts the object back.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,11 +39,12 @@ from hrc_learn.skills.work_cell import (
 )
 
 RECEIVE, HOME, TRANSFER, RELEASE = "receive", "home", "transfer", "release"
-"""Phases that other modules look up in the log."""
+"""Names of phases that other modules look up in the log."""
 RELEASE_TIME = 0.8
 """Shortest time for the fingers to open and the released object to come to rest [s]."""
-# Length of the straight retreat along the end effector's own axis that frees the fingers [m],
-# and its speed [m/s]: at the usual speed, the shoulder comes near its limits.
+# `_CLEARANCE`: length of the straight retreat, along the end effector's z axis, that frees the
+# fingers [m]. `_RETREAT_SPEED`: speed of the retreat [m/s]; at the usual speed, the shoulder
+# comes near its limits.
 _CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
 
 
@@ -52,7 +53,7 @@ class PickPlaceJob(GraspJob):
     """Job of one object from the table to its shelf, with its results."""
 
     shelf: str
-    """Name of its shelf."""
+    """Name of the object's shelf."""
     goal: Pose
     """Pose of the end effector at the release, if the object is held in the middle."""
     plan: Plan | None = None
@@ -64,11 +65,11 @@ class PickPlaceJob(GraspJob):
     receipt: Receipt | None = None
     """Hand-over of the object by a person; None: the object lay on the table."""
     span: tuple[float, float] = (0.0, 0.0)
-    """Start and end [s]."""
+    """Start and end of the job [s]."""
 
 
 type Phase = Callable[[PickPlaceJob], Phase | None]
-"""Phase of a job, which returns the next one; None: the job is over."""
+"""Phase of a job; it returns the next phase, or None if the job is over."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +81,7 @@ class PickAndPlaceConfig:
     interaction: float = 11.0
     """Time for which the robot keeps servoing while a person pulls its elbow [s]."""
     interactions: int = 1
-    """Number of objects, from the first one on, for which the person gets that time."""
+    """The person gets this time for the first objects only; this is their number."""
     speed: float = 1.5
     """Speed of the transfer relative to the demonstration."""
     waits: int = 3
@@ -106,7 +107,7 @@ def place_along(
     """
     cell.begin_phase(TRANSFER)
     cell.follow_path(plan.path)
-    # The arm lags behind: at the end of the path it is not quite there.
+    # The arm lags behind: at the end of the path, it has not quite reached the goal.
     cell.move_straight(goal)
     cell.begin_phase(RELEASE)
     begun = cell.time
@@ -118,7 +119,16 @@ def place_along(
 
 
 def _put_down(cell: WorkCell, goal: Pose, lowering: float) -> Pose:
-    """Lower the grasped object until it stands, and release it; returns the pose."""
+    """Lower the grasped object until it stands, and release it.
+
+    Args:
+        cell: Arm, gripper and person.
+        goal: Pose of the end effector from which the object is lowered.
+        lowering: Largest distance to lower the object, if there is no contact [m].
+
+    Returns:
+        Pose of the end effector at the release.
+    """
     below = Pose(goal.position.clone(), goal.orientation)
     below.position[2] -= lowering
     cell.move_until_contact(below)
@@ -304,14 +314,14 @@ class PickAndPlace:
         return self._retreat
 
     def _retreat(self, job: PickPlaceJob) -> Phase | None:
-        """Retreat along the same path, which was free before."""
+        """Retreat along the path of the transfer, which was free before."""
         assert job.plan is not None
         self._cell.begin_phase("retreat")
         self._cell.follow_path(job.plan.path[::-1])
         return None
 
     def _put_back(self, job: PickPlaceJob) -> Phase | None:
-        """Put the object back at its place, and go home."""
+        """Put the object back where it was picked up, and go home."""
         assert job.picked_up is not None
         if job.receipt is not None:
             return None  # a received object has no place on the table: the arm keeps it
@@ -327,7 +337,7 @@ class PickAndPlace:
     def _dropped(self, job: PickPlaceJob, what: str) -> Phase | None:
         """Start over from home, unless the number of attempts is reached."""
         self._grasping.note(job, "dropped object", what)
-        # The place of a lost received object is unknown.
+        # If an object from a person's hand is lost, its position is unknown.
         if job.receipt is not None or job.attempts == self._config.grasping.attempts:
             job.failure = what
         self._grasping.start_over()

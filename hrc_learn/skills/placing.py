@@ -1,9 +1,9 @@
 """A workplace with shelves, and plans to place an object there by a learned motion.
 
-The motion was demonstrated for one shelf. For another shelf it is planned in one of two spaces:
-with the joint-space primitive and a shifted goal, as in the paper, which bends the path into
-the shelf; or with the pose primitive and the learned arm angle in the null space, which keeps
-the path straight.
+The motion was demonstrated for one shelf. For another shelf it is planned in one of two spaces.
+In joint space, the goal of the joint primitive is shifted, as in the paper; the path into the
+shelf is then bent. In pose space, the pose primitive moves the end effector and the learned arm
+angle moves the null space; the path then stays straight.
 """
 
 from collections.abc import Iterator, Sequence
@@ -55,7 +55,7 @@ class GraspObject(Protocol):
 
     @property
     def marker(self) -> Marker:
-        """Marker by which the camera finds it."""
+        """Marker by which the camera finds the object."""
         ...
 
 
@@ -154,11 +154,11 @@ class CollisionChecker(Protocol):
     def collisions_along(
         self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> Sequence[Touch]:
-        """Contacts along a path of joint positions [rad]; their times are sample indices.
+        """Contacts along a path of joint positions; `Touch.start` is the index of a sample.
 
         Args:
             path: Joint positions [rad].
-            carried: Name of the object in the gripper; None: none.
+            carried: Name of the object in the gripper; None: no object.
         """
         ...
 
@@ -189,20 +189,20 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlaceCorrection:
-    """Difference between the readings of an arm and the known pose of a place.
+    """Corrects poses by the difference between a known pose and the arm's reading there.
 
-    Errors of base, tool and encoders are nearly equal at all places with the same orientation
-    of the tool. A person guides the arm to a known place once, and the difference measured
-    there corrects all places, except for the arm's repeatability.
+    Errors of base, tool and encoders are nearly equal at all poses with the same orientation of
+    the tool. A person guides the arm to one known pose, and the difference measured there
+    corrects all poses. The arm's repeatability error remains.
     """
 
     read: Pose
-    """Pose that the arm reads with its tool at the known place."""
+    """Pose that the arm reads with its tool at the known pose."""
     place: Pose
-    """The known place."""
+    """The known pose."""
 
     def apply(self, place: Pose) -> Pose:
-        """Pose that the arm reads with its tool at another place."""
+        """Pose that the arm reads with its tool at another known pose."""
         shift = self.read.position - self.place.position
         back = quaternion.conjugate(self.place.orientation)
         turn = quaternion.multiply(back, self.read.orientation)
@@ -271,7 +271,7 @@ class PlacingSkill:
         Raises:
             UnreachableError: No joint positions reach the goal.
         """
-        # For both spaces: an unreachable goal is refused before planning.
+        # Refuse an unreachable goal before planning, in both spaces.
         end = self.robot.inverse(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed
         time = torch.arange(0.0, duration + dt / 2, dt, dtype=torch.float64)
@@ -306,9 +306,14 @@ def follow_pose(
 ) -> Float[Tensor, "steps joints"]:
     """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
-    u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q, where
-    n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region. The
-    poses are tracked exactly, the arm angle as far as null space and joint limits allow.
+    The joint velocity is
+
+        u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q
+
+    Here J^+ is the pseudo-inverse of the Jacobian, e the pose error, N the projector on the
+    null space, n the joint motion that turns the arm angle at unit rate, and xi_q the gradient
+    of the joint-limit region. The poses are tracked exactly, the arm angle as far as null space
+    and joint limits allow.
 
     Args:
         chain: Kinematics of the arm.
@@ -328,7 +333,7 @@ def follow_pose(
         null_velocity = -limits.gradient(q)
         if angle is not None and rate is not None:
             measured, motion = arm_angle_and_motion(chain, q, J)
-            # The shorter direction around the circle.
+            # Take the shorter direction around the circle.
             error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
             null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) + null_velocity
         task_velocity, null = resolved_rate(J, desired, null_velocity)
@@ -378,10 +383,10 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
         )
 
 
-# Offsets of via points from home, to go around objects in the direct path [m]: higher, nearer
-# to the robot, further from it.
+# Offsets of via points from home, to go around objects in the direct path [m]: the points lie
+# higher than home, nearer to the robot, and further from the robot.
 _VIA_POINTS = ((0.0, 0.0, 0.12), (-0.14, 0.0, 0.06), (0.08, 0.0, 0.10))
-# Changes of joint 7 at home, which move the elbow about the line to the wrist [rad]: out, in.
+# Changes of joint 7 at home [rad]: the elbow moves out or in, about the line to the wrist.
 _ARM_ANGLES = (-0.35, 0.35)
 # Height added to the release of an object that sits low in the gripper [m].
 _RAISED = 0.008
@@ -396,10 +401,10 @@ def plan_candidates(
     dt: float,
     speed: float,
 ) -> Iterator[Plan]:
-    """Candidate plans to a shelf, the learned one first; each is planned on demand.
+    """Candidate plans to a shelf, the learned plan first; each plan is computed on demand.
 
-    The others end a little higher, for an object that sits low in the gripper, or first go to
-    a via point or another arm angle near home. Near its goal, the primitive returns to the
+    The other plans end a little higher, for an object that sits low in the gripper, or first go
+    to a via point or another arm angle near home. Near its goal, the primitive returns to the
     learned pose and arm angle, so the path into the shelf stays the same.
 
     Args:
@@ -428,7 +433,7 @@ def plan_candidates(
 
 
 def _via_postures(workplace: Workplace) -> Iterator[Float[Tensor, " joints"]]:
-    """Reachable joint positions near home."""
+    """Reachable joint positions at via points and arm angles near home [rad]."""
     for offset in workplace.robot.hand_size * torch.tensor(_VIA_POINTS, dtype=torch.float64):
         with suppress(UnreachableError):
             yield workplace.home_joints(offset)

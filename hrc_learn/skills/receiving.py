@@ -1,9 +1,10 @@
 """Receiving an object from a person's hand, recognised by the motion of the hand alone.
 
 A tracker sees the person. Each movement of the hand from rest is compared with demonstrated
-movements (`InteractionPrimitive`). As soon as it is most likely a hand-over, the end effector
-goes to the predicted meeting point, more slowly with a larger uncertainty, and as close to the
-person as the safety filter allows. There it waits for the object, and closes the fingers.
+movements (`InteractionPrimitive`). As soon as the movement is most likely a hand-over, the end
+effector goes to the predicted meeting point, as close to the person as the safety filter
+allows. It moves more slowly if the prediction is less certain. At the meeting point, it waits
+for the hand and closes the fingers.
 """
 
 from collections import deque
@@ -22,9 +23,9 @@ from hrc_learn.skills.placing import GraspObject
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 HAND_OVER = "hand over"
-"""Name of the kind of movement to respond to."""
+"""Name of the kind of movement to which the robot responds."""
 
-# Observed parts of a tracked body, with the names of `sim.worker.PARTS`.
+# Parts of a tracked body that are observed, named as in `sim.worker.PARTS`.
 _BODY, _HAND = "pelvis", "hand_right"
 
 
@@ -35,9 +36,9 @@ class ReceivingConfig:
     window: float = 0.3
     """Time window over which motion of a hand is detected [s]: nine images."""
     motion_threshold: float = 0.06
-    """Displacement within the window above which the hand counts as moving, and below which the
-    body counts as standing [m]: four times the apparent displacement of a hand at rest, with a
-    tracker noise of 1 cm."""
+    """The hand counts as moving if its displacement within the window is larger, and the body
+    counts as standing if its displacement is smaller [m]. With a tracker noise of 1 cm, a hand
+    at rest seems to be displaced by a quarter of this."""
     noise: float = 0.012
     """Standard deviation of each coordinate of the hand [m]: tracker noise and human
     variation."""
@@ -50,10 +51,10 @@ class ReceivingConfig:
     tolerance: float = 0.06
     """Standard deviation of the meeting point at which the speed is halved [m]."""
     near: float = 0.09
-    """Largest distance of the hand from its demonstrated place relative to the end effector
+    """Largest distance of the hand from its demonstrated position relative to the end effector
     [m]."""
     still: float = 0.5
-    """Time for which the hand has to be there before the fingers close [s]."""
+    """Time for which the hand has to stay near that position before the fingers close [s]."""
     attempts: int = 3
     """Largest number of times that the fingers close."""
     timeout: float = 30.0
@@ -62,14 +63,14 @@ class ReceivingConfig:
 
 @dataclass(kw_only=True)
 class Receipt:
-    """Record of a hand-over; times are NaN until the event."""
+    """Record of a hand-over; each time is NaN until its event."""
 
     set_off: float = np.nan
     """Time of the first image of the hand's movement [s]."""
     recognised: float = np.nan
     """Time of the recognition [s]."""
     seen: float = np.nan
-    """Time of the newest image at the recognition [s]."""
+    """Time of the image that led to the recognition [s]."""
     predicted: Float[np.ndarray, "3"] | None = None
     """Position of the end effector at the meeting, predicted at the recognition [m]."""
     taken: float = np.nan
@@ -81,7 +82,7 @@ class Receipt:
 
 
 class MovementWatch:
-    """Segments the tracked hand of a standing person into movements."""
+    """Divides the tracked motion of a standing person's hand into movements."""
 
     def __init__(self, config: ReceivingConfig, body: int, hand: int):
         """Start without images.
@@ -109,7 +110,7 @@ class MovementWatch:
         stands = self._moved(self._body) < config.motion_threshold
         moves = self._moved(self._hand) > config.motion_threshold
         if not stands or not moves:
-            # At rest again, or walking: the next motion is another movement.
+            # The hand rests again, or the person walks: the next motion is another movement.
             self.times, self.hand = [], []
             return False
         if not self.times:
@@ -125,7 +126,10 @@ class MovementWatch:
         return seen.ends[self._hand].mean(axis=0)
 
     def _moved(self, part: int) -> float:
-        """Displacement within the window: twice that between the means of its halves [m]."""
+        """Displacement of a body part within the window [m].
+
+        This is twice the distance between the mean positions in both halves of the window.
+        """
         places = np.stack([one.ends[part].mean(axis=0) for one in self._latest])
         half = len(places) // 2
         return 2 * float(np.linalg.norm(places[-half:].mean(0) - places[:half].mean(0)))
@@ -183,7 +187,8 @@ class Receiving:
 
     def _recognise(self, deadline: float) -> InteractionEstimate:
         """Hold still until a movement is most likely a hand-over."""
-        # Number of consecutive images above the certainty, and True after one below it.
+        # `certain`: number of consecutive images with a probability above the certainty.
+        # `other`: True if the last image of the present movement was below the certainty.
         certain, other = 0, False
         wait, still = self._cell.pose, torch.zeros(6, dtype=torch.float64)
         while self._cell.time < deadline:
@@ -196,7 +201,7 @@ class Receiving:
                 continue
             estimate = self._estimate()
             k = self._model.kinds.index(HAND_OVER)
-            # Two in a row: a single image may be far off.
+            # Require two images in a row: a single image may be far off.
             certain = certain + 1 if estimate.probability[k] > self._config.certainty else 0
             other = certain == 0
             if certain == 2:
@@ -207,8 +212,10 @@ class Receiving:
         raise MissedGraspError("receive: no hand-over was recognised.")
 
     def _meet(self, estimate: InteractionEstimate, deadline: float) -> Float[np.ndarray, "3"]:
-        """Go to the predicted meeting point; returns the demonstrated offset of the hand
-        [m].
+        """Go to the predicted meeting point.
+
+        Returns:
+            Demonstrated position of the hand minus that of the end effector at the end [m].
         """
         cell, config, receipt = self._cell, self._config, self.receipt
         start, dt = cell.pose, cell.config.dt
@@ -243,7 +250,10 @@ class Receiving:
         return (estimate.person(end)[0] - estimate.robot(end)[0])[0].numpy()
 
     def _await_hand(self, hand_offset: Float[np.ndarray, "3"], deadline: float) -> None:
-        """Hold still until the person's hand rests at its demonstrated offset [m]."""
+        """Hold still until the person's hand rests at its demonstrated offset [m].
+
+        The offset is the position of the hand minus that of the end effector.
+        """
         cell, config, wait = self._cell, self._config, self._cell.pose
         still, there = torch.zeros(6, dtype=torch.float64), deque()
         expected = wait.position.numpy() + hand_offset
@@ -263,7 +273,7 @@ class Receiving:
         raise MissedGraspError("receive: the person's hand did not reach the gripper.")
 
     def wait_until_away(self, distance: float = 0.25, longest: float = 5.0) -> None:
-        """Hold still until the hand is at a distance [m], at most for the longest time [s]."""
+        """Hold still until the hand is `distance` [m] away, at most for `longest` [s]."""
         end = self._cell.time + longest
         while self._cell.time < end:
             self._cell.hold_pose(self._cell.config.dt)
@@ -274,6 +284,7 @@ class Receiving:
                     return
 
     def _estimate(self) -> InteractionEstimate:
+        """Estimate of the interaction from the present movement of the hand."""
         times = np.array(self._watch.times)
         return self._model.observe(
             times - times[0], np.stack(self._watch.hand), self._config.noise
@@ -289,13 +300,13 @@ class Receiving:
         return True
 
 
-# Lag of the arm behind its command above which the command waits [m]; speed below which the end
-# effector counts as at rest [m/s].
+# `_LARGEST_LAG`: distance of the arm behind its command above which the command waits [m].
+# `_REST_SPEED`: speed below which the end effector counts as at rest [m/s].
 _LARGEST_LAG, _REST_SPEED = 0.04, 0.01
 
 
 def _end(estimate: InteractionEstimate) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Position of the end effector at the end, and its standard deviation [m]."""
+    """Predicted final position of the end effector, and its standard deviation [m]."""
     mean, deviation = estimate.robot(torch.tensor([estimate.duration], dtype=torch.float64))
     return mean[0], deviation[0]
 

@@ -1,11 +1,11 @@
-"""Target of visual servoing in the image, learned from demonstrations, and the goals for it.
+"""Target of visual servoing in the image, and the controller's goals to reach the target.
 
 Demonstrations end with the end effector right above an object. The position of the object's
 marker in the tool frame at that moment is learned from the pixels of both markers. In a new
 scene, the estimated camera turns the object's pixel into a ray, which is intersected with the
-plane at the demonstrated height of objects. The end effector has to go where this point has
-the learned position in the tool frame. The target in the image is the pixel that the end
-effector's marker will have there, so calibration errors that move both markers alike cancel.
+plane at the demonstrated height of objects. The end effector has to go where this intersection
+has the learned position in the tool frame. The target in the image is the pixel that the end
+effector's marker will have there. Calibration errors that move both markers alike cancel.
 """
 
 import math
@@ -32,12 +32,12 @@ LONGEST_OFFSET = 0.4
 place contain little information on the object's height: without this bound, the offset could
 become metres long."""
 
-# Iterations of the fit of the offset; each solves the linearised projection in closed form.
+# Iterations of the fit of the offset; each iteration solves a linearised projection.
 _STEPS = 8
 # Offset from which the fit starts: below the end effector [m].
 _BELOW = (0.0, 0.0, 0.1)
-# Half length of the segment along a marker's direction in the image whose ends are projected
-# onto the plane of the marker [px].
+# A marker's direction in the image is converted to a heading by projecting the ends of a
+# segment onto the marker's plane; this is the half length of the segment [px].
 _ALONG = 20.0
 
 
@@ -50,23 +50,23 @@ class _TargetFile:
 
 @dataclass(frozen=True, kw_only=True)
 class VisualTarget:
-    """Place of the object's marker in the frame of a tool right above it."""
+    """Position of the object's marker relative to a tool right above the object."""
 
     offset: Float[np.ndarray, "3"]
-    """Place in the tool frame [m]."""
+    """Position of the object's marker in the tool frame [m]."""
     error: float
-    """Leave-one-out error, root mean square [px]; NaN with fewer than five demonstrations."""
+    """Root mean square leave-one-out error [px]; NaN with fewer than five demonstrations."""
 
     @classmethod
     def fit(
         cls, camera: Float[Tensor, "13"], objects: Float[np.ndarray, "demos 2"], poses: Pose
     ) -> "VisualTarget":
-        """Fit to the ends of demonstrations.
+        """Fit the offset to the ends of demonstrations.
 
         Args:
             camera: Camera of the demonstrations (see `jacobian.perspective`).
             objects: Pixels of the object's marker [px].
-            poses: Poses of the end effector right above it, (demos,).
+            poses: Poses of the end effector right above the object, (demos,).
 
         Raises:
             ValueError: There are fewer than three demonstrations.
@@ -88,12 +88,12 @@ class VisualTarget:
     def tool_position(
         self, camera: Float[Tensor, "*batch 13"], pixel: Float[Tensor, "2"], above: Pose
     ) -> Float[Tensor, "*batch 3"]:
-        """Place of a tool right above an object [m].
+        """Position of a tool right above an object, in the base frame [m].
 
         Args:
             camera: Cameras.
             pixel: Pixel of the object's marker [px].
-            above: Orientation of the tool, and its height where demonstrations end.
+            above: Orientation of the tool, and height of the tool at the end of demonstrations.
         """
         offset = quaternion.rotate(above.orientation, torch.from_numpy(self.offset))
         height = above.position[2] + offset[2]
@@ -111,8 +111,8 @@ class VisualTarget:
         Args:
             camera: Cameras.
             pixel: Pixel of the object's marker [px].
-            above: Orientation of the tool, and its height where demonstrations end.
-            height: Height of the tool now [m]; None: that of `above`.
+            above: Orientation of the tool, and height of the tool at the end of demonstrations.
+            height: Height of the tool now [m]; None: the height of `above`.
         """
         place = self.tool_position(camera, pixel, above)
         if height is not None:
@@ -137,7 +137,7 @@ class VisualTarget:
             cameras: Estimate of the camera.
             image_jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
             pixel: Pixel of the object's marker [px].
-            above: Orientation of the tool, and its height where demonstrations end.
+            above: Orientation of the tool, and height of the tool at the end of demonstrations.
         """
         best, *others = self(cameras.samples, pixel, above)
         apart = (torch.stack(others) - best).numpy()
@@ -165,8 +165,9 @@ class VisualTarget:
 def _solved(
     design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
 ) -> tuple[Float[np.ndarray, " unknowns"], float]:
-    """Least-squares solution with two equations per demonstration, and its leave-one-out error.
+    """Least-squares solution, with two equations per demonstration, and leave-one-out error.
 
+    The error is the root mean square over the demonstrations [px].
     A solution longer than `LONGEST_OFFSET` is shortened by the smallest sufficient ridge
     penalty.
     """
@@ -205,8 +206,8 @@ def object_heading(
     Args:
         camera: Camera.
         pixel: Pixel of the marker [px].
-        angle: Its direction in the image [rad].
-        height: Its height [m].
+        angle: Direction of the marker in the image [rad].
+        height: Height of the marker [m].
     """
     along = _ALONG * pixel.new_tensor([math.cos(angle), math.sin(angle)])
     ends = torch.stack([pixel - along, pixel + along])
@@ -217,7 +218,11 @@ def object_heading(
 
 @dataclass(frozen=True, kw_only=True)
 class VisualServoConfig:
-    """Tolerances, time limits and regions of visual servoing."""
+    """Tolerances, time limits and regions of visual servoing.
+
+    The end effector moves in a flat box above the table. A probe is a motion from above the box
+    down into the box; it is made while the camera is uncertain.
+    """
 
     tolerance: float = 1.5
     """Distance of the feature from the target that counts as reached [px]."""
@@ -232,8 +237,8 @@ class VisualServoConfig:
     occlusion_timeout: float = 10.0
     """Give up after the end effector's marker is undetected for this long [s]."""
     object_error: float = 0.0025
-    """Predicted error above the object below which the gripper may descend [m], one standard
-    deviation in the plane; until then the end effector probes."""
+    """Predicted error above the object below which the gripper may descend to grasp [m], one
+    standard deviation in the plane. With a larger error, the end effector probes."""
     probe: float = 0.06
     """Height above the box from which a probe descends [m]. The descent shows how the marker's
     pixel depends on height."""
@@ -249,20 +254,20 @@ class VisualServoConfig:
     would reduce the distance [px]."""
     turn_rate: float = 0.8
     """Highest angular speed at which the gripper turns for the object [rad/s]. A turn moves the
-    marker by 0.15 m per radian; at this speed, and with images delayed, it stays within 10 px
-    of its target."""
+    marker by 0.15 m per radian. At this speed, the marker stays within 10 px of its target even
+    with delayed images."""
     marker_tolerance: float = 1.5
     """Deviation of the marker from its predicted pixel, while the end effector is held, above
     which it counts as half hidden [px]: three times the noise of pixel and prediction."""
     lost_after: float = 1.0
-    """Time after which a marker last seen near the border counts as out of view instead of
-    occluded; then the end effector returns to the middle of the box [s]."""
+    """Time without detection after which a marker last seen near the border counts as out of
+    view, not as occluded [s]. The end effector then returns to the middle of the box."""
     half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
     """Half edges of the box in which vision feedback acts [m]. The box is flat: the image shows
     little about height, and an object has to be grasped at the demonstrated height."""
     acquisition_half_size: tuple[float, float, float] = (0.03, 0.03, 0.003)
-    """Half edges of the box until the marker is first detected [m]: a camera that was moved may
-    not see the whole box, but will see its middle."""
+    """Half edges of the box until the marker is first detected [m]. A camera that was moved may
+    not see the whole box, but will see the middle of the box."""
     angle: float = 0.01
     """Half angle of the tolerated cone of orientations [rad]. The paper's cone of 7.6 degrees
     would shift the marker by 1 cm."""
@@ -289,7 +294,7 @@ class VisualServoConfig:
         )
 
     def within(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """The nearest pixel that keeps the distance from the border of the image [px]."""
+        """The nearest pixel at least `border` pixels away from the border of the image [px]."""
         return np.clip(pixel, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
 
     def goals(
@@ -311,14 +316,15 @@ class VisualServoConfig:
             torch.from_numpy(self.within(target)),
             half_size=half_size,
         )
-        # Close to the wall of a region, the distance beyond it decays at the rate 4 k_c / h^2
-        # for positions and k_o (alpha_o / 2)^2 for orientations. With the paper's k_c = 4e-4,
-        # the arm would follow a marker that has left the image until it is fully stretched.
+        # Just outside a region, the distance from its wall decays at the rate 4 k_c / h^2 for
+        # positions (stiffness k_c, half edge h) and k_o (alpha_o / 2)^2 for orientations
+        # (stiffness k_o, sharpness alpha_o). With the paper's k_c = 4e-4, an arm whose marker
+        # has left the image would move on until it is fully stretched.
         walls = tuple(self.rate / 4 * h**2 for h in half_size)
         sharpness = 2 / self.angle
         return replace(
             goals,
-            # Attracts from anywhere in the image, unlike the paper's region.
+            # This region attracts from anywhere in the image, unlike the paper's region.
             vision=replace(goals.vision, formulation="saturated"),
             position=replace(goals.position, stiffness=walls),
             orientation=OrientationRegion(
@@ -331,7 +337,7 @@ class VisualServoConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoTarget:
-    """Pose to servo to, and its place in the image."""
+    """Pose that the end effector servos to, with all that determines its target pixel."""
 
     config: VisualServoConfig
     above: Pose
@@ -340,7 +346,7 @@ class ServoTarget:
     """Joint positions at `above`, approached in joint space [rad]; None: the Cartesian regions
     guide the approach."""
     visual: VisualTarget
-    """Place of the object's marker in the tool frame."""
+    """Position of the object's marker in the tool frame."""
     item: Float[np.ndarray, "2"]
     """Pixel of the object's marker [px]."""
     angle: float | None = None
@@ -348,18 +354,19 @@ class ServoTarget:
     turn_range: tuple[float, float] = (0.0, 0.0)
     """Smallest and largest turn of the gripper about the vertical [rad]."""
     orientation: Float[Tensor, "4"] | None = None
-    """Orientation of the end effector, turned for the object; None: that of `above`."""
+    """Orientation of the end effector, turned for the object; None: orientation of `above`."""
     rest: Float[Tensor, " joints"] | None = None
-    """Posture to which the null space returns [rad]; None: it stays where it is."""
+    """Posture to which the null space returns [rad]; None: the null space does not return."""
     raised: float = 0.0
     """Height of the goal above the box [m], for probes."""
     kept_camera: Float[Tensor, "13"] | None = None
-    """Camera that places the target, to keep it in place while the estimate learns; None: the
-    present estimate places it."""
+    """Camera that determines the target pixel. It keeps the target in place while the estimate
+    of the camera changes. None: the present estimate determines the target pixel."""
 
     def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool = True) -> Goals:
         """Goals from an estimate of the camera, for the present pose of the end effector."""
-        # A camera that was moved may not see above the box until the marker is detected.
+        # A camera that was moved may not see above the box: do not raise the goal until the
+        # marker is detected.
         offset = torch.tensor([0.0, 0.0, self.raised if detected else 0.0], dtype=torch.float64)
         above = Pose(self.above.position + offset, self.tool_orientation)
         goals = self.config.goals(above, self.pixel(camera, pose), detected=detected)
@@ -368,8 +375,8 @@ class ServoTarget:
     def pixel(self, camera: Float[Tensor, "13"], pose: Pose) -> Float[np.ndarray, "2"]:
         """Target of the marker with the end effector at its present height [px].
 
-        At any height, the target is right above the object, so that a height error of some
-        millimetres does not move the gripper sideways.
+        At any height, the target is the pixel of a marker right above the object. Therefore a
+        height error of some millimetres does not move the gripper sideways.
         """
         camera = camera if self.kept_camera is None else self.kept_camera
         lower_wall = float(self.above.position[2]) - self.config.half_size[2]
@@ -395,10 +402,10 @@ class ServoTarget:
 
     @property
     def demonstrated(self) -> Pose:
-        """Height where demonstrations end, and the orientation of the end effector."""
+        """Height at which demonstrations end, and present orientation of the end effector."""
         return Pose(self.above.position, self.tool_orientation)
 
     @property
     def tool_orientation(self) -> Float[Tensor, "4"]:
-        """Orientation of the end effector."""
+        """Orientation of the end effector: turned for the object, or else that of `above`."""
         return self.above.orientation if self.orientation is None else self.orientation

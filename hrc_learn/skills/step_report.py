@@ -17,19 +17,19 @@ from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reason
 from hrc_learn.store import read_toml
 
-# Fraction of a motion above which it counts as followed: late servos and the curvature of the
-# null space alone leave no more than this.
+# An arm counts as following the person if it keeps more than this fraction of the requested
+# motion. Late servos and the curvature of the null space alone reduce the fraction to this.
 _FOLLOWED = 0.97
 # Distance from a joint limit below which it is reported [rad]. Pushes end 0.12 rad before the
 # limit, which is the margin of the safety filter plus that of the task.
 _NEAR_LIMIT = 0.15
 # Time between two updates of contacts and joint limits [s]: no device shows them faster.
 _UPDATE_EVERY = 0.1
-# Pace below which an arm waits rather than slows down.
+# Pace below which an arm counts as waiting instead of slowing down.
 _WAITING = 0.05
 
 type Detail = float | int | str
-"""Number or words inserted into the text of a reason."""
+"""Number or words that are inserted into the text of a reason."""
 
 _TABLES = read_toml(Path(__file__).with_name("hindrances.toml"))
 _TEXTS: Mapping[Hindrance, str] = _TABLES["texts"]
@@ -37,7 +37,7 @@ _INTERVENTIONS: Mapping[str, Hindrance] = _TABLES["interventions"]
 
 
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
-    """Reason why a safety filter may have reduced a motion; None: it delayed it at most."""
+    """Reason why a safety filter may have reduced a motion; None: at most it caused a delay."""
     acted = {INTERVENTIONS[int(k)] for k in report.flags.nonzero()}
     return next(
         (hindrance for kind, hindrance in _INTERVENTIONS.items() if kind in acted), None
@@ -47,9 +47,9 @@ def filter_hindrance(report: SafetyReport) -> Hindrance | None:
 def contact_force(
     jacobian: Float[Tensor, "6 joints"], state: ArmState
 ) -> Float[np.ndarray, "3"] | None:
-    """Force at the end effector that fits the external torques best [N].
+    """Force at the end effector that best explains the external torques [N].
 
-    Contacts elsewhere, friction and an unknown load contribute to it too.
+    Contacts elsewhere, friction and an unknown load contribute to this force, too.
 
     Args:
         jacobian: Jacobian of the end effector.
@@ -91,13 +91,13 @@ class PersonFeedback:
     def note(
         self, cause: Hindrance, kept: float = 1.0, *, mention: bool = False, **details: Detail
     ) -> None:
-        """Note a cause.
+        """Note a cause that limits the motion.
 
         Args:
             cause: Cause of the limitation.
             kept: Fraction of the motion that remains, 0 to 1.
             mention: Report the cause even if it does not reduce the motion.
-            details: Values for its text.
+            details: Values for the text of the cause.
         """
         self._followed *= kept
         if kept < _FOLLOWED or mention:
@@ -140,17 +140,17 @@ class PersonFeedback:
         load: GraspedBox | None = None,
         contact_expected: bool = False,
     ) -> Feedback:
-        """Feedback of this step; the next one begins without hindrances.
+        """Feedback of this step; the next step begins without hindrances.
 
         Args:
             state: Reading of the arm.
-            jacobian: Jacobian of its end effector; None: computed when needed.
+            jacobian: Jacobian of the end effector; None: computed when needed.
             pushed: True if the person asks for a motion.
             person_distance: Distance of the nearest person [m], NaN while it is not known;
                 None: people are not tracked.
             pace: Speed scale imposed on the task, 0 to 1.
-            load: Object in the gripper; None: none.
-            contact_expected: True while, or shortly after, the task probes for contact.
+            load: Object in the gripper; None: no object.
+            contact_expected: True while the task searches for a contact, or shortly after.
         """
         # The clock jumps back if a simulation is restarted.
         if not 0 <= state.time - self._updated < _UPDATE_EVERY:
@@ -165,7 +165,7 @@ class PersonFeedback:
             followed = self._followed
             reasons = tuple(
                 Reason(hindrance=cause, kept=kept, text=_TEXTS[cause].format(**known | details))
-                # The strongest first.
+                # The cause that limits the motion most comes first.
                 for cause, (kept, details) in sorted(
                     self._causes.items(), key=lambda item: item[1][0]
                 )
@@ -184,7 +184,7 @@ class PersonFeedback:
         )
 
     def _update(self, state: ArmState, jacobian: Float[Tensor, "6 joints"] | None) -> None:
-        """Look for joints near their limits, and for contacts."""
+        """Find joints near their limits, and estimate the contact force."""
         q, names = state.joint_position, self._chain.joint_names
         distance = np.minimum(q - self._lower, self._upper - q)
         self._nearest = int(distance.argmin()) + 1
@@ -233,9 +233,9 @@ def step_columns(
 
     Args:
         state: Reading of the arm.
-        velocity: Joint velocity sent to it [rad/s].
-        effort: Null-space input [N m].
-        report: Report of the loop.
+        velocity: Joint velocity sent to the arm [rad/s].
+        effort: Null-space input of the person [N m].
+        report: Report of the control loop.
         feedback: Feedback to the person.
     """
     goal, path = report.goal, report.path_joints
@@ -261,7 +261,7 @@ def separation_columns(
     velocity: Float[Tensor, " joints"],
     people_scale: float,
 ) -> dict[str, float]:
-    """Log columns of the distance from people and of the protective distance at this speed.
+    """Log columns: distance from people, and protective distance at the present speed.
 
     The protective distance is zero for contacts that power and force limiting allows.
 

@@ -34,10 +34,11 @@ from hrc_learn.skills.visual_skill import MarkerAngle
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
-# Fractions of the probe height, tried until the marker's target there is well within the image.
+# Fractions of the probe height. They are tried in turn until the marker's target pixel at that
+# height is well within the image.
 _PROBE_FRACTIONS = np.array([1.0, 0.75, 0.5])
-# Largest predicted error above the object with which the gripper turns for the object [m]: with
-# a larger one, the camera's estimated orientation may be entirely wrong.
+# Largest predicted error above the object with which the gripper turns for the object [m]. With
+# a larger error, the camera's estimated orientation may be entirely wrong.
 _LOST = 0.03
 _NOT_SEEN = np.full(2, np.nan)
 _NOT_FOUND = SeenFeature(_NOT_SEEN, np.nan)
@@ -45,7 +46,7 @@ _NOT_FOUND = SeenFeature(_NOT_SEEN, np.nan)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ServoReading:
-    """Measurements and requests of one step of visual servoing."""
+    """Measurements, and requests of the person, for one step of visual servoing."""
 
     time: float
     """Time [s]."""
@@ -106,7 +107,7 @@ class ServoState:
     arrived: bool = False
     """True once the joint-space approach is over."""
     held: MarkerConsistency | None = None
-    """Test that the marker moves with the held end effector; None: it is not held."""
+    """Test that the marker moves with the held end effector; None: servoing does not hold."""
     posture_gain_scale: float = 1.0
     """Scale of the speed at which the null space returns, 0 while a person pushes it."""
 
@@ -177,7 +178,7 @@ class ServoStep:
         self._drawn = DrawnGoals(self.config.drawn, refusal)
 
     def initial_state(self, joints: Float[Tensor, " joints"]) -> ServoState:
-        """State of an arm at rest at joint positions [rad]."""
+        """State of an arm at rest at the joint positions `joints` [rad]."""
         controller = self.controller.initial_state(joints)
         return ServoState(
             controller=controller,
@@ -194,7 +195,7 @@ class ServoStep:
             state: State at the end of the last motion.
             time: Present time [s].
             motion: Present motion of the arm, from the safety filter of the loop that has moved
-                it since the last target.
+                the arm since the last target.
         """
         controller, pause = state.controller, time - state.last_image
         if 0 < pause < np.inf:
@@ -214,7 +215,7 @@ class ServoStep:
         )
 
     def observed(self, state: ServoState, reading: ServoReading) -> ServoState:
-        """State with the camera and the image Jacobian at the newest image."""
+        """State with the camera and the image Jacobian estimated for the newest image."""
         if reading.markers.time == state.image_jacobian_time:
             return state
         pose, estimate = self.chain.forward(reading.image_joints), state.controller.estimator
@@ -273,13 +274,13 @@ class ServoStep:
         return ServoCommand(command, goals, feature, approach, remark), state
 
     def tool_target(self, state: ServoState, target: ServoTarget) -> ServoTarget:
-        """The target in the wanted orientation, with the turn of the person."""
+        """The target in the wanted orientation, turned further by the person."""
         return self._oriented(state, target, state.wanted_orientation)
 
     def pixel_error(
         self, state: ServoState, reading: ServoReading, target: ServoTarget
     ) -> float:
-        """Distance of the feature from its target [px]; NaN if it is not detected."""
+        """Distance of the marker from its target [px]; NaN if the marker is not detected."""
         pixel = self.tool_target(state, target).pixel(state.camera, reading.pose)
         return float(np.linalg.norm(self.feature(reading) - pixel))
 
@@ -294,7 +295,7 @@ class ServoStep:
         return float(quaternion.angle(pose.orientation, goal))
 
     def probe_height(self, state: ServoState, target: ServoTarget) -> float:
-        """Largest height of a probe at which its marker is well within the image [m]."""
+        """Largest height of a probe at which the marker is well within the image [m]."""
         turned = self.tool_target(state, target)
         for height in self.config.probe * _PROBE_FRACTIONS:
             up = torch.tensor([0.0, 0.0, float(height)], dtype=torch.float64)
@@ -313,13 +314,16 @@ class ServoStep:
         return missing > self.config.lost_after and not inside.all()
 
     def feature(self, reading: ServoReading) -> Float[np.ndarray, "2"]:
-        """Pixel of the end effector's marker; NaN if it is not detected [px]."""
+        """Pixel of the end effector's marker [px]; NaN if the marker is not detected."""
         return reading.markers.features.get(self.marker, _NOT_FOUND).pixel
 
     def _visible_feature(
         self, state: ServoState, reading: ServoReading
     ) -> tuple[ServoState, Float[np.ndarray, "2"]]:
-        """Pixel of the marker, NaN where it is half hidden while the end effector is held."""
+        """Next state, and pixel of the marker [px].
+
+        While the end effector is held, the pixel is NaN if the marker is half hidden.
+        """
         feature = self.feature(reading)
         if state.held is None:
             return state, feature
@@ -334,7 +338,7 @@ class ServoStep:
     def _with_wanted_orientation(
         self, state: ServoState, reading: ServoReading, target: ServoTarget
     ) -> ServoState:
-        """State with the orientation for the object, from a new image."""
+        """State with the orientation that suits the object in a new image."""
         if self._angle is None or target.angle is None or not state.detected:
             return state
         if self.uncertainty(state, target) > _LOST:
@@ -350,7 +354,10 @@ class ServoStep:
     def _turned_further(
         self, state: ServoState, target: ServoTarget, feature: Float[np.ndarray, "2"], dt: float
     ) -> ServoState:
-        """State with the goal turned further, unless the marker would leave the image."""
+        """State with the goal turned further towards the wanted orientation.
+
+        The goal does not turn if the marker would leave the image.
+        """
         wanted = state.wanted_orientation
         if wanted is None or not np.isfinite(feature).all():
             return state
@@ -369,11 +376,14 @@ class ServoStep:
     def _goals(
         self, state: ServoState, reading: ServoReading, target: ServoTarget
     ) -> tuple[Goals, ServoState, str]:
-        """Goals from target, resting posture and drawing; next state; message to the person."""
+        """Goals of the controller, next state, and message to the person (empty: none).
+
+        The goals combine the target, the resting posture and the drawing of the person.
+        """
         target = self._oriented(state, target, state.goal_orientation)
         if state.arrived:
-            # A person's pull, or a turn for the object, moves the joints far from the posture:
-            # that must not restart the approach, not even while the marker is out of view.
+            # A person's pull, or a turn for the object, may move the joints far from the
+            # posture. The approach must not start again then, even with the marker out of view.
             target = replace(target, posture=None)
         planned = target.goals(state.camera, reading.pose, detected=state.detected)
         pushed = reading.effort.any()
@@ -396,7 +406,7 @@ class ServoStep:
     def _oriented(
         self, state: ServoState, target: ServoTarget, orientation: Tensor | None
     ) -> ServoTarget:
-        """The target in an orientation (None: its own), turned further by the person."""
+        """The target in an orientation (None: `above`), turned further by the person."""
         tool = replace(target, orientation=orientation).tool_orientation
         return replace(target, orientation=quaternion.multiply(state.drawn.turn, tool))
 
@@ -421,7 +431,7 @@ class VisualServo:
         self.state = law.initial_state(cell.joints)
 
     def servo_to(self, target: ServoTarget) -> float:
-        """Bring the marker to the target, and probe until the target is certain.
+        """Bring the marker to the target, and probe until the target is known well enough.
 
         Returns:
             Duration [s].
@@ -433,7 +443,7 @@ class VisualServo:
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
         for _ in range(config.max_probes):
-            # Unless the camera is known well, the gripper first passes a point higher up.
+            # If the camera is not known well, the gripper first passes a point higher up.
             self._read()
             if self._law.uncertainty(self.state, target) > config.object_error:
                 raised = replace(target, raised=self._law.probe_height(self.state, target))
@@ -456,7 +466,8 @@ class VisualServo:
             duration: Duration [s].
         """
         end = self._cell.time + duration
-        # Learning during the hold must not move the target; a turn by the person must.
+        # The camera estimate keeps learning, but must not move the target during the hold. A
+        # turn by the person still moves the target.
         self._read()
         held = replace(target, kept_camera=self.state.camera)
         self.state = replace(
@@ -469,11 +480,11 @@ class VisualServo:
         self.state = replace(self.state, held=None)
 
     def error(self, target: ServoTarget) -> float:
-        """Distance of the feature from its target [px]; NaN if it is not detected."""
+        """Distance of the marker from its target [px]; NaN if the marker is not detected."""
         return self._law.pixel_error(self.state, self._read(), target)
 
     def orientation(self, unturned: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
-        """Orientation of the end effector for the object, with the turn of the person.
+        """Orientation of the end effector for the object, turned further by the person.
 
         Args:
             unturned: Orientation of an end effector that is not turned for an object.
@@ -508,7 +519,7 @@ class VisualServo:
     def _near(self, target: ServoTarget, tolerance: float) -> bool:
         """True if the marker is within a tolerance [px] of its target, at the right height.
 
-        It is False while a person's drawing keeps the end effector away.
+        The result is False while a person's drawing keeps the end effector away.
         """
         reading = self._read()
         height = float(reading.pose.position[2] - target.above.position[2])

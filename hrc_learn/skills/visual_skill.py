@@ -21,7 +21,7 @@ from hrc_learn.store import Radians, read_json, write_json
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OBJECT_FEATURE = "observation.object_feature"
-"""Dataset column with the object's marker in the image."""
+"""Dataset column with the pixel and the visibility of the object's marker."""
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
 ANGLE_FEATURE = "observation.marker_angle"
 """Dataset column with the directions of both markers in the image [rad]."""
@@ -29,8 +29,8 @@ ANGLE_FEATURE_NAMES = ("tool", "object")
 HALF_TURN = math.pi
 """Turn after which a parallel gripper grasps an object in the same way [rad]."""
 
-# Distance outside the range up to which a chosen turn is kept [rad]: the error of its estimate
-# while the camera is uncertain.
+# A chosen turn is kept until it lies further than this outside the range of turns [rad]. This
+# is the error of an estimated turn while the camera is uncertain.
 _KEPT = 0.15
 
 
@@ -43,7 +43,7 @@ class MarkerAngle:
 
     version: Literal[2] = 2
     offset_rad: Radians
-    """Heading of the tool's x axis less that of the marker's, modulo half turns [rad]."""
+    """Heading of the tool's x axis minus heading of the marker, modulo half turns [rad]."""
     spread_rad: Radians
     """Root mean square deviation of the offset among the demonstrations [rad]."""
 
@@ -61,9 +61,9 @@ class MarkerAngle:
         Args:
             camera: Camera of the demonstrations.
             objects: Pixels of the object's marker [px].
-            angles: Directions of that marker in the image [rad].
-            poses: Poses of the end effector right above it, (demos,).
-            target: Place of the object in the tool frame.
+            angles: Directions of the object's marker in the image [rad].
+            poses: Poses of the end effector right above the object, (demos,).
+            target: Position of the object's marker in the tool frame.
         """
         differences = []
         for pixel, direction, k in zip(objects, angles, range(len(angles)), strict=True):
@@ -89,12 +89,12 @@ class MarkerAngle:
             heading: Heading of the object's marker (see `object_heading`) [rad].
             reference: Orientation of a tool that is not turned.
             now: Present turn of the tool [rad].
-            turn_range: Smallest and largest turn [rad]. Among the turns that differ by half
-                turns, the one in the range that is nearest to `now` is chosen; if none is, the
-                end of the range nearest to one of them. It is kept until it is well outside the
-                range: otherwise noise would turn the tool back and forth near an end of the
-                range.
-            chosen: Turn chosen before [rad]; None: none.
+            turn_range: Smallest and largest turn [rad]. Turns that differ by half turns are
+                equivalent. Of those in the range, the turn nearest to `now` is chosen; if none
+                is in the range, the end of the range nearest to one of them.
+            chosen: Turn chosen before [rad]; None: none. Its equivalent is kept until it is
+                well outside the range: otherwise noise would turn the tool back and forth near
+                an end of the range.
         """
         turn, (low, high) = heading + self.offset_rad - _heading(reference), turn_range
         candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
@@ -137,17 +137,17 @@ class VisualServoSkill:
     approach: Approach | None = None
     """Approach direction; None if the demonstrations show no object."""
     angle: MarkerAngle | None = None
-    """Demonstrated turn of the gripper; None if marker directions were not recorded, so that
-    the gripper does not turn."""
+    """Demonstrated turn of the gripper; None if marker directions were not recorded: the
+    gripper then does not turn for the object."""
     learned: EvidenceResult | None = None
     """Learned RBF centres, noise and prior; None if they were given."""
     landmarks: Landmarks | None = None
-    """Landmarks of tool and objects; None if they carry markers."""
+    """Landmarks of tool and objects; None if tool and objects carry markers."""
     cells: CellErrors | None = None
     """Held-out errors of each cell of a grid; None for a loaded skill."""
 
     def save(self, folder: Path) -> None:
-        """Write the image Jacobian, and whatever else was learned with it."""
+        """Write the image Jacobian and all other learned parts that are not None."""
         self.jacobian.save(folder / "jacobian")
         if self.target is not None:
             self.target.save(folder / "visual_target.json")

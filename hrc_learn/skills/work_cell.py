@@ -48,15 +48,17 @@ from hrc_learn.skills.step_report import (
 
 # Longest time for the joints to return at the end of a path [s].
 _LONGEST_RETURN = 5.0
-# Time at the end of a straight line for the pose error to decay by pose_gain [s].
+# Time at the end of a straight line in which the pose error decays at the rate `pose_gain` [s].
 _SETTLING_TIME = 0.4
-# Longest total delay of a straight line that waits for a lagging end effector [s]: the goal may
-# be out of reach.
+# Longest total time for which a straight line waits for a lagging end effector [s]: the goal
+# may be out of reach.
 _LONGEST_LAG = 5.0
-# Number of torque readings that are averaged, and of steps until the arm has overcome friction.
+# `_AVERAGED`: number of torque readings that are averaged. `_GETTING_UNDER_WAY`: number of
+# steps until the arm has overcome friction.
 _AVERAGED, _GETTING_UNDER_WAY = 5, 25
-# Time after a search for contact in which contacts are still expected [s]: the fingers open and
-# the gripper leaves. Longest time for a stopped arm to come to rest [s].
+# `_LEAVING`: time after a search for contact in which contacts are still expected [s], since
+# the fingers open and the gripper leaves. `_COMING_TO_REST`: longest time in which a stopped
+# arm comes to rest [s].
 _LEAVING, _COMING_TO_REST = 1.0, 1.0
 _STILL = torch.zeros(6, dtype=torch.float64)
 
@@ -79,12 +81,12 @@ class BlockedPathError(TaskFailedError):
 
 @dataclass(frozen=True, kw_only=True)
 class WorkCellConfig(ArmLoopConfig):
-    """Settings of the control loop, and of the camera in it."""
+    """Settings of the control loop and of its camera."""
 
     detect_every: int = 4
     """Control steps between two detections while markers are tracked."""
     keep_image_every: int = 40
-    """Control steps between two images kept for the recording; 0: none is kept."""
+    """Control steps between two images kept for the recording; 0: no images are kept."""
     latency: LatencyConfig = field(default_factory=LatencyConfig)
     """Delay and loss of the camera's images."""
 
@@ -94,16 +96,16 @@ class KeptImage:
     """An image kept for the recording."""
 
     time: float
-    """Time at which it was taken [s]."""
+    """Time at which the image was taken [s]."""
     image: UInt8[np.ndarray, "height width 3"]
 
 
 class WorkCell:
     """Control loop of a work cell: read, command, let time pass, detect, log.
 
-    The law is `ArmLoop`; this class connects it to drivers, a clock, a camera, a person and a
-    log. Skills move the arm through it and know protocols only. A callable lets time pass: it
-    steps a simulator, or waits for real hardware.
+    `ArmLoop` computes the commands. This class connects it to drivers, a clock, a camera, a
+    person and a log. Skills move the arm through a work cell and need not know any drivers. A
+    callable lets time pass: it steps a simulator, or waits for real hardware.
 
     Attributes:
         chain: Kinematics and hand of the arm.
@@ -112,11 +114,12 @@ class WorkCell:
         state: Newest reading of the arm.
         loop_state: State of the control loop: safety filter, pace, null space, path.
         human: Person near the arm; may be replaced between two steps.
-        human_input: Newest input of that person, with its null-space effort smoothed.
+        human_input: Newest input of the person, with a smoothed null-space effort.
         observation: Newest detection of markers that has arrived.
         load: Object in the gripper, which must keep its distance from people as well.
         tracked_markers: Markers detected every `detect_every` steps; empty: none.
-        region: Position region of the last controller command; None: there was none.
+        region: Position region of the last command, if it came from the adaptive controller;
+            else None.
         plan: Joint path being followed [rad]; None: none.
         log: Columns of every step so far, and the phases of the task.
         remarks: Messages to the person, with their times [s].
@@ -148,16 +151,17 @@ class WorkCell:
             chain: Kinematics and hand of the arm.
             arm: Driver of the arm.
             gripper: Driver of its gripper.
-            sensor: Fixed camera with its marker detector; None where a task needs none.
+            sensor: Fixed camera with its marker detector; None if the task needs no camera.
             human: Person near the arm.
             advance: Lets a given time pass [s].
             config: Settings of the loop.
             on_phase: Called with the name of each phase of the task and its start time [s].
-            rng: Source of lost images.
-            clearance: Distance of the arm at given joint positions from itself and its
-                surroundings [m]; None: a push can move the arm anywhere within its limits.
-            watch: Distances from tracked people, near whom the arm slows down or waits; None:
-                people are not tracked.
+            rng: Random generator that decides which images are lost.
+            clearance: Function from joint positions [rad] to the distance of the arm from
+                itself and its surroundings [m]; None: a push can move the arm anywhere within
+                its limits.
+            watch: Source of the distances from tracked people; the arm slows down or waits near
+                people. None: people are not tracked.
         """
         self.config = config or WorkCellConfig()
         self.chain, self.gripper, self.human = chain, gripper, human
@@ -177,7 +181,7 @@ class WorkCell:
         self.images: list[KeptImage] = []
         self.remarks: list[Event] = []
         self._stopping = False
-        # Time until which contacts are expected, because the task searches for one [s].
+        # Contacts are expected until this time, because the task searches for a contact [s].
         self._contact_expected = -math.inf
         state = arm.read()
         asked = human.read(state)
@@ -211,17 +215,17 @@ class WorkCell:
 
     @property
     def distances(self) -> Distances | None:
-        """Distances from people, for a safety filter to keep; None: people are not tracked."""
+        """Distances from people that a safety filter keeps; None: people are not tracked."""
         return None if self._reading.people is None else self._reading.people.distances
 
     @property
     def pace(self) -> TaskPace:
-        """Pace of the task, which people near the arm and pauses slow down."""
+        """Pace of the task; people near the arm, and pauses, slow it down."""
         return self.loop_state.pace
 
     @property
     def task_time(self) -> float:
-        """Clock without the time lost to people near the arm and to pauses [s]."""
+        """Time spent on the task [s], without the time lost to people and pauses."""
         return float(self.pace.time)
 
     def watchful(self, safety: SafetyConfig) -> SafetyConfig:
@@ -249,7 +253,7 @@ class WorkCell:
         self.observation = self._markers.newest(self.time) or self.observation
 
     def wait_for_detection(self) -> MarkerObservation:
-        """Hold still until an image taken from now on has arrived, and return its markers."""
+        """Hold still until an image taken after this call has arrived; return its markers."""
         now = self.time
         self.detect()
         while self.observation.time < now:
@@ -286,7 +290,7 @@ class WorkCell:
 
         Args:
             goal: Pose that the end effector should have.
-            twist: Velocity of that pose (linear [m/s], angular [rad/s]).
+            twist: Velocity of this pose (linear [m/s], angular [rad/s]).
         """
         self._act(TrackPose(pose=goal, twist=twist))
 
@@ -297,8 +301,8 @@ class WorkCell:
     def move_straight(self, goal: Pose, speed: float = 0.15) -> None:
         """Move the end effector to a pose on a straight line, and let it settle.
 
-        The motion slows down where the end effector falls behind, for example at a joint limit
-        to which a person pushed the arm; this may cost 5 s in all.
+        The motion slows down while the end effector lags behind, for example at a joint limit
+        to which a person pushed the arm. This may cost 5 s in all.
 
         Args:
             goal: Pose at the end.
@@ -325,9 +329,10 @@ class WorkCell:
 
         Args:
             goal: Pose at the end, if nothing is met.
-            speed: Mean speed [m/s]: the object is pressed further while the arm stops.
-            force: Contact force against the motion [N], as a change since the arm got under
-                way: the estimate also contains friction and an unknown load.
+            speed: Mean speed [m/s]. Choose it low: the arm presses on until it has stopped.
+            force: Contact force against the motion that counts as a contact [N]. The force is
+                measured relative to its value after the arm got under way, because the estimate
+                also contains friction and an unknown load.
 
         Returns:
             Pose of the end effector at the contact; None if there was none, or if the arm does
@@ -365,7 +370,7 @@ class WorkCell:
             now = float(np.mean(felt))
             free = now if free is None else free
             if now - free > force:
-                # The arm pressed on while readings were averaged: the contact was at before[0].
+                # The arm moved on while readings were averaged: the contact began at before[0].
                 self.hold_pose(_AVERAGED * self.config.dt)
                 return before[0]
         return None
@@ -376,10 +381,10 @@ class WorkCell:
         """Move the joints along a path sampled at the control step, yielding to the person.
 
         While a person pushes, the end effector keeps to the poses of the path, and the null
-        space yields. The path waits where an arm that was pushed aside cannot follow: where it
-        would collide, before a singularity of the path, and where the joints might be unable to
-        return. After a push the joints return to the path, even at its end, or stay off it
-        (`WorkCellConfig.after_push`).
+        space yields. The path waits where an arm that was pushed aside cannot follow: before a
+        collision, before a singularity of the path, and where the joints might be unable to
+        return. After a push, the joints return to the path, even at the end of the path, or
+        stay aside (`WorkCellConfig.after_push`).
 
         Args:
             path: Joint positions [rad].
@@ -419,7 +424,13 @@ class WorkCell:
     def _track_line(
         self, line: StraightLine, passed: float, rate: float = 1.0
     ) -> tuple[Pose, Float[Tensor, "6"]]:
-        """Take one step along a line, a time after its start [s]; return its pose and twist."""
+        """Take one step along a line; return the pose and the twist that were tracked.
+
+        Args:
+            line: The line.
+            passed: Time since the start of the line [s].
+            rate: Speed relative to the line's own speed, 0 to 1.
+        """
         now = min(passed + self.config.dt, line.duration)
         pose, _ = line.at(now)
         _, twist = line.at(min(now + self.config.command_delay, line.duration))
@@ -474,7 +485,7 @@ class WorkCell:
         self._read()
 
     def _read(self) -> None:
-        """Read the arm, its person and tracked people, take images, and stop if requested."""
+        """Read the arm, its person and the tracked people; take images; stop if requested."""
         state = self._arm.read()
         self._markers.remember(state.time, state.joint_position)
         asked = self.human.read(state)
@@ -525,7 +536,7 @@ class WorkCell:
             self.images.append(KeptImage(time=self.time, image=image))
 
     def _give_up_if_blocked(self) -> None:
-        """Raise if people block the arm for too long, or obstacles block its return."""
+        """Raise if people block the arm for too long, or if obstacles block its return."""
         blocked = "a person has been in the way of the arm"
         self._give_up_after(float(self.pace.blocked_for), blocked, "clear its path")
         if self.loop_state.path.direct_return.blocked:
@@ -535,7 +546,13 @@ class WorkCell:
             )
 
     def _give_up_after(self, waited: float, blocked: str, cure: str) -> None:
-        """Give the task up once it has waited for `longest_wait`."""
+        """Raise if the task has waited for longer than `longest_wait`.
+
+        Args:
+            waited: Time for which the task has waited [s].
+            blocked: What the task waited for, as the start of the message.
+            cure: What a person can do about it.
+        """
         if waited > self.config.longest_wait:
             raise TaskFailedError(
                 f"{blocked} for {waited:.0f} s: {cure}, or raise longest_wait."
