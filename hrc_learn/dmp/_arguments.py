@@ -82,7 +82,7 @@ def readable(*tensors: Tensor) -> bool:
     if torch.compiler.is_compiling():
         return False
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    # A loop, because a comprehension takes as long as the matrix product of a short rollout.
+    # A loop is faster: a comprehension takes as long as the matrix product of a short rollout.
     for x in tensors:
         if functorch.is_functorch_wrapped_tensor(x):
             return False
@@ -111,7 +111,7 @@ def transforming() -> bool:
 
 
 def refuse_nested_forward(s: Tensor) -> None:
-    """Raise NotImplementedError if times may be inside two nested forward derivatives.
+    """Raise NotImplementedError if times `s` may be inside two nested forward derivatives.
 
     PyTorch then silently treats the outer derivative of an `autograd.Function` as zero.
     """
@@ -257,7 +257,7 @@ def normalised_time(
             f"time has shape {tuple(time.shape)}, but there are {tuple(duration.shape)} "
             f"durations: time must be (T,) or {(*duration.shape, time.shape[-1])}"
         ) from None
-    # Identical grids collapse to one, which needs one response matrix for the whole batch.
+    # If all grids are identical, one response matrix serves the whole batch.
     if readable(time, duration) and not (time.requires_grad or duration.requires_grad):
         time, duration = _collapse_identical(time, 1), _collapse_identical(duration, 0)
     return time / duration.double()[..., None]
@@ -277,7 +277,7 @@ def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[T
 
 
 def _collapse_identical(values: Tensor, ndim: int) -> Tensor:
-    """First of a batch of `ndim`-dimensional tensors if all are equal, else the batch."""
+    """First tensor of a batch of `ndim`-dimensional tensors if all are equal, or the batch."""
     if values.ndim == ndim:
         return values
     first = values[(0,) * (values.ndim - ndim)]

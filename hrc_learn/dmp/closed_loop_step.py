@@ -1,7 +1,7 @@
-"""State of a primitive in closed loop, and its exact step.
+"""State of a primitive that runs in closed loop, and the exact step to the next state.
 
-The equation is linear, so each term (forcing, goal filter, coupling) has a particular solution,
-which is known at both ends of a step. The difference between the state and the sum of these
+The equation of motion is linear, so each term (forcing, goal filter, coupling) has a particular
+solution, which is known before and after a step. The difference between the state and the sum of these
 solutions decays as the unforced spring does. Steps of any length are therefore exact.
 """
 
@@ -20,8 +20,9 @@ from hrc_learn.dmp.response import Response
 from hrc_learn.geometry import minimum_jerk
 
 RESONANCE = 1e-3
-"""Smallest |rate^2 - alpha rate + alpha beta| / (alpha beta) of a goal filter; it is zero at a
-mode of the spring. The particular solution grows with its inverse, and digits are lost."""
+"""Smallest allowed |rate^2 - alpha rate + alpha beta| / (alpha beta) of a goal filter. If this
+ratio is near zero, the rate is near a mode of the spring: the particular solution gets so large
+that digits are lost."""
 _FULL_PACE = torch.ones((), dtype=torch.float64)
 """Pace of an undisturbed motion, made once because making a tensor takes longer than a sum."""
 
@@ -30,8 +31,8 @@ _FULL_PACE = torch.ones((), dtype=torch.float64)
 class DMPState:
     """State of a primitive in closed loop; every step returns a new one.
 
-    A pytree that passes through `torch.func` and `torch.export`. To follow a robot that was
-    pushed, replace the position by the measured one.
+    It is a pytree that passes through `torch.func` and `torch.export`. To follow a robot that
+    was pushed, replace the position by the measured one.
     """
 
     position: Float[Tensor, "*batch D"]
@@ -81,10 +82,10 @@ def step(
         ds: Step in normalised time (float64); a number if nothing traces or differentiates it.
         response: Response of the primitive.
         weights: Weights of the unscaled forcing term.
-        scale: Function that scales states (*batch, K, D) caused by the forcing term.
-        gain: Factor on these states.
+        scale: Function that scales states (*batch, 2, D) caused by the forcing term.
+        gain: Factor on the scaled states.
         goal_filter: Rate in dg/ds = -rate (g - target); None: the goal jumps to its target.
-        push: Second derivative with respect to s that is added to the motion.
+        push: Term added to the second derivative of the position with respect to s.
         pace: Speed of the clock, stored for the velocity.
     """
     spring, s, target = response.spring, state.s + ds, state.target
@@ -98,7 +99,7 @@ def step(
     forced = forced.to(target) @ weights.mT
     if isinstance(coast, Tensor) or coast > 0:  # after the forcing, the spring acts alone
         forced = spring.propagator(coast).to(target) @ forced
-    # States caused by the forcing at both ends of the step; the difference to them decays.
+    # States caused by the forcing before and after the step. The offset from them decays.
     before, after = scale(state.forced), scale(forced)
     if gain is not None:
         before, after = gain * before, gain * after
@@ -112,7 +113,7 @@ def step(
     if goal_filter is not None:
         goal, lag_before, lag_after = _filtered(state.goal, target, ds, goal_filter, spring)
         before, after = before + lag_before, after + lag_after
-    # Relative to the equilibrium, at which the spring balances a push.
+    # Positions are relative to the equilibrium, at which the spring balances a push.
     rest = target if push is None else target + push / spring.stiffness
     y = torch.stack([state.position - rest, state.rate], dim=-2)
     E, y = E.to(target), y - before
@@ -145,8 +146,8 @@ def numpy_step(
     Args:
         E: Transition matrix of the spring over the step.
         y: State before the step.
-        before: State caused by the forcing before the step.
-        after: State caused by the forcing after the step.
+        before: State caused by the forcing, at the beginning of the step.
+        after: State caused by the forcing, at the end of the step.
         rest: Equilibrium of the spring.
     """
     offset = y - before
@@ -218,7 +219,7 @@ def numpy_approach(
 def _filtered(
     goal: Tensor, target: Tensor, ds: Tensor | float, rate: float, spring: SpringDamper
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Filtered goal after a step, and the state (y - target, y') it causes before and after.
+    """Filtered goal g after a step, and the states (y - target, y') it causes before and after.
 
     For a goal that decays to its target, the particular solution is y_p = target +
     k (g - target) with k = alpha beta / (rate^2 - alpha rate + alpha beta).

@@ -1,19 +1,20 @@
 """Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
-`step` takes their results as `phase_stopping` or as `coupling`. Each obstacle is given by the
+`step` takes the terms as `phase_stopping` or as `coupling`. Each obstacle is given by the
 nearest point on its surface, so the terms need no shapes.
 
-Forces and the distance to a second arm act on the velocity (Gams et al. 2014, "Coupling
-movement primitives: interaction with the environment and bimanual tasks"). The spring opposes a
-push on the acceleration; a term C added to the velocity moves the primitive as a whole:
+Errors of force, and of the distance to a second arm, act on the velocity (Gams et al. 2014,
+"Coupling movement primitives: interaction with the environment and bimanual tasks"). The spring
+would oppose a term in the acceleration. A term C in the velocity moves the whole primitive:
 
     tau z_dot = alpha (beta (g - y) - z) + f + lead tau C_dot,   tau y_dot = z + C
 
-C = tau gain error, with an error of force or of distance. A goal that contradicts the wanted
-force still pulls: at rest, feedback alone leaves the fraction 1 / (1 + K gain) of the error,
-with K = k tau / beta in contact with a stiffness k, and K = 2 tau / beta between two arms. If
-the feedback of one repetition is the feed-forward of the next, the error falls by this factor
-again. A coupling is held constant over each step, with an error of first order in the step.
+Here f is the forcing term, z the scaled velocity, and C = tau gain error. If the goal g
+contradicts the wanted force, the spring still pulls to g: at rest, feedback alone leaves the
+fraction 1 / (1 + K gain) of the error, with K = k tau / beta in contact with a stiffness k, and
+K = 2 tau / beta between two arms. If the next repetition applies the feedback of this one as
+feed-forward, the error decreases by this factor again. A coupling is constant over each step,
+which causes an error of first order in the step.
 
 Two arms keep an offset if the arm at `position` receives minus the error and the other arm plus
 the error, with error = wanted - (other - position). To follow a leader, the follower receives
@@ -58,10 +59,11 @@ def steering(
 ) -> Float[Tensor, "*batch 3"]:
     """Acceleration that turns the velocity away from obstacles ahead [m/s^2].
 
-    The term is gamma R v phi exp(-beta phi), with the angle phi between velocity and obstacle
-    and a quarter turn R away from the obstacle (Hoffmann et al. 2009, "Biologically-inspired
-    dynamical systems for movement generation", eq. 9). It bends the path without changing the
-    speed. An obstacle straight ahead has no effect, because neither side is nearer.
+    The term is gamma R v phi exp(-beta phi). phi is the angle between the velocity v and the
+    direction of the obstacle; R rotates v by 90 degrees away from the obstacle (Hoffmann et al.
+    2009, "Biologically-inspired dynamical systems for movement generation", eq. 9). The term
+    bends the path and keeps the speed. An obstacle straight ahead has no effect, because neither
+    side is nearer.
 
     Args:
         position: [m].
@@ -105,7 +107,7 @@ def repulsion(
     away = position[..., None, :] - obstacles
     distance = away.norm(dim=-1, keepdim=True)
     d = distance.clamp_min(TOUCH)
-    # Beyond `reach` nothing acts.
+    # Obstacles farther than `reach` have no effect.
     strength = gain * (1 / d - 1 / reach).clamp_min(0) / d**2
     return (strength * away / d).sum(-2)
 
@@ -120,8 +122,8 @@ def velocity_coupling(
 ) -> Float[Tensor, "*batch D"]:
     """Coupling for `step` that acts as a term C added to the velocity.
 
-    Eliminating z gives alpha / tau V + (1 + lead) V_dot with V = C / tau: a proportional and
-    a derivative term of the error.
+    The result is alpha / tau V + (1 + lead) V_dot with V = C / tau, from the equations at the
+    top of this module without z: a proportional and a derivative term of the error.
 
     Args:
         velocity: V, such as gain * (wanted - measured force) [m/s].

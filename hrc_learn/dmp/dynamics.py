@@ -21,8 +21,8 @@ from torch import Tensor
 from hrc_learn.geometry.numerics import polynomial
 
 CRITICAL = 1e-12
-"""Bound on |1 - 4 beta / alpha| below which the damping counts as critical. Closer to zero,
-sinh(r s) / r loses more than six digits to cancellation."""
+"""Bound on |1 - 4 beta / alpha| below which the damping counts as critical. At smaller
+values, sinh(r s) / r would lose more than six digits to cancellation."""
 ROUNDING = 38.0
 """Decay exponent beyond which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
 DOMAINS = ("time", "phase")
@@ -81,7 +81,7 @@ class SpringDamper:
     def propagator(self, s: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch 2 2"]:
         """Transition matrix exp(A s), which maps (y - g, y') at 0 to (y - g, y') at `s`.
 
-        exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
+        exp(A s) = C I + S (A + alpha / 2 I) (Cayley-Hamilton theorem); `modes` computes C, S.
         If `s` is a plain number, the result is cached: do not change it in place.
         """
         if not isinstance(s, Tensor):
@@ -92,10 +92,10 @@ class SpringDamper:
         return entries.view(*s.shape, 2, 2)
 
     def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
-        """C and S: exp(-alpha s / 2) times cosh(r s), and times sinh(r s) / r.
+        """C = exp(-alpha s / 2) cosh(r s) and S = exp(-alpha s / 2) sinh(r s) / r.
 
-        r^2 = alpha^2 / 4 - alpha beta. If r is imaginary, cos and sin take the place of cosh
-        and sinh; for r = 0, the factors are 1 and s.
+        r^2 = alpha^2 / 4 - alpha beta. If r is imaginary, cos and sin of |r| s take the place
+        of cosh and sinh; for r = 0, C = exp(-alpha s / 2) and S = s C.
 
         Args:
             s: Normalised time, of a type that `xp` accepts.
@@ -108,7 +108,7 @@ class SpringDamper:
             C = xp.exp(-half * s)
             return C, s * C
         if discriminant > 0:
-            # Both exponents are negative, so nothing overflows at large s, as cosh would.
+            # Both exponents are negative, so nothing overflows at large s; cosh would.
             slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
             return (slow + fast) / 2, (slow - fast) / (2 * rate)
         envelope = xp.exp(-half * s)
@@ -129,7 +129,7 @@ def _cached_propagator(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
 
 
 def approach_curve(s: Float[Tensor, "*batch"], fraction: float, order: int) -> Tensor:
-    """Derivative of m(s) - 1, where the minimum-jerk curve m reaches 1 at s = `fraction`."""
+    """m(s) - 1 or its derivative of an order; the minimum-jerk curve m is 1 at `fraction`."""
     coefficients = (-1.0, 0.0, 0.0, 10.0, -15.0, 6.0)
     for _ in range(order):
         coefficients = tuple(k * c for k, c in enumerate(coefficients))[1:]
@@ -223,7 +223,8 @@ class GaussianBasis:
         """Normalised time over which the forcing is nearly a polynomial of low degree.
 
         Between two neighbours, a normalised Gaussian is a logistic function of s, whose scale
-        is width^2 times the spacing. Its nearest pole is pi times this scale away.
+        is width^2 times the spacing. Its nearest pole, in the complex plane, is pi times this
+        scale away.
         """
         # 1.4 width^2 is 0.45 of the distance to the nearest pole, pi width^2.
         handover = min(0.5, 1.4 * self.width**2) / (self.count - 1)
@@ -311,13 +312,13 @@ class PeriodicBasis:
 class SplineBasis:
     """Uniform cubic B-splines, faded by the phase z: phi_i = B(s / h - i + 2) z.
 
-    B is centred at zero and vanishes beyond two spacings. A weight therefore has no effect at
-    all before c_i - 2 h, and at most four weights act at a time. The splines add up to one
+    B is centred at zero and is zero beyond two spacings. A weight therefore has no effect
+    before c_i - 2 h, and at most four weights act at a time. The splines add up to one
     without normalisation (de Boor 1978, "A practical guide to splines", chapter IX).
 
     The centres are c_i = (i - 2) h, i = 1 ... N, with the spacing h = 1 / (N - 1). The first
     lies one spacing before the start, so that the first interval is complete; the last lies
-    one spacing before the end. The forcing term fades from 1 - 2 h on and is zero from 1 + h.
+    one spacing before the end. The forcing term fades from s = 1 - 2 h to 1 + h, then is zero.
     """
 
     count: int = 50
@@ -404,10 +405,11 @@ def restored_basis(config: dict[str, Any]) -> Basis:
 def balanced_units(
     basis: Basis, A: Float[Tensor, "rows M"], others: int
 ) -> Float[Tensor, "unknown"]:
-    """Units in which a ridge penalises the weights and the next `others` columns alike.
+    """Units of the unknowns in which a ridge penalises all unknowns alike.
 
-    Late weights act through a small phase, so the unit of a weight is 1 / phase at its centre.
-    Other columns, such as the start velocity, are scaled to the size of the largest of these.
+    The columns of A are the weights, then `others` unknowns such as the start velocity. Late
+    weights act through a small phase, so the unit of a weight is 1 / phase at its centre. The
+    other columns are scaled to the size of the largest column of a weight, in these units.
     """
     unit = 1 / basis.phase(basis.centre_times().to(A))
     norm = A.norm(dim=0)

@@ -1,4 +1,4 @@
-"""Primitives for other programs: a NumPy stepper, and the step as a `torch.export` program.
+"""Exports of primitives for other programs: a NumPy stepper, and a `torch.export` program.
 
 The program accepts batches of any size as dictionaries of tensors, so a control loop can run it
 without this package:
@@ -32,11 +32,11 @@ from hrc_learn.geometry import Pose, quaternion
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
 FRAMES = "reference", "goal_velocity"
-"""Fields with the frame of the columns, in the states of different kinds of primitive."""
+"""State fields with the frame of the columns: for orientations and for moving goals."""
 TRACED_BATCH = 3
 """Batch size during tracing: any but 0 and 1, which the tracer would treat as constants."""
 ROUNDINGS = 8
-"""Machine epsilons up to which an angle counts as zero: a quaternion product rounds 7 times."""
+"""Angles up to this many machine epsilons count as zero: quaternion products round 7 times."""
 TRACED_STEP = 1e-3
 """Step [s] with which a program is traced; it accepts any other when it runs."""
 
@@ -56,7 +56,7 @@ class ExportedDMP:
     State and inputs are dictionaries of tensors (B, ...); dt is (B,) [s]. A state is what
     `state_tensors` returns. Inputs are `phase_stopping`, `coupling` and `goal`; a pose has
     `goal_position`, `goal_orientation` and `goal_body` instead of `goal`, and its coupling is
-    (B, 6). All inputs are required; those of `resting_inputs` have no effect.
+    (B, 6). All inputs are required; the values of `resting_inputs` have no effect.
     """
 
     def save(self, folder: str | Path) -> None:

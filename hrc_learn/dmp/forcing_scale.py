@@ -1,11 +1,14 @@
 """Scalings of the forcing term with start and goal, selected by name.
 
+With the start y_0 and the goal g:
+
 - `"none"`: no scaling. Weights are accelerations; a new goal shifts the motion smoothly.
-  Defined for every start and goal, hence the default.
-- `"paper"`: g - y_0, as printed in the paper. The motion grows with the distance to the goal,
-  and is mirrored if the goal lies on the other side; undefined for demonstrations with g = y_0.
-- `"amplitude"`: the range of each coordinate in the demonstration. Weights are dimensionless,
-  so a scaled demonstration has the same weights; also defined for g = y_0.
+  This is the default, because it is defined for every start and goal.
+- `"paper"`: factor g - y_0, as printed in the paper. The motion grows with the distance to the
+  goal, and is mirrored if the goal lies on the other side. The scaling is undefined for
+  demonstrations with g = y_0.
+- `"amplitude"`: factor equal to the range of each coordinate in the demonstration. Weights are
+  dimensionless, so a scaled demonstration has the same weights; also defined for g = y_0.
 - `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
   space; see `_rotated`.
 """
@@ -21,13 +24,13 @@ from torch import Tensor
 from hrc_learn.dmp.samples import demo_label
 
 MINIMUM_DISPLACEMENT = 1e-3
-"""Smallest |g - y_0| that may divide weights, relative to the range. A smaller one would make
-them over a thousand times as large as division by the range does."""
+"""Smallest |g - y_0| that may divide weights, relative to the range. A smaller divisor would
+give weights over a thousand times as large as division by the range."""
 HALF_TURN = 1e-3
 """Difference [rad] from half a turn below which a rotation counts as half a turn."""
 NO_DIRECTION = 1e-24
-"""Squared ratio of a displacement to the demonstrated one below which it has no direction:
-start and goal then agree to rounding, 1e-12."""
+"""Squared ratio of a displacement to the demonstrated displacement. Below it, start and goal
+agree to rounding (ratio 1e-12), so the displacement has no direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +159,7 @@ def _rotated(values: Any, displacement: Any, reference: Demonstrated, xp: Module
 
     For half a turn, the common plane is not unique. Within `HALF_TURN` of half a turn, R turns
     in the plane of a and the coordinate axis most orthogonal to a. R is discontinuous there,
-    and its derivative grows as 1 / |a + b| towards it; both stay finite.
+    and its derivative grows as 1 / |a + b| towards half a turn, but both stay finite.
     """
     shown = reference.goal - reference.start
     length = _squared(shown) ** 0.5
@@ -198,7 +201,7 @@ SCALINGS: dict[str, Callable[[Any, Any, Demonstrated, ModuleType], Any]] = {
 
 
 def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
-    """Scaling of this name, for the first `columns` coordinates; a `Scaling` is returned as is.
+    """Scaling named `scaling`, for the first `columns` coordinates; a `Scaling` passes as is.
 
     Raises:
         ValueError: Unknown scaling.

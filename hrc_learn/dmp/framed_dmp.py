@@ -1,8 +1,8 @@
-"""Motions relative to the frames of objects.
+"""Motions learned relative to the frames of objects, and adapted to new frames.
 
 Each demonstration is expressed in every frame. While a frame determines the motion, the
-demonstrations agree in it. For frames at new places, the Gaussians of all frames are moved
-there and multiplied, as in task-parameterised models (Calinon 2016, "A tutorial on
+demonstrations agree in that frame. For new frames, the Gaussians of all frames are transformed
+to the base frame and multiplied, as in task-parameterised models (Calinon 2016, "A tutorial on
 task-parameterized movement learning and retrieval", eqs. 5 and 6). Here the Gaussians are over
 the coordinates of a primitive, that is over whole motions instead of single times: a motion
 that deviates at its start continues to deviate. The result is an ordinary primitive.
@@ -29,8 +29,8 @@ the error on synthetic motions is twice as large (benchmarks/bench_frames.py).""
 MODES = 12
 """Number of modes of these deviations: the next mode has 1e-6 of the variance."""
 FREEDOM = 1e-3
-"""Standard deviation added independently to each coordinate, relative to its mean over all
-frames. It makes the covariance invertible; motions do not visibly change."""
+"""Standard deviation added independently to each coordinate, relative to the RMS deviation of
+this coordinate over all frames. It makes the covariance invertible; motions hardly change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +75,9 @@ class Frames:
 class FramedDMP:
     """Gaussians over the coordinates of a primitive relative to each of F frames (float64).
 
-    x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`. The covariance is that
-    of the n demonstrations plus that of smooth deviations in all directions, which are as large
-    as the observed ones and have the weight of one more demonstration.
+    x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M numbers for each of
+    D columns. The covariance of the n demonstrations is extended by smooth deviations in all
+    directions. They are as large as the observed deviations and count as one demonstration.
     """
 
     primitive: JointDMP
@@ -173,7 +173,7 @@ class FramedDMP:
 def _precision(root: Float[Tensor, "F D M columns"]) -> Float[Tensor, "F DM DM"]:
     """Inverse covariance from a square root of the covariance, with `FREEDOM` added."""
     D = root.shape[1]
-    # Each weight and end has one unit for all D columns, which rotations do not change.
+    # The D columns of a weight or end have one common unit, which rotations do not change.
     unit = root.square().sum(-1).mean((0, 1)).sqrt()
     root = (root / unit[:, None]).flatten(1, 2)
     eye = torch.eye(root.shape[1]).to(root)
@@ -184,7 +184,7 @@ def _precision(root: Float[Tensor, "F D M columns"]) -> Float[Tensor, "F DM DM"]
 def _smooth_deviations(
     dmps: JointDMP, off: Float[Tensor, "n F D M"], least: float
 ) -> Float[Tensor, "F D M columns"]:
-    """Square root of the covariance of smooth deviations in any direction.
+    """Square root of the covariance of smooth deviations, equal in all directions.
 
     Args:
         dmps: Primitives of the demonstrations.

@@ -36,7 +36,7 @@ class InteractionPrimitive:
     models: tuple[ProbabilisticDMP[JointDMP], ...]
     """Gaussian of each kind over all columns, the person's columns first."""
     prior: Float[Tensor, "K"]
-    """Fraction of the demonstrations that are of each kind."""
+    """Fraction of the demonstrations of each kind."""
     log_duration: Float[Tensor, "K 2"]
     """Mean and standard deviation of the logarithm of durations [s]."""
     observed: int
@@ -131,7 +131,7 @@ class InteractionPrimitive:
         posterior = torch.softmax(score.flatten(), 0).view_as(score)
         probability = posterior.sum(-1)
         kind = int(probability.argmax())
-        # Durations are log-normal: the mean of the logarithm is their centre.
+        # Durations are log-normal: average their logarithms.
         within = posterior[kind] / probability[kind]
         expected = (within * duration[kind].log()).sum().exp()
         model = self.models[kind]
@@ -154,7 +154,7 @@ class InteractionPrimitive:
         values: Float[Tensor, "n H"],
         noise: Tensor,
     ) -> Float[Tensor, "G"]:
-        """Log density of the observation for the normalised times of each duration."""
+        """Log density of the observation for G durations, each with normalised times in `s`."""
         rows = model.primitive.response.evaluate(s)[:, :, 0]
         mean = rows @ model.mean[: self.observed].mT
         spread = model.spread.view(*model.mean.shape, -1)[: self.observed]

@@ -34,15 +34,15 @@ between two of these times is higher by less than 1e-3 of its height."""
 TOLERANCE = 1.05
 """Ratio to the smallest held-out error up to which an error counts as equal to it."""
 DEFAULT_COUNT = 50
-"""Default number of basis functions: they follow recordings of arms to 5e-5 of the range, and
-fewer would not make a motion without noise smoother."""
+"""Default number of basis functions. 50 functions follow recordings of arms to 5e-5 of the
+range; fewer would not make a motion without noise smoother."""
 
 
 STRONG_RIDGE = 1e-5
-"""Ridge where the samples do not determine all functions: its square is well above rounding."""
+"""Ridge for samples that do not determine all weights; its square is well above rounding."""
 TIMESTAMPS = 1000
-"""Number of samples in the default rollout of `fit_shared`: the demonstrations have no common
-grid."""
+"""Number of samples in the default rollout after `fit_shared`, whose demonstrations have no
+common time grid."""
 
 
 class FitOptions(TypedDict, total=False):
@@ -53,7 +53,8 @@ class FitOptions(TypedDict, total=False):
     `"ridge"`, regression on the force; `"lwr"`, the paper's method."""
     approach: float | int | None
     """Fraction of the motion, 0 to 1, over which it adapts smoothly to a new start and goal; 0:
-    at once, as in the paper. None (default): 1, but 0 for rhythms and the scaling `"paper"`."""
+    the spring alone adapts it, as in the paper. None (default): 1, but 0 for rhythms and for
+    the scaling `"paper"`."""
     basis: Basis | None
     """Basis of the forcing term; `n_basis` Gaussians by default."""
     spring: SpringDamper | None
@@ -124,8 +125,8 @@ def _unscaled(
 class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
     """Discrete movement primitive of D coordinates under one phase.
 
-    A `LinearPrimitive` whose columns are the coordinates: values are (*batch, D) in the units
-    of the demonstration, velocities the same per second, couplings per s^2.
+    It is a `LinearPrimitive` whose columns are the coordinates. Values are (*batch, D) in the
+    units of the demonstration; velocities are in these units per s, couplings per s^2.
     """
 
     @property
@@ -156,9 +157,9 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
                 demonstrations of different lengths, a list of (T_i, D), with a list of (T_i,)
                 as `time`. The floating-point dtype of the positions is that of the primitive;
                 the fit runs in float64.
-            n_basis: N, unless `basis` is given. None: 50, and noise is removed from the
-                samples; see `FitOptions.smooth`. If there are at most 1.5 N samples, the motion
-                follows piecewise cubics between them.
+            n_basis: Number N of basis functions, unless `basis` is given. None: 50, and noise
+                is removed from the samples; see `FitOptions.smooth`. If there are at most
+                1.5 N samples, the motion follows piecewise cubics between them.
             velocity: Recorded velocity per second, shaped like `position`. Without it, the
                 default method also fits the start velocity, and the others differentiate
                 positions.
@@ -217,7 +218,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         start: Vectors | None = None,
         goal: Vectors | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """Shortest duration [s] in which the path keeps limits, for use in `rollout`.
+        """Shortest duration [s] at which the motion keeps the limits, for use in `rollout`.
 
         A slower motion keeps its path if its start velocity is scaled too. Velocities then fall
         as 1 / duration and accelerations as 1 / duration^2.
@@ -225,8 +226,8 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         Args:
             velocity: Limit of each coordinate [1/s], (D,) or one for all; None: no limit.
             acceleration: Limit of each coordinate [1/s^2], (D,) or one for all.
-            start: Start of the motion; by default the demonstrated one, like the goal.
-            goal: Goal of the motion.
+            start: Start of the motion; None: as demonstrated.
+            goal: Goal of the motion; None: as demonstrated.
         """
         fine = torch.linspace(
             0, 1, LIMIT_SAMPLES, dtype=torch.float64, device=self.start.device
@@ -305,7 +306,7 @@ def select_basis_count(
 
 
 def _held_out(mask: Bool[Tensor, "B T"], fold: int, n_folds: int) -> Bool[Tensor, "B T"]:
-    """Every n-th valid sample, except the first and the last."""
+    """Mask of the samples that a fold holds out: every n-th valid one, except the ends."""
     order = mask.long().cumsum(-1)
     inner = (order > 1) & (order < order[..., -1:])
     return mask & inner & (order % n_folds == fold)
@@ -320,19 +321,19 @@ def fit_shared(
 ) -> tuple[JointDMP, Float[Tensor, "D"]]:
     """Fit one primitive to all demonstrations, in one pass and bounded memory.
 
-    The problem min |A X - B|^2 is solved from the products [A B]'[A B], to which the rows of
-    A and B add in any order and over any number of processes.
-
     The fit minimises the distance of all samples to one primitive, which has the start, goal
     and duration of each demonstration in turn, but the same weights and start velocity (per
-    duration) for all. For demonstrations on one grid, the result is the mean of their separate
-    primitives. With several processes, each reads its part of the demonstrations, and all
-    return the same result.
+    duration) for all. For demonstrations on one time grid, the result is the mean of their
+    separate primitives.
+
+    The least-squares problem min |A X - B|^2, with unknowns X and one row of A and B for each
+    sample, is solved from [A B]'[A B]. This product is a sum over the rows, in any order. Each
+    of several processes reads its part of the demonstrations; all return the same result.
 
     Args:
         demonstrations: Timestamps (T,) [s] and positions (T, D) of each. They are read one by
             one, so a sequence that loads them on demand is enough.
-        n_basis: N.
+        n_basis: Number N of basis functions.
         joint_names: D names, stored with the primitive.
         units: Units of the coordinates.
 
@@ -369,7 +370,7 @@ def fit_shared(
 def _accumulate(
     demonstrations: Sequence[tuple[Times, Points]], response: Response
 ) -> tuple[Float[Tensor, "1 m m"], Float[Tensor, "4 D"], int]:
-    """Products of all processes, sums of start, goal, range and duration, and sample count."""
+    """Over all processes: products, sums of start, goal, range and duration, sample count."""
     D, rows, products, sums = 0, 0, None, None
     for i, (time, position) in distributed.local_items(demonstrations):
         samples = _checked(i, time, position)

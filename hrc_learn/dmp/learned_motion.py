@@ -1,13 +1,13 @@
-"""Automatic choice of the model that predicts each demonstration best from the others.
+"""Learning of a motion with the model that predicts each demonstration best from the others.
 
-A motion is linear in the coordinates x_j of the primitives of n demonstrations, and each model
-but that of frames is a sum x(c) = sum_j w_j(c) x_j with sum_j w_j = 1: the mean, the nearest
-demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
-regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
-trajectory database"). The weights without demonstration i have a closed form (for the
-regression from its hat matrix: PRESS, Allen 1974), so no such model is fitted again. Each model
-may be shrunk towards the straight minimum-jerk motion, by the factor from 1 to 0 that predicts
-best.
+A primitive is fitted to each of n demonstrations; a motion is linear in its coordinates x_j.
+All models except frames compute the coordinates for a context c (known before the motion) as
+x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest demonstration, means
+weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge regression on
+contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a trajectory
+database"). The weights without demonstration i have a closed form (for the regression: PRESS
+from the hat matrix, Allen 1974), so these models are not fitted again. Each model may be shrunk
+towards the straight minimum-jerk motion, by the factor from 0 to 1 that predicts best.
 """
 
 import math
@@ -46,15 +46,15 @@ WIDTHS = (2.0, 1.0, 0.5, 0.25)
 PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
 """Ridges relative to the data; a ridge of 1 halves the effect of a single context."""
 FEWEST = 4
-"""Number of demonstrations from which a regression can be distinguished from the mean."""
+"""Smallest number of demonstrations for which a regression is tried besides the mean."""
 CLEARLY, DEVIATIONS = 0.02, 0.8
-"""A more complex model has to decrease the mean error by more than this fraction of it, and by
-more than this number of standard errors: on seven datasets, predictions of unseen
-demonstrations were best with 0.5 to 1 standard errors (`benchmarks/bench_learn.py`)."""
+"""`CLEARLY`: fraction of the mean error by which a more complex model has to decrease it.
+`DEVIATIONS`: number of standard errors by which the model has to decrease it, too. On seven
+datasets, 0.5 to 1 gave the best predictions of new motions (`benchmarks/bench_learn.py`)."""
 GRID = 101
 """Number of times at which motions are compared."""
 CONSTANT = 1e-9
-"""Spread, relative to the size, below which a context counts as constant."""
+"""Spread of a context, relative to its size, below which the context counts as constant."""
 
 
 Kind = Literal["mean", "kernel", "nearest", "contextual", "frames", "line"]
@@ -69,13 +69,13 @@ class Candidate:
     family: str
     """`"kernel"`, `"ridge"` or `"frames"`."""
     strength: float
-    """Width of the kernel, infinite for the mean and 0 for the nearest one; or the ridge."""
+    """Width of the kernel (infinite: mean; 0: nearest demonstration), or the ridge."""
     approach: float
     shrinkage: float
     """Factor on the deviation from the straight motion: 0 leaves only the straight motion."""
     error: Float[Tensor, "n"]
-    """Root mean square error of each demonstration predicted from all others; each column is
-    relative to the largest range among columns of its kind."""
+    """Root mean square error of each demonstration, predicted from all others. The error of a
+    column is relative to the largest range among columns of its kind (`_scale`)."""
 
     @property
     def kind(self) -> Kind:
@@ -119,10 +119,10 @@ def learn(
         demonstrations: Demonstrations with `time` and `joint_position`, or with `position` and
             perhaps `orientation`, as from `load_demos`; or pairs of times (T,) [s] and values:
             joints or other coordinates, (T, D), or a `Pose` of (T).
-        context: (n, C), known before the motion. None: start and goal.
+        context: Values (n, C) that are known before each motion. None: start and goal.
         frames: Frames of each demonstration, (n, F), for positions in space.
-        n_basis: N. None: the smallest of `BASIS_COUNTS` whose error on held-out samples is
-            nearly the least.
+        n_basis: Number of basis functions. None: the smallest of `BASIS_COUNTS` whose error on
+            held-out samples is nearly the least.
         approach: As in `FitOptions`. None: one of `APPROACHES`.
         options: Further options for `fit` of the primitive.
 
@@ -148,11 +148,12 @@ def choose(
     *,
     regression_only: bool = False,
 ) -> "LearnedMotion":
-    """Model with the least held-out error, for primitives fitted with different options.
+    """Choose a model by its held-out error, for primitives fitted with different options.
 
     Args:
-        fits: Primitives (n) of the same demonstrations, fitted with `scaling="none"`.
-        context: (n, C), known before the motion. None: start and goal, in columns.
+        fits: For each choice of options, a batch of primitives of the n demonstrations, fitted
+            with `scaling="none"`.
+        context: Values (n, C) known before each motion. None: start and goal, in columns.
         frames: Frames of each demonstration, (n, F); joint primitives only.
         regression_only: True to choose among the regressions on contexts only.
 
@@ -281,7 +282,7 @@ class LearnedMotion:
     def _primitives(
         self, x: Float[Tensor, "q D M"], w: Float[Tensor, "q n"]
     ) -> MotionPrimitive:
-        """Primitives with shrunk coordinates `x`, and durations averaged with the weights."""
+        """Primitives with shrunk coordinates `x` and geometric means of durations, weighted."""
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x, self.chosen.shrinkage)
         middle, reference = mean_primitive(self.each).motion, common_reference(self.each)
@@ -428,8 +429,8 @@ def _candidates(
 def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor, "n D 1"]:
     """Unit of the error of each column: the largest range among columns of its kind.
 
-    Positions, orientation errors and bodies are different kinds; a kind that does not move has
-    the unit one.
+    Positions, orientation errors and bodies are different kinds. The unit of a kind that does
+    not move is 1.
     """
     span = shown.amax(-1) - shown.amin(-1)
     errors = each.error_columns
@@ -444,7 +445,7 @@ def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor
 
 
 def _from_frames(each: JointDMP, frames: Frames) -> Float[Tensor, "n D M"]:
-    """Coordinates of each demonstration, predicted from its frames and all others."""
+    """Coordinates of each demonstration, predicted from its frames and all other ones."""
     n, made = len(each), []
     for i in range(n):
         rest = torch.arange(n) != i
@@ -459,9 +460,9 @@ def _weights(
     known: Float[Tensor, "n C"],
     asked: Float[Tensor, "q C"] | None = None,
 ) -> Float[Tensor, "q n"]:
-    """Weights w(c) of the demonstrations for contexts `asked`.
+    """Weights w(c) of the demonstrations for the contexts `asked`.
 
-    None: held-out weights for the context of each demonstration.
+    If `asked` is None: held-out weights for the context of each demonstration.
     """
     held_out, n = asked is None, len(known)
     query = known if asked is None else asked.to(known)
@@ -478,7 +479,7 @@ def _weights(
         if strength == 0:
             return torch.nn.functional.one_hot(distance.argmin(1), n).to(known)
         return torch.softmax(-((distance / strength) ** 2) / 2, dim=1)
-    # If the targets are unit vectors, one for each demonstration, predictions are the weights.
+    # With one unit vector per demonstration as target, the predictions are the weights.
     unit = torch.eye(n).to(b)
     fit = fit_ridge(b, unit, strength, standardize=False)
     if held_out:

@@ -120,7 +120,7 @@ class LinearPrimitive(nn.Module):
             spring: Gains of the unforced dynamics.
             scaling: Scaling of the forcing term; see `forcing_scale.py`.
             approach: Fraction of the motion over which it adapts to a new start and goal; 0:
-                at once.
+                the spring alone adapts it.
             joint_names: D names.
             units: Units of the columns.
             fit_report: Residuals of the fit.
@@ -135,7 +135,7 @@ class LinearPrimitive(nn.Module):
         elif not weights.requires_grad:
             self.weights = nn.Parameter(weights)
         else:
-            # A parameter is a leaf, through which no gradient would flow on.
+            # Not a parameter, which is a leaf: gradients would not flow through it.
             self.register_buffer("weights", weights)
         buffers = (start, goal, start_velocity, duration, amplitude, timestamps)
         for name, value in zip(TENSORS[1:], buffers, strict=True):
@@ -160,7 +160,7 @@ class LinearPrimitive(nn.Module):
         )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        # Checked before any tensor changes, because `half` could not be undone.
+        # Check before any tensor changes, because `half` cannot be undone.
         check_precision(fn(self.weights.detach().reshape(-1)[:1]).dtype)
         return super()._apply(fn, recurse)
 
@@ -195,8 +195,8 @@ class LinearPrimitive(nn.Module):
             timestamps: Normalised times of the default rollout.
 
         Returns:
-            A primitive with the same basis, spring, scaling and names, with memory of its own
-            and without a fit report.
+            A primitive with the same basis, spring, scaling and names. Its tensors are copies,
+            and it has no fit report.
         """
         x = coordinates.to(self.weights)
         duration = self.duration if duration is None else duration
@@ -222,7 +222,7 @@ class LinearPrimitive(nn.Module):
         response: Response,
         **parts: Any,
     ) -> S:
-        """Primitives from coordinates, with memory of their own.
+        """Primitives from coordinates; the tensors are copied.
 
         Args:
             x: Weights, start velocity dy/ds, start and goal, as from `coordinates`.
@@ -258,11 +258,11 @@ class LinearPrimitive(nn.Module):
         return own | {f"{REPORT}{name}": x for name, x in report.items()}
 
     def with_tensors[S: "LinearPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
-        """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
+        """The same primitive with other tensors, named as in `tensors`."""
         return type(self)(**self.arguments(tensors))
 
     def arguments(self, tensors: Mapping[str, Tensor] | None = None) -> dict[str, Any]:
-        """Arguments that make this primitive again, or one with other tensors."""
+        """Constructor arguments of this primitive, or of a copy with other tensors."""
         return _tensor_arguments(self.tensors() if tensors is None else tensors) | {
             "basis": self.basis,
             "spring": self.spring,
@@ -318,13 +318,13 @@ class LinearPrimitive(nn.Module):
         """`_motion_coordinates` for one motion in NumPy, in a third of the time.
 
         Returns:
-            Coordinates. None where NumPy does not apply, or for a wrong value, which
-            `_motion_coordinates` reports.
+            Coordinates. None where NumPy does not apply, or if a value is wrong;
+            `_motion_coordinates` then reports it.
         """
         weights = self.weights
         if weights.ndim != 2 or duration.ndim or self.scaling != "none":
             return None
-        # Attribute access on a module takes three times as long.
+        # Attribute access on a module would take three times as long.
         own: Any = self._buffers.get
         start, goal, velocity = boundary
         dtype, device = weights.dtype, weights.device
@@ -364,7 +364,7 @@ class LinearPrimitive(nn.Module):
         duration = duration.expand(batch)
         s = torch.zeros_like(duration, dtype=torch.float64)
         forced = self.response.forced.to(s.device)(s).to(start)
-        # Copies, because an export treats one tensor in two fields as one input.
+        # Copies, because an export would treat one tensor in two fields as one input.
         return DMPState(
             position=start.clone(),
             rate=rate,
@@ -391,8 +391,8 @@ class LinearPrimitive(nn.Module):
     ) -> DMPState:
         """Advance by `dt` [s], exactly for terms that are constant over the step.
 
-        Arguments are those of `MotionPrimitive.step`, in columns: `external_acceleration`
-        [1/s^2], (*batch, D), is added to the motion.
+        Arguments are those of `MotionPrimitive.step`, in columns; `external_acceleration`
+        [1/s^2], (*batch, D), is its `coupling`.
         """
         if not isinstance(dt, float):
             dt = to_tensor(dt, torch.float64, state.duration.device)
@@ -471,7 +471,7 @@ class LinearPrimitive(nn.Module):
 
     @full_precision
     def second_derivative(self, state: DMPState) -> Float[Tensor, "*batch D"]:
-        """Second derivative d^2 y / ds^2 at a state without coupling."""
+        """Second derivative d^2 y / ds^2 at a state, without the effect of couplings."""
         response = self.response
         force = response.basis.forcing(state.s)[..., None, :].to(self.weights)
         force = self._scaled(force @ self.weights.mT, state.start, state.goal)[..., 0, :]
@@ -493,7 +493,7 @@ class LinearPrimitive(nn.Module):
     def equilibrium_goal(
         self, state: DMPState, second_derivative: Float[Tensor, "*batch D"]
     ) -> Float[Tensor, "*batch D"]:
-        """Goal with which the state has this d^2 y / ds^2 (for unscaled forcing)."""
+        """Goal for which the state has this `second_derivative` (for unscaled forcing)."""
         change = second_derivative - self.second_derivative(state)
         return state.goal + change / self.spring.stiffness
 

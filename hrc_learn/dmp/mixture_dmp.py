@@ -23,16 +23,16 @@ from hrc_learn.dmp.probabilistic_dmp import (
 from hrc_learn.geometry import Pose
 
 EXPLAINED, MAXIMUM_DIRECTIONS = 0.9, 3
-"""Fraction of the variance of paths that the compared directions explain, and the largest
-number of directions: with few demonstrations, further ones are chance."""
+"""`EXPLAINED`: fraction of the variance of paths that the principal directions explain.
+`MAXIMUM_DIRECTIONS`: their largest number; with few demonstrations, more reflect chance."""
 MINIMUM_SPREAD = 0.1
 """Smallest spread within a mode, relative to the total: two demonstrations that agree by chance
 must not form a mode."""
 STRONG_EVIDENCE = 10.0
-"""Difference of the criterion that is very strong evidence for more modes (Kass and Raftery
-1995, "Bayes factors"); with few demonstrations, chance alone causes half of it."""
+"""Decrease of the Bayesian information criterion that is very strong evidence for more modes
+(Kass and Raftery 1995, "Bayes factors"). With few demonstrations, chance causes half of it."""
 MAXIMUM_ITERATIONS, SETTLED = 100, 1e-6
-"""Largest number of iterations, and change of responsibilities at which they end."""
+"""Largest number of iterations, and largest change of responsibilities that ends them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +44,7 @@ class MixtureDMP[P: MotionPrimitive]:
 
     modes: tuple[ProbabilisticDMP[P], ...]
     probability: Float[Tensor, "K"]
-    """Probability of each mode; a priori, its fraction of the demonstrations."""
+    """Probability of each mode; after `fit`, the fraction of the demonstrations in the mode."""
     responsibilities: Float[Tensor, "n K"]
     """Probability of each mode for each demonstration; rows sum to one."""
     contexts: Float[Tensor, "K C"]
@@ -65,9 +65,10 @@ class MixtureDMP[P: MotionPrimitive]:
 
         Args:
             primitives: Primitives of several demonstrations, fitted with `scaling="none"`.
-            context: (n, C), known before the motion; by default starts and goals, in columns.
-            n_modes: K. None: the smallest number without strong evidence against it by the
-                Bayesian information criterion (Schwarz 1978), at most half the demonstrations.
+            context: Values (n, C) known before each motion. None: starts and goals, in columns.
+            n_modes: Number K of modes. None: the smallest number whose Bayesian information
+                criterion (Schwarz 1978) is at most `STRONG_EVIDENCE` above the least, among
+                numbers up to half the demonstrations.
             slack: Freedom beyond the variation of the demonstrations; see
                 `ProbabilisticDMP.fit`.
 
@@ -140,7 +141,7 @@ class MixtureDMP[P: MotionPrimitive]:
 
 
 def principal_components(paths: Float[Tensor, "n F"]) -> Float[Tensor, "n d"]:
-    """Coordinates of paths in the directions of largest variance."""
+    """Coordinates of paths along the directions of largest variance."""
     U, sigma, _ = torch.linalg.svd(paths - paths.mean(0), full_matrices=False)
     explained = sigma.square().cumsum(0) / sigma.square().sum().clamp(min=1e-300)
     d = min(int((explained < EXPLAINED).sum()) + 1, MAXIMUM_DIRECTIONS)
@@ -198,7 +199,7 @@ def _context_precision(
     """Inverse covariance of contexts around the means of their modes.
 
     `MINIMUM_SPREAD`^2 times the mean variance of all contexts is added to each variance,
-    because a context is evidence and not proof.
+    so that a context makes a mode likely but never certain.
     """
     off = (c[:, None] - (r / r.sum(0)).mT @ c) * r.sqrt()[..., None]
     within = off.flatten(0, 1)

@@ -1,9 +1,10 @@
-"""Principal components of motions that continue from the state of an arm.
+"""Principal components of motions that continue from the current state of an arm.
 
-A motion is a cubic spline. Its first control points follow from the state, so that it continues
-the current motion. The others are predicted from that state, and their deviation from the
-prediction is expressed in orthogonal components, in order of decreasing variance. A network
-predicts the components, as continuous parameters (flows, diffusion) or as tokens (`tokens.py`).
+A motion is a cubic spline. The first control points follow from the state, so that the spline
+continues the current motion. The other control points are predicted from the state, and their
+deviation from the prediction is a sum of orthogonal components of decreasing variance. A
+network predicts the components, as continuous parameters (flows, diffusion) or as tokens
+(`tokens.py`).
 """
 
 import torch
@@ -16,7 +17,7 @@ from hrc_learn.dmp.samples import Samples
 MARGIN = 0.1
 """Distance by which motions may exceed the demonstrated range, relative to the range."""
 SHRINKAGE = 0.1
-"""Weight of a separable covariance (time times columns), for which few motions are enough."""
+"""Weight of a separable covariance (time times columns), which few motions determine well."""
 RIDGE = 1e-3
 """Ridge of the prediction from the start: values from 1e-4 to 1e-2 are equally good."""
 POINTS = (6, 8, 10, 13, 16, 20, 26, 32, 40, 50, 64)
@@ -30,9 +31,9 @@ LONGEST = 3.0
 TINY = 1e-24
 """Smallest variance, for columns that never move."""
 TURN = 6.0
-"""Distance of the third control point inside a limit, relative to the distance of the second
-beyond it. Motions then keep the limit if the second exceeds it by at most 2.5 times the
-margin."""
+"""If the second control point lies beyond a limit, the third lies this many times as far inside
+the limit. The motion then keeps the limit if the second control point exceeds the limit by at
+most 2.5 times the margin."""
 KNOWN_STATE = 2
 DEGREE = 3
 
@@ -97,7 +98,7 @@ class MotionComponents(nn.Module):
             samples: Samples of the motions.
             units: Buffers `centre`, `scale`, `low` and `high`.
             start_velocity: Velocity at the start [1/s], if it will be known.
-            start_known: False: the components determine the start, too.
+            start_known: True if the start will be known; False: the components determine it.
             accuracy: Largest root mean square error of the splines, in units of the columns.
         """
         duration = samples.duration.log().mean().exp()

@@ -49,9 +49,10 @@ class MotionHead(nn.Module):
     """Map from network parameters to a motion of D columns from any initial state.
 
     The P parameters are, for each of the D columns in turn, N whitened weights and the goal;
-    then come those of timing: the duration if it has a range, and the delay if one is allowed.
-    If all are zero, the motion is the minimum-jerk motion to the centre of the goals, with the
-    geometric mean of the shortest and longest duration and half the longest delay.
+    then come the timing parameters: the duration if it has a range, and the delay if one is
+    allowed. If all parameters are zero, the motion is the minimum-jerk motion to the centre of
+    the goals. Its duration is then the geometric mean of the shortest and the longest duration,
+    and its delay is half the longest delay.
 
     The map is differentiable in all arguments and takes any number of leading batch axes.
     """
@@ -77,10 +78,11 @@ class MotionHead(nn.Module):
         """Compute the modes.
 
         Args:
-            columns: D.
-            n_basis: N.
-            duration: Duration [s], or its range: a parameter then selects its logarithm.
-            delay: Longest delay before a motion [s]; 0: no delay and no parameter for it.
+            columns: Number D of columns.
+            n_basis: Number N of basis functions.
+            duration: Duration [s], or the range (shortest, longest) from which a parameter
+                selects, on a logarithmic scale.
+            delay: Longest delay before a motion [s]; 0: no delay, and no parameter for it.
             amplitude: Root mean square deviation over a motion for unit normal weights, and
                 standard deviation of the goal for a unit normal parameter, in the units of the
                 columns; (D,) or one for all.
@@ -170,8 +172,8 @@ class MotionHead(nn.Module):
         Args:
             parameters: Mean of the parameters.
             scale_tril: Cholesky factor of the covariance of the first L = D (N + 1) parameters.
-                Duration and delay are certain.
-            start: (*batch, D), certain.
+                Duration and delay are known exactly.
+            start: (*batch, D), known exactly.
             start_velocity: Per second, (*batch, D).
             since: Time [s], (*batch).
             origin: (*batch, D).
@@ -331,7 +333,7 @@ class MotionHead(nn.Module):
         H = self._by_mode(self.response.evaluate(s)[..., 0, :])
         if plan.since is None:
             return H
-        # The state is certain, so no parameter changes position or velocity at `since`.
+        # The state is given, so no parameter changes position or velocity at `since`.
         there = self._by_mode(self.response.evaluate(plan.since)[..., :2, :])
         back = spring_rows(self.response, s - plan.since[..., None], 0)
         return H - back @ there
@@ -356,7 +358,7 @@ class _Plan:
 
 
 class PlannedTrajectory(ContinuedTrajectory):
-    """Motion that may have a delay, or continue from the state of another one."""
+    """Motion that may have a delay, or continue from the state of another motion."""
 
     def __init__(
         self,
@@ -395,7 +397,7 @@ class PlannedTrajectory(ContinuedTrajectory):
 
 @dataclass(frozen=True, eq=False)
 class MotionDistribution:
-    """Gaussian over the motions of a head, from Gaussian parameters and a certain state."""
+    """Gaussian over the motions of a head, from Gaussian parameters and an exact state."""
 
     head: MotionHead
     parameters: Float[Tensor, "*batch P"]
@@ -445,7 +447,8 @@ class MotionDistribution:
     ) -> Float[Tensor, "*batch"]:
         """KL divergence KL(self || other) of positions observed with noise.
 
-        It is finite even if start, velocity or timing differ, although these are certain.
+        Start, velocity and timing have no uncertainty. Owing to the noise, the divergence is
+        finite even if they differ.
 
         Args:
             other: Distribution of motions with as many columns.
@@ -486,7 +489,7 @@ def _each_column(amplitude: Any, columns: int) -> Float[Tensor, "D"]:
 def _modes(response: Response) -> Float[Tensor, "N N"]:
     """Weights of orthogonal motions, smoothest first, with a mean square of one in total.
 
-    The modes have the relative sizes that white forcing causes.
+    The relative sizes of the modes are those that white noise as forcing would cause.
     """
     N = response.basis.count
     s = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)
@@ -494,5 +497,5 @@ def _modes(response: Response) -> Float[Tensor, "N N"]:
     unit = balanced_units(response.basis, H, 0)
     _, sigma, Vh = torch.linalg.svd(H[:, :N] * unit, full_matrices=False)
     modes = unit[:, None] * Vh.mT * (len(s) / sigma.square().sum()).sqrt()
-    # The sign of a mode is arbitrary: take the one with a positive mean.
+    # The sign of a mode is arbitrary: choose the sign with a positive mean motion.
     return modes * torch.where((H[:, :N] @ modes).sum(0) < 0, -1.0, 1.0)

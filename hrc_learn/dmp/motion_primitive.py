@@ -141,7 +141,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         return self.motion.tensors()
 
     def with_tensors[S: "MotionPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
-        """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
+        """The same primitive with other tensors, named as in `tensors`."""
         return self.with_motion(self.motion.with_tensors(tensors))
 
     def __len__(self) -> int:
@@ -159,7 +159,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         return True
 
     def __getitem__[S: "MotionPrimitive"](self: S, index: Any) -> S:
-        """Part of a batch, indexed like the first axes of a tensor, with memory of its own.
+        """Copy of a part of a batch, indexed like the first axes of a tensor.
 
         Gradients flow through weights that are a buffer; a parameter is copied.
         """
@@ -229,7 +229,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         boundary, tau, frame = self._resolved(given, duration, speed, **options)
         columns = self.motion.initial_columns(boundary, tau)
         if frame is not None:
-            # A copy for each element: an export treats one tensor in two places as one input.
+            # One copy per element: an export would treat one tensor in two places as one input.
             frame = frame.expand(*columns.position.shape[:-1], frame.shape[-1]).clone()
         return self.state_of(columns, frame)
 
@@ -250,14 +250,15 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         Uncoupled steps of any length end where the rollout does. A coupling that depends on
         the state is evaluated at the start of the step, with an error of first order in `dt`.
         The same holds for a filtered goal with the scalings `"paper"` and `"rotation"`, because
-        it scales the forcing. A new goal changes neither the current value nor its velocity.
+        the goal then scales the forcing. A new goal changes neither the current value nor the
+        velocity.
 
         Args:
             state: From `initial_state` or the last step.
             dt: [s], (*batch).
             goal: New goal from now on, (*batch).
-            goal_filter: Rate, per duration, at which the goal moves to the commanded one, which
-                avoids a jump of the acceleration. None: the goal jumps.
+            goal_filter: Rate, per duration, at which the goal approaches the commanded goal, to
+                avoid a jump of the acceleration. None: the goal jumps.
             coupling: External acceleration added to the motion [1/s^2], (*batch).
             phase_stopping: Number p >= 0, (*batch). The clock of phase and spring runs slower
                 by the factor 1 + p, so the motion slows down on its path.
@@ -320,19 +321,21 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
         Start and goal keep their values and velocities, and columns without a via point do not
         change. With `within`, the motion outside of this time does not change either. Via
-        points hold for the primitive's own start, goal and duration: set others before, with
-        `with_boundary`. Gradients flow to times, values and velocities. If the motion would
-        change over 1.5 times as much as the curve through the via points, these are too close.
+        points refer to the start, goal and duration of this primitive; `with_boundary` sets
+        others first. Gradients flow to times, values and velocities. Via points are too close
+        together if the motion would change over 1.5 times as much as the curve through them.
 
         Args:
             time: Times of the via points [s], (*batch, n).
-            value: Values as for `via_points`, like the velocity; NaN leaves them free.
-            velocity: Velocities. If a value is given, None or NaN keeps the motion's velocity.
+            value: Values, as for `via_points`; NaN leaves a value free.
+            velocity: Velocities, as for `via_points`. If a value is given, None or NaN keeps
+                the velocity of the motion.
             within: Times [s] between which the motion may change; None: from start to end.
 
         Raises:
-            ValueError: Via points at one time or outside of the window, or too many or too
-                close together for the basis; the message names the distance that works.
+            ValueError: Two via points at the same time, a via point outside of `within`, or too
+                many or too close via points for the basis; the message names the distance that
+                works.
         """
         via = self.via_points(time, value, velocity)
         return self.with_motion(through_via_points(self.motion, via, within))
@@ -398,8 +401,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     def reversed[S: "MotionPrimitive"](self: S) -> S:
         """Primitive that moves the same path backwards, from the goal to the start.
 
-        Its motion is that of this primitive at duration - t, fitted with the same basis. It
-        accepts new starts and goals like any other.
+        Its motion at time t is that of this primitive at duration - t, fitted with the same
+        basis. It accepts new starts and goals.
 
         Raises:
             ValueError: A rhythm, which has no end to start from.
@@ -497,7 +500,7 @@ def via_values(
 def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     """Batch of primitives of one kind, basis and spring, along a new first axis.
 
-    If timestamps differ, each primitive keeps its own; the last one is repeated as padding.
+    If timestamps differ, each primitive keeps its own, padded with its last timestamp.
     The result has a fit report if all primitives have one.
 
     Raises:
@@ -515,7 +518,7 @@ def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
                 f"{other[name]}, of the first {first[name]}"
             )
     tensors = [primitive.tensors() for primitive in primitives]
-    # Parts of the fit report may be missing in some.
+    # Some primitives may lack parts of the fit report.
     names = set.intersection(*map(set, tensors))
     columns = {name: [each[name] for each in tensors] for name in names}
     return primitives[0].with_tensors(
@@ -534,7 +537,7 @@ def _described(primitive: MotionPrimitive) -> dict[str, Any]:
 
 
 def _padded(rows: list[Tensor]) -> Tensor:
-    """One grid of timestamps if all are equal, else one row each."""
+    """One grid of timestamps if all are equal, else one padded row for each primitive."""
     if all(x.shape == rows[0].shape and torch.equal(x, rows[0]) for x in rows):
         return rows[0].clone()
     T = max(x.shape[-1] for x in rows)

@@ -3,8 +3,9 @@
 y'' = alpha (beta (g + (s - 1) v - y) + v - y') + f,   s = t / tau
 
 (Kober et al. 2010, "Movement templates for learning of hitting and batting", with the goal's
-velocity in the damping term). The goal passes g at s = 1 with velocity v. For the relative
-motion x = y - (s - 1) v, this is the equation of a goal at rest: rollouts and steps stay exact.
+velocity also in the damping term); primes are derivatives with respect to s. The goal passes g
+at s = 1 with the velocity v per duration. The relative motion x = y - (s - 1) v obeys the
+equation with a goal at rest, so rollouts and steps stay exact.
 """
 
 from dataclasses import dataclass
@@ -118,14 +119,14 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     def _boundary(
         self, given: Boundary, duration: Tensor, end_velocity: Vectors | None = None
     ) -> tuple[Boundary, Tensor]:
-        """Boundary relative to the moving goal, and the goal velocity for `end_velocity`."""
+        """Boundary relative to the goal, and the goal velocity that causes `end_velocity`."""
         motion, end = self.motion, duration[..., None]
         start, goal, per_s = motion.resolve_boundary(given, duration)
         rate = per_s / end
         at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
         at_rest = at_rest.velocity[..., 0, :]
         # In normalised time, a goal velocity of 1 shifts the start by 1 and the start velocity
-        # by -1 (columns -2 and -3 of the response), and itself adds 1 to the end velocity.
+        # by -1 (columns -2 and -3 of the response). It also adds 1 to the end velocity.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         gain = 1 + at_end[-2] - at_end[-3]
         # The end velocity is linear in v, so the difference gives v directly.

@@ -1,7 +1,7 @@
-"""Movement primitives of an orientation, whose linear columns are its error to a reference.
+"""Movement primitives of an orientation; the columns are its error e to a reference.
 
-e'' = alpha (beta (0 - e) - e') + f, exact at all angles (Koutras and Doulgeri 2019). The
-reference is the goal by default; see `orientation_error.py` for the error.
+e'' = alpha (beta (0 - e) - e') + f, with the forcing term f, is exact at all angles (Koutras
+and Doulgeri 2019). The reference is the goal by default; `orientation_error.py` defines e.
 """
 
 import math
@@ -122,7 +122,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
 ):
     """Primitive whose columns are a position, the error of an orientation, and a body.
 
-    Position and body may have no columns. The frame is the reference of the error.
+    Position and body may have no columns. The `frame` of methods is the reference.
     """
 
     goal_orientation: Tensor
@@ -147,7 +147,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
 
     @abstractmethod
     def _parts(self, name: str, value: Any) -> tuple[Tensor | None, Any]:
-        """Position and orientation of a value, None where there is none.
+        """Position and orientation of a value; None for a part that is missing.
 
         Raises:
             ValueError: A value of another kind.
@@ -287,11 +287,11 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
     def _retarget_numbers(
         self, columns: DMPState, frame: Tensor, rotation: Quaternions
     ) -> tuple[DMPState, Tensor] | None:
-        """Columns and reference of one motion for a goal that jumps, in Python's numbers.
+        """Columns and reference of one motion for a goal that jumps, computed without tensors.
 
         Returns:
-            None where PyTorch has to compute, or for a wrong value, which PyTorch's path
-            reports.
+            Columns and reference. None where PyTorch has to compute them, or if a value is
+            wrong; the computation in PyTorch then reports it.
         """
         E, motion, parts = self.error_columns, self.motion, (columns.position, columns.rate)
         if frame.ndim != 1 or type(motion) is not JointDMP or not fits_numpy(frame, *parts):
@@ -398,9 +398,10 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
             time: Timestamps [s], (T,) or (*B, T).
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4). Signs may flip; neighbours
                 must be less than half a turn apart.
-            n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
+            n_basis: Number N of basis functions, unless `basis` is given; None as for
+                `JointDMP.fit`.
             mask: (*B, T), false at samples to ignore.
-            formulation: `"log"`, or `"ude"` for the state of Ude et al. 2014.
+            formulation: `"log"`, or `"ude"` for the formulation of Ude et al. 2014.
             options: Options of the fit; see `FitOptions`.
 
         Raises:
@@ -441,7 +442,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
 
     def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
         if isinstance(self.motion, UdePrimitive):
-            # v is minus the angular velocity.
+            # The rate in this formulation is minus the angular velocity.
             return -to_tensor(coupling, frame.dtype, frame.device)
         return super()._acceleration(columns, frame, coupling)
 

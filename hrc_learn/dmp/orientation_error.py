@@ -21,8 +21,8 @@ type Numbers = list[float]
 _NO_AXIS = 1e-9
 """Length [rad] below which a rotation vector has no direction."""
 MEAN_ITERATIONS = 10
-"""Iterations of a mean. Each leaves a small fraction of the distance to the mean, or of the
-cube of this distance if all orientations are close."""
+"""Number of iterations that compute a mean. Each reduces the distance to the mean to a small
+fraction of it, or of its cube if all orientations are close together."""
 NORM_TOLERANCE = 1e-2
 """Deviation from one up to which the norm of a recorded quaternion is corrected."""
 
@@ -78,8 +78,8 @@ def error_rate(
 ) -> Float[Tensor, "*batch 3"]:
     """Rate de/dt for an angular velocity [rad/s]; the inverse of `angular_velocity`.
 
-    If the error is a whole number of turns, it can only change along its own axis: the part of
-    the velocity across this axis is then lost.
+    If the error is a whole number of turns, it can only change along its axis. The component
+    of the velocity perpendicular to this axis is then ignored.
     """
     error, velocity = torch.broadcast_tensors(error, velocity)
     return -velocity - axis_drift(error, velocity)
@@ -107,7 +107,7 @@ def retarget(
     old: Float[Tensor, "*batch 4"],
     goal: Float[Tensor, "*#batch 4"],
 ) -> tuple[Tensor, Tensor]:
-    """Error to a new goal and its rate, for the same motion of the orientation."""
+    """Error to a new goal and rate of this error, for the same motion of the orientation."""
     new = nearest_turn(to_error(to_orientation(error, old), goal), error)
     return new, error_rate(new, angular_velocity(error, rate))
 
@@ -148,7 +148,7 @@ def _polar(v: Numbers) -> tuple[float, Numbers]:
 
 
 def _stretched(v: Numbers, axis: Numbers, across: float, turn: float) -> Numbers:
-    """Vector with its part across a unit axis scaled, plus `turn` times axis x v."""
+    """Scale the part of v perpendicular to a unit axis by `across`, and add turn (axis x v)."""
     (x, y, z), (a, b, c) = v, axis
     along = (1 - across) * (a * x + b * y + c * z)
     cross = (b * z - c * y, c * x - a * z, a * y - b * x)

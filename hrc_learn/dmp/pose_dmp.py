@@ -98,8 +98,8 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
     `goal_body`.
 
     The fit report has residuals by column: position [m], orientation error [rad], body. The
-    residuals of the error's components bound that of the angle. `nrmse` divides by the largest
-    range although the units of the columns differ.
+    residuals of the error's components bound the residual of the angle. `nrmse` divides by the
+    largest range, although the units of the columns differ.
     """
 
     error_columns: ClassVar[slice] = ERROR
@@ -126,7 +126,8 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
             time: Timestamps [s], (T,) or (*B, T).
             position: (*B, T, 3) [m]. Its floating-point dtype is that of the primitive.
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
-            n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
+            n_basis: Number N of basis functions, unless `basis` is given; None as for
+                `JointDMP.fit`.
             body: Body coordinates, (*B, T, K), or (T,) for one.
             mask: (*B, T), false at samples to ignore.
             scaling: Scaling of the position's forcing term, as for `JointDMP.fit`;

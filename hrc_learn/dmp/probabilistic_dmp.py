@@ -42,10 +42,10 @@ PATH_TIMES = 30
 """Number of times at which paths are compared; routes do not part and rejoin between two of
 them."""
 FEWEST, SINGULAR = 4, 1e-6
-"""Smallest number of primitives from which the dependence of paths on start and goal is
-estimated, and relative singular value below which start and goal count as constant."""
+"""`FEWEST`: smallest number of primitives from which the dependence of paths on start and goal
+is estimated. `SINGULAR`: relative singular value below which the ends count as constant."""
 KNOWN_DURATION = 1e-6
-"""Standard deviation of the logarithm of a known duration."""
+"""Standard deviation of the logarithm of a duration that is given as known."""
 GAUSSIAN = ("mean", "spread", "timing")
 SAME_ORIENTATION = 1e-9
 """Angle [rad] below which orientations count as equal: no sensor resolves it, and rounding is
@@ -66,8 +66,8 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
         A primitive without batch dimensions and without a fit report.
 
     Raises:
-        ValueError: The scaling is `"rotation"`, whose weights are in a frame of their own for
-            each demonstration.
+        ValueError: The scaling is `"rotation"`, for which the weights of each demonstration
+            are in a different frame.
     """
     motion, columns = _mean_motion(primitives.motion), primitives.error_columns
     if columns is None:
@@ -148,7 +148,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     timing: Float[Tensor, "rank"]
     """Deviation of the logarithm of the duration for each column of `spread`."""
     dependence: float = 1.0
-    """Factor on the dependence of paths on start and goal in `at`."""
+    """Factor, 0 to 1, on the dependence of paths on start and goal in `at`."""
 
     @classmethod
     def fit(cls, primitives: P, slack: float = 0.0) -> "ProbabilisticDMP[P]":
@@ -173,7 +173,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def around(cls, primitive: P, slack: float = 1.0) -> "ProbabilisticDMP[P]":
         """Gaussian around one primitive whose forcing may vary, for via points.
 
-        Start, start velocity and goal are certain.
+        Start, start velocity and goal have no variance.
 
         Args:
             primitive: A single primitive, fitted with `scaling="none"`.
@@ -194,7 +194,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         return self.primitive.with_motion(motion.with_coordinates(self.mean))
 
     def sample(self, n: int, generator: torch.Generator | None = None) -> P:
-        """Batch of n random primitives, with durations of their own."""
+        """Batch of n random primitives; each has its own random duration."""
         rank = self.spread.shape[1]
         z = torch.randn(n, rank, generator=generator, dtype=torch.float64).to(self.spread)
         motion = self.primitive.motion
@@ -272,8 +272,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Gradients flow to times, values, velocities, mean and spread.
 
         Args:
-            time: Times of the via points [s], (n,), in the most likely motion. Empty: only the
-                duration is known.
+            time: Times of the via points [s], (n,), on the time scale of the most likely
+                motion. Empty: only the duration is known.
             value: Joints (n, D), unit quaternions (n, 4) or a `Pose` of (n). NaN leaves a
                 coordinate free; in a quaternion, the orientation.
             velocity: Joint velocities (n, D), angular velocities (n, 3) or twists (n, 6), per
@@ -306,15 +306,15 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         given = ~wanted.isnan()
         deviation = positive("noise", noise, mean).expand_as(via.position)
         deviation = deviation.repeat(2, 1).reshape(-1)[given]
-        # In units of the noise, and in coordinates z of the spread, whose prior is a unit
-        # Gaussian.
+        # Rows are in units of the noise. The unknowns z are factors on the columns of the
+        # spread, with a unit Gaussian as prior.
         root = root[given] / deviation[:, None]
         return self._given(root, (wanted[given] - mean[given]) / deviation)
 
     def _given(
         self, root: Float[Tensor, "k rank"], residual: Float[Tensor, "k"]
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian given root z = residual with unit noise, for coordinates z of the spread."""
+        """Gaussian given root z = residual with unit noise; z multiplies columns of `spread`."""
         # The prior's identity keeps this positive definite for any number of equal via points.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)
@@ -335,10 +335,10 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def at(
         self, start: Any = None, goal: Any = None, duration: float | None = None
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian with a certain start and goal, by default those of the mean.
+        """Gaussian given a start and a goal, by default those of the mean.
 
         Few demonstrations do not show reliably how a path depends on start and goal. The
-        covariance of the path with them is therefore multiplied by the factor, 0 to 1, that
+        covariance of path and ends is therefore multiplied by the factor `dependence`, which
         best predicts each demonstration from the others. On average, this predicts at least as
         well as the mean of all demonstrations.
 

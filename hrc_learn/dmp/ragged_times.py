@@ -6,8 +6,8 @@ are multiplied by the coordinates first. The result is a piecewise polynomial pe
 value at any time is a sum of a few coefficients weighted by powers.
 
 This sum is linear in the coordinates, and its time derivative is the motion of the next order.
-The same two functions therefore compute a motion, its adjoint, and their derivatives of any
-order.
+Two functions, `_motion` and `_adjoint`, therefore compute motions, gradients with respect to
+coordinates, and derivatives of both of any order.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ from hrc_learn.dmp.response import (
 
 NEGLIGIBLE = 4
 """Error allowed when the degree of polynomials is reduced, in machine epsilons relative to the
-largest value of a column: a sum of fifty products rounds off as much."""
+largest value of a column. The rounding error of a sum of fifty products is as large."""
 CHUNK = {"cpu": 2**16, "cuda": 2**22}
 """Samples processed at a time. On a CPU, their indices and powers fit the cache, which halves
 the time for a million samples; on a GPU, they occupy the device and take under a gigabyte."""
@@ -72,8 +72,8 @@ class CoefficientTable:
 
     Each piece has K coefficients: those of 1, u, u^2 ... with u from -1 to 1 along the piece,
     and those of functions of time that are not polynomial. One more piece covers all times
-    after the forcing: there the state at its end, relative to the goal, decays as the unforced
-    spring does.
+    after the forcing. The state at the end of the forcing, relative to the goal, decays there
+    as the unforced spring does.
     """
 
     response: Response
@@ -94,7 +94,7 @@ class CoefficientTable:
     def locate(
         self, s: Float[Tensor, "B T"], dtype: torch.dtype
     ) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T K"]]:
-        """Piece that contains each time, and the values that multiply its coefficients."""
+        """Piece that contains each time, and values that multiply the coefficients of the piece."""
         forced = self.response.forced
         pieces, periodic = len(forced.coefficients), forced.periodic
         x = s / forced.interval
@@ -147,7 +147,7 @@ def _tabulate(
     forced, N = response.forced, response.basis.count
     row = forced.coefficients[:, :, min(order, 1)]
     for _ in range(order - 1):
-        # The table of y' is as exact as that of y, so y' is differentiated for higher orders.
+        # The table of y' is as exact as the table of y, so differentiate y' for higher orders.
         exponents = torch.arange(row.shape[1], dtype=row.dtype, device=row.device)
         row = row * (2 / forced.interval * exponents)[:, None]
         row = torch.nn.functional.pad(row[:, 1:], (0, 0, 0, 1))
@@ -263,7 +263,7 @@ def _motion(s: Tensor, coordinates: Tensor, response: Response, order: int) -> T
         flat, pieces = _flat_pieces(piece)
         rows = _rows(table, x, pieces)
         if x.is_cpu and bags is None:
-            # Looked up, because computing the indices of each sample takes twice as long.
+            # A table of indices: computing them for each sample would take twice as long.
             count = len(x) * table.pieces * table.size
             bags = torch.arange(count, dtype=torch.int32).view(-1, table.size)
         if bags is None:

@@ -1,9 +1,9 @@
-"""The motion of a primitive as a linear map of its coordinates.
+"""The exact motion of a primitive, as a linear map of its coordinates.
 
-With x = (y - g, y'), the forcing alone drives x' = A x + (0, phi(s)), with the solution
-x(b) = E(b - a) x(a) + integral from a to b of E(b - u) (0, phi(u)) du, where E is the
-transition matrix of the spring. The integral is computed piece by piece, summed, and kept as a
-table of polynomials.
+The state x = (y - g, y') obeys x' = A x + (0, phi(s)) if a basis function phi is the forcing.
+The solution is x(b) = E(b - a) x(a) + integral from a to b of E(b - u) (0, phi(u)) du, where E
+is the transition matrix of the spring. The integral is computed piece by piece, summed, and
+kept as a table of polynomials.
 """
 
 import json
@@ -30,7 +30,7 @@ from hrc_learn.dmp.dynamics import (
 )
 
 GAUSS_POINTS = 12
-"""Points of Gauss-Legendre quadrature on a piece, on which no basis function changes much."""
+"""Points of Gauss-Legendre quadrature on a piece; no basis function changes much on a piece."""
 DEGREE = 12
 """Degree of the polynomials; pieces are so short that the remaining error is rounding."""
 GRIDS_KEPT = 16
@@ -41,7 +41,7 @@ SMALL_MATRIX_CORES = {"SkylakeX", "Cooperlake", "SapphireRapids"}
 """OpenBLAS core types (version 0.3.29) with kernels for small matrices, which skip packing: all
 processors with AVX-512, including AMD's."""
 MINIMUM_ROWS = 4
-"""Number of rows from which those kernels are faster than one flat product of all motions."""
+"""Number of rows from which these kernels are faster than one flat product of all motions."""
 
 
 def chebyshev_points() -> Float[Tensor, "P"]:
@@ -152,7 +152,7 @@ class TimeGrid:
     """The first of the matrices in NumPy; None if it is not on the CPU."""
 
     def holds(self, s: Tensor) -> bool:
-        """True if `s` has the same times; it must not be traced or differentiated."""
+        """True if `s` has the same times; `s` must not be traced or differentiated."""
         # Reading another device would wait for its queue, and transforms refuse it.
         if not s.is_cpu or transforming():
             return s is self.s and s._version == self.version
@@ -165,9 +165,9 @@ class Response:
 
     y(s) = H(s) [w_1 ... w_N, y_0', y_0, g]: each column of H is the motion that one unit of a
     coordinate causes alone. The columns of the weights are integrated once by Gauss-Legendre
-    quadrature with the transition matrix of the spring, and kept as polynomials in s; the
-    others are closed form. Nothing depends on the step length of a grid. Everything is float64
-    until it is returned.
+    quadrature with the transition matrix of the spring, and kept as polynomials in s; the other
+    columns have a closed form. The motion does not depend on the step length of a grid. All
+    computations are in float64.
     """
 
     def __init__(self, spring: SpringDamper, basis: Basis, approach: float = 0.0):
@@ -193,10 +193,10 @@ class Response:
         # Tensors made in inference mode cannot take part in a backward pass later.
         with torch.inference_mode(False):
             self.forced = self._integrate()
-        """States (y, y') caused by unit weights alone, (2, N): from rest at the goal at s = 0,
-        or on the limit cycle for a periodic basis."""
+        """States (y, y') caused by unit weights alone, (2, N). They start from rest at the goal
+        at s = 0; for a periodic basis, they are on the limit cycle."""
         self.tables: dict[Hashable, Any] = {}
-        """Tables derived from this response by other modules, kept as long as it is."""
+        """Tables that other modules derive from this response, kept as long as the response."""
         self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
         self._latest: TimeGrid | None = None
 
@@ -237,7 +237,7 @@ class Response:
 
     @torch.inference_mode(False)
     def _transposed(self, s: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute `matrices` for all later calls."""
+        """Compute the result of `matrices`, so that calls in any mode can use it."""
         H = self.evaluate(s.detach().clone().double()).to(dtype)
         position, velocity, acceleration = without_subnormals(H).permute(1, 2, 0).contiguous()
         return position, velocity, acceleration
@@ -285,7 +285,7 @@ class Response:
         if self.approach:
             force = self.approach_force(s)[..., None]
             forcing = torch.cat([forcing[..., :-2], -force, force], dim=-1)
-        # All columns are offsets from the goal except the goal's own, which is shifted by one.
+        # All columns are offsets from the goal, except the goal's own column, which is 1 larger.
         free = self.spring.acceleration(state[..., 0, :] - goal, state[..., 1, :])
         return (free + forcing)[..., None, :]
 
@@ -364,7 +364,7 @@ def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Re
 
 
 def named_response(name: str) -> Response:
-    """The shared response of this name, for custom operators, which cannot take objects."""
+    """Shared response with this `name`, for custom operators, which cannot take objects."""
     spring, basis, approach = json.loads(name)
     return response_of(SpringDamper(**spring), restored_basis(basis), approach)
 
@@ -392,8 +392,8 @@ def product(
 ) -> Float[Tensor, "*batch D T"]:
     """Product X H of a batch of coordinates with one matrix.
 
-    With OpenBLAS's kernels for small matrices, a batch takes less than half the time of a flat
-    product if multiplied motion by motion; without them, four times as long.
+    Multiplying motion by motion takes less than half the time of one flat product if OpenBLAS
+    has kernels for small matrices, and four times as long if it has none.
     """
     D, single = X.shape[-2], X.ndim == 2
     if fits_numpy(X):

@@ -17,7 +17,7 @@ from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
 
 SEARCH_RANGE = 0.1
-"""Relative range around the autocorrelation's estimate in which a period is searched."""
+"""Relative range around the estimate by autocorrelation in which a period is searched."""
 HIGH_PEAK = 0.9
 """Height of a peak of the autocorrelation, relative to the highest, that counts as high."""
 GOLDEN = (5**0.5 - 1) / 2
@@ -88,9 +88,9 @@ def fit_rhythmic(
 def find_period(
     elapsed: Float[Tensor, "T"], y: Float[Tensor, "T D"], response: Response
 ) -> Float[Tensor, ""]:
-    """Period [s] of an oscillation: the highest peak of the autocorrelation, refined.
+    """Period [s] of an oscillation: the first high peak of the autocorrelation, refined.
 
-    The refined period is the one whose rhythm fits the samples best, by golden sections.
+    A golden-section search around the peak finds the period whose rhythm fits the samples best.
     """
     span = elapsed[-1]
     rough = _autocorrelation_peak(elapsed, y)
@@ -163,7 +163,7 @@ def fit_rhythmic_orientation(
     """Fit a rhythm of an orientation to each demonstration of at least one cycle.
 
     The error to the mean orientation oscillates as a `fit_rhythmic` primitive; the goal of the
-    result is its centre. `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
+    result is the centre of the oscillation. `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).

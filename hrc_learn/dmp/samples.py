@@ -30,16 +30,16 @@ STRENGTHS = -10, 6, 81
 """Decimal exponents of the first and the last penalty compared, relative to the samples, and
 the number of penalties. A step of 0.2 decades changes the error by less than 1 %."""
 LIKELIHOOD_MARGIN = 1.0
-"""Twice the logarithm of a likelihood ratio that is not significant; two standard deviations
-would be four."""
+"""Twice the logarithm of the largest likelihood ratio that is not significant. A margin of two
+standard deviations would be 4."""
 CLEAN = 2e-5
 """Noise relative to the range below which samples stay as they are: the accuracy of a fit with
 fifty functions."""
 ORDER = 3
-"""Order of the penalised differences: a motion without jerk is a parabola."""
+"""Order of the penalised differences; third differences are zero for motions without jerk."""
 SAMPLES_EACH = 1.5
-"""Samples per basis function from which a fit determines the motion between samples: with
-fewer, accelerations are several times the true ones."""
+"""Samples per basis function that a fit needs to determine the motion between samples. With
+fewer, accelerations are several times too large."""
 DENSE = 4
 """Samples per basis function of the grids of `densified`, enough to show the cubics' detail."""
 
@@ -125,7 +125,7 @@ class Samples:
 
     @cached_property
     def amplitude(self) -> Float[Tensor, "B D"]:
-        """Range of each coordinate; one where a coordinate never moves, to divide by."""
+        """Range of each coordinate, as a divisor: 1 for a coordinate that never moves."""
         return self.span.masked_fill(self.span == 0, 1.0)
 
     def compare(
@@ -213,7 +213,7 @@ def check_samples(
 
     Raises:
         ValueError: Shapes that do not fit, values that are not finite, time that does not
-            increase, or fewer than 3 samples. The message names the place.
+            increase, or fewer than 3 samples. The message names the sample or the shape.
     """
     position = _floating(position)
     time = to_tensor(time, torch.float64, position.device)
@@ -351,7 +351,7 @@ def _normalised(
 
 
 def smoothed(samples: Samples) -> tuple[Samples, Float[Tensor, "B D"]]:
-    """Samples without their noise, and its standard deviation in each column.
+    """Samples without noise, and the standard deviation of the noise in each column.
 
     Columns with less noise than `CLEAN`, and columns that never move, stay unchanged.
     """
@@ -372,10 +372,10 @@ def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]) -> tuple[Tensor
 
 
 def densified(samples: Samples, n_basis: int) -> Samples:
-    """Samples that are dense enough to determine all functions in each demonstration.
+    """Samples that are dense enough to determine all basis functions in each demonstration.
 
-    Between recorded samples they follow cubics with the recorded velocities, or with slopes by
-    second-order differences, which are exact for parabolas.
+    New samples between the recorded ones lie on cubics with the recorded velocities, or with
+    slopes from second-order differences, which are exact for parabolas.
     """
     few = samples.mask.sum(-1) <= SAMPLES_EACH * n_basis
     if not few.any():
@@ -433,12 +433,12 @@ class _Spline:
     """Precision of each coordinate from the samples, 0 to 1; the penalty adds the rest."""
 
     def at_samples(self, points: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch T"]:
-        """Splines with these control points."""
+        """Values of the splines with these control points, at the samples."""
         parts = (points[..., self.first + k] * self.values[:, k] for k in range(4))
         return reduce(torch.add, parts)
 
     def projected(self, y: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch K"]:
-        """Products of samples with each spline; the transpose of `at_samples`."""
+        """Scalar products of samples and each spline; the transpose of `at_samples`."""
         total = y.new_zeros(*y.shape[:-1], len(self.V))
         for k in range(4):
             total.index_add_(-1, self.first + k, y * self.values[:, k])

@@ -25,7 +25,7 @@ type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Sequence | floa
 """A tensor, a NumPy array, or a nested list of numbers."""
 
 # Below these thresholds the series are exact to rounding in float64 (next term < 1e-16), while
-# the closed forms lose their second derivatives to cancellation, which grows as 1/threshold^2.
+# the second derivatives of the closed forms lose digits to cancellation, as 1/threshold^2.
 _SINC_THRESHOLD = 1e-2
 _ARCTAN_THRESHOLD = 1e-3
 
@@ -60,11 +60,11 @@ def check_settings(
 
     Args:
         settings: Object with the settings as attributes.
-        positive: Names of those that must be positive.
-        finite: Names of those that must be positive and finite.
-        not_negative: Names of those that must be zero or positive.
-        below_one: Names of those that must be in [0, 1).
-        fraction: Names of those that must be in (0, 1].
+        positive: Names of settings that must be positive.
+        finite: Names of settings that must be positive and finite.
+        not_negative: Names of settings that must be zero or positive.
+        below_one: Names of settings that must be in [0, 1).
+        fraction: Names of settings that must be in (0, 1].
 
     Raises:
         ValueError: A setting is not in its range.
@@ -131,7 +131,7 @@ def safe_norm(vector: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
     return torch.where(zero, 0.0, torch.sqrt(torch.where(zero, 1.0, square)))
 
 
-# No measurement in SI units is as large. The square of this number fits into float32.
+# Larger than any measurement in SI units; the square of this number fits into float32.
 _LARGEST_VALID = 1e12
 
 
@@ -141,9 +141,9 @@ def is_number(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
 
 
 def may_branch(x: Tensor) -> bool:
-    """True where a step may skip work by branching on its data.
+    """True if Python may branch on the values of a tensor, for example to skip work.
 
-    Tracers and `vmap` cannot follow such a branch, and on an accelerator it waits for the data.
+    Tracers and `vmap` cannot follow such a branch. On an accelerator, it would wait for data.
     """
     if torch.compiler.is_compiling() or x.device.type != "cpu":
         return False
@@ -151,12 +151,12 @@ def may_branch(x: Tensor) -> bool:
 
 
 def everywhere(mask: Bool[Tensor, "*batch"]) -> bool:
-    """True where a step may branch and a mask holds for the whole batch."""
+    """True if Python may branch (`may_branch`) and the mask is true for the whole batch."""
     return may_branch(mask) and bool(mask.all())
 
 
 def has_numbers(tree: Any) -> bool:
-    """True where a step may branch and all floating-point values of a pytree are numbers."""
+    """True if Python may branch and all floating-point values of a pytree are numbers."""
     values = [x.reshape(-1) for x in tree_leaves(tree) if x.is_floating_point()]
     return may_branch(values[0]) and bool(is_number(torch.cat(values)).all())
 
@@ -171,7 +171,7 @@ def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
 
 
 def minimum_jerk[T: (float, Tensor)](x: T) -> tuple[T, T]:
-    """Progress 0 to 1 of a minimum-jerk motion and its slope (Flash and Hogan 1985).
+    """Progress m(x), 0 to 1, of a minimum-jerk motion, and dm/dx (Flash and Hogan 1985).
 
     Args:
         x: Fraction of the duration. Outside 0 to 1 the motion rests at the start or the end.
@@ -219,7 +219,7 @@ def _outlives_the_call(tensor: Tensor) -> bool:
 # Products and solutions with matrices of a few rows. In eager mode each call costs more than
 # its arithmetic, so one call of BLAS or LAPACK is best. A compiler fuses sums of products with
 # the surrounding operations, also across a batch, but has to leave its loop for each call of
-# BLAS or LAPACK. So the compiled branch is written out.
+# BLAS or LAPACK. So the branches for compilers write the sums out.
 
 
 def matmul(
@@ -303,8 +303,8 @@ def null_projection(
 def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
     """An orthogonal matrix Q; J maps its last n - m columns to zero, up to rounding.
 
-    The first m columns span the range of J^T and, if its rank is below m, some of the null
-    space.
+    The first m columns span the range of J^T and, if the rank of J is below m, some of the
+    null space.
 
     Args:
         J: Jacobian with at least as many columns as rows.
@@ -319,13 +319,13 @@ def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n
 
 
 def _reflections(J: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Vectors and factors of the reflections that make J^T triangular, for each row of J."""
+    """Householder vector v and factor 2 / |v|^2 for each row of J, to make J^T triangular."""
     columns = list(J.unbind(-2))
     reflections: list[tuple[Tensor, Tensor]] = []
     for k in range(len(columns)):
         x = columns[k][..., k:]
         norm = (x * x).sum(-1, keepdim=True).sqrt()
-        # Equal signs, so no digits cancel.
+        # Both terms of the sum have the same sign, so no digits cancel.
         v = torch.cat([x[..., :1] + torch.copysign(norm, x[..., :1]), x[..., 1:]], dim=-1)
         square = (v * v).sum(-1, keepdim=True)
         # A column of zeros needs no reflection.
@@ -344,7 +344,7 @@ def _reflected(x: Tensor, k: int, v: Tensor, factor: Tensor) -> Tensor:
 
 
 def _factors(A: Tensor) -> tuple[list[list[Tensor]], list[Tensor]]:
-    """L and 1/D of A = L D L^T; L as rows of the entries left of its diagonal."""
+    """L and 1/D of A = L D L^T; each row of L holds only the entries left of the diagonal."""
     n = A.shape[-1]
     L: list[list[Tensor]] = [[] for _ in range(n)]
     inverse_d: list[Tensor] = []

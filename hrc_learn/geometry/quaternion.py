@@ -22,7 +22,7 @@ from hrc_learn.geometry.numerics import (
     safe_norm,
 )
 
-# Row i of the matrix P with p * q = P q, as components of p and their signs.
+# Matrix P with p * q = P q: for each entry, the index of the component of p, and its sign.
 _PRODUCT_INDEX = Constant(torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0]))
 _PRODUCT_SIGN = Constant(
     torch.tensor(
@@ -32,7 +32,7 @@ _PRODUCT_SIGN = Constant(
 _CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
 # The sum of the signs with these weights has the sign of the first non-zero component.
 _LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
-# 4 q q^T = I + sum over three entries of R (row-major) with these signs.
+# Each entry of 4 q q^T - I is a sum of three entries of R (row-major) with these signs.
 _OUTER_INDEX = Constant(
     torch.tensor(
         [
@@ -162,10 +162,10 @@ def slerp(
 
 
 def mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
-    """The rotation whose matrix is nearest to the matrices of all inputs, regardless of sign.
+    """Mean rotation; the signs of the quaternions do not matter.
 
-    It minimises the sum of squared Frobenius norms of the differences (Markley et al. 2007,
-    "Averaging quaternions").
+    It minimises the sum of squared Frobenius norms of the differences between its rotation
+    matrix and those of the inputs (Markley et al. 2007, "Averaging quaternions").
     """
     q64 = q.double()
     return torch.linalg.eigh(q64.mT @ q64).eigenvectors[:, -1].to(q)
@@ -196,7 +196,7 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
     """
     length = safe_norm(v)
     axis = v / torch.where(length > 0, length, 1.0)[..., None]
-    # At the identity there is no axis: use the last one before it.
+    # At the identity there is no axis: use the axis of the last sample that has one.
     step = torch.arange(v.shape[-2], device=v.device).expand(length.shape)
     seen = torch.where(length > _AXIS_THRESHOLD, step, 0).cummax(-1).values
     axis = torch.take_along_dim(axis, seen[..., None], dim=-2)
@@ -267,7 +267,7 @@ def drift_free_slope(
     rate: Float[Tensor, "*batch 3"],
     curvature: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """v', from e, e' and e'': minus the angular acceleration."""
+    """Solve for v', given e' = `rate` and e'' = `curvature`: minus the angular acceleration."""
     square = (e * e).sum(-1, keepdim=True)
     h, k = _h(square), _k(square)
     # h' = dh/da a' with a a' = e e'; likewise k'. The closed forms cancel at small a.
@@ -284,7 +284,7 @@ def drift_free_slope(
 
 
 def _h(square: Tensor) -> Tensor:
-    """(1 - cos a) / a^2 from a^2, by half the angle to avoid cancellation."""
+    """(1 - cos a) / a^2 from a^2, computed from sin(a / 2) to avoid cancellation."""
     _, half = cos_and_sinc(square / 4)
     return half**2 / 2
 

@@ -1,4 +1,4 @@
-"""Shapes to draw and to keep clear of, the rigid bodies that carry them, and mesh files.
+"""Shapes that are drawn or avoided, the rigid bodies that carry them, and mesh files.
 
 A body is a trajectory of poses with boxes, capsules or mesh files attached to it. trimesh reads
 the files. Only the triangles, their positions in the scene and one plain colour for each
@@ -80,7 +80,7 @@ class MeshFile:
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Unit quaternion (w, x, y, z)."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Factors on the file's coordinates, along its own axes."""
+    """Factors on the coordinates in the file, along the axes of the file."""
     colour: Colour | None = None
     """Colour of parts without a colour in the file; None: the default."""
 
@@ -111,7 +111,7 @@ class MeshPart:
     faces: Int[np.ndarray, "faces 3"]
     """Corners of each triangle, counter-clockwise as seen from outside."""
     colour: Colour | None = None
-    """None: the file gives none."""
+    """Colour in the file, None if there is none."""
 
     def placed(self, mesh: MeshFile) -> "MeshPart":
         """The part in the frame of its body, with a colour."""
@@ -152,7 +152,7 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
 
     parts = []
     for mesh, colour in _meshes(path):
-        # Merge vertices within a micrometre: text files are rounded to about that.
+        # Merge vertices within a micrometre, to which text files are typically rounded.
         mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=6)
         mesh.update_faces(mesh.nondegenerate_faces())
         mesh = smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
@@ -192,7 +192,7 @@ def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
 
     try:
         scene = trimesh.load_scene(path, process=False)
-    except Exception as error:  # for broken files, its readers raise errors of many types
+    except Exception as error:  # trimesh raises errors of many types for broken files
         raise ValueError(f"{path} is no mesh that trimesh reads: {error}") from error
     unit = str(scene.units or "").partition(" * ")[0]
     scale = float(unit) if unit[:1].isdigit() else 1.0

@@ -24,13 +24,13 @@ class Region(ABC):
 
     @abstractmethod
     def value(self, x: Float[Tensor, "*batch n"]) -> Tensor:
-        """Region function f, at most zero inside; one value, or one for each component of x."""
+        """Region function f, at most zero inside: a scalar, or a value per component of x."""
 
     @abstractmethod
     def feedback(
         self, x: Float[Tensor, "*batch n"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
-        """Potential P of shape (*batch,) and its gradient of shape (*batch, n)."""
+        """Potential P (*both,) and its gradient (*both, m); m = 3 for orientations, else n."""
 
     @final
     def potential(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both"]:
@@ -43,7 +43,7 @@ class Region(ABC):
         return self.feedback(x)[1]
 
 
-# Region function at twice the half size, beyond which the pull of the saturated form grows
+# Value of f at twice the half size. Where f is larger, the pull of the saturated form grows
 # linearly with the distance.
 _FAR_OUT = 3.0
 
@@ -56,13 +56,14 @@ class PositionRegion(Region):
     f_i = ((r_i - c_i) / h_i)^2 - 1                                      (CaFun)
     P   = sum_i k_c/2 max(0, f_i)^2                                      (CaPeFun)
 
-    k_c has the unit of a potential: the requested speed, 2 k_c f (r - c)/h^2, grows as the box
-    shrinks, and near a wall the excess decays at the rate 4 k_c/h^2 [1/s].
+    with position r, centre c and half size h. k_c has the unit of P. The requested speed,
+    2 k_c f (r - c)/h^2, therefore grows as the box shrinks. Near a wall, the distance past
+    the wall decays at the rate 4 k_c/h^2 [1/s].
 
-    Far from a small box this pull grows with the cube of the distance: the axis with the
-    largest offset dominates, and a cap on the twist leaves nothing for the rotation.
-    `formulation="saturated"` is equal up to twice the half size, f = 3; beyond, the pull grows
-    linearly, so the tool moves straight to the box:
+    Far from a small box this pull grows with the cube of the distance. The axis with the
+    largest offset then dominates, and a cap on the twist leaves almost nothing for rotation.
+    `formulation="saturated"` is equal up to twice the half size, f = 3. Farther out, its pull
+    grows linearly, so the tool moves straight to the box:
 
     P = sum_i k_c 3 (f_i - 3/2),   f_i > 3
     """
@@ -72,8 +73,8 @@ class PositionRegion(Region):
     half_size: Float[Tensor, "*#batch 3"]
     """Half edges of the box, all positive, along the base axes [m]."""
     stiffness: float | tuple[float, float, float] = static(4e-3)
-    """k_c, one for all or one for each axis of the box. Table I has 4e-4 for x and y, with
-    which the excess near a wall decays in 9 s if the half size is 0.12 m."""
+    """k_c, one value for all axes or one for each axis of the box. Table I of the paper has
+    4e-4 for x and y; for a half size of 0.12 m, the time constant near a wall is then 9 s."""
     formulation: Literal["paper", "saturated"] = static("paper")
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
@@ -88,7 +89,7 @@ class PositionRegion(Region):
         scaled = (x - self.centre) / self.half_size
         f = (scaled * scaled - 1).clamp(min=0)
         k_c = self.stiffness
-        # One for each axis of the box, or one for all.
+        # One value for each axis of the box, or one value for all axes.
         k_c = f.new_tensor(k_c) if isinstance(k_c, tuple) else k_c
         if self.formulation == "saturated":
             near = f.clamp(max=_FAR_OUT)
@@ -100,8 +101,8 @@ class PositionRegion(Region):
         return P, 2 * pull * scaled / self.half_size
 
 
-# Shorter axes are rounding noise. They occur only at the goal, inside the cone, where the
-# gradient is zero.
+# Error vectors sin(phi/2) n shorter than this are rounding noise. They occur only at the goal,
+# inside the cone, where the gradient is zero.
 _SHORTEST_AXIS = 1e-12
 
 
@@ -132,10 +133,10 @@ class _Cone(Region):
 
     @abstractmethod
     def _half_angle(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """sin(phi/2) n with the axis n of the error, sin(phi/2) and cos(phi/2)."""
+        """Three tensors: sin(phi/2) n with the axis n of the error, sin(phi/2), cos(phi/2)."""
 
     def _potential_and_slope(self, sine: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-        """Potential, and its derivative with respect to phi, divided by sin(phi/2)."""
+        """Potential P, and the quotient of dP/dphi and sin(phi/2)."""
         f = (self.sharpness * torch.atan2(sine, cosine) - 1).clamp(min=0)
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
         # Divided by the sine, because the vector part of the error is sin(phi/2) n.
@@ -146,7 +147,7 @@ class _Cone(Region):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class OrientationRegion(_Cone):
-    """All orientations within an angle of the goal; its potential is zero inside.
+    """All orientations p within an angle of the goal p_g; P is zero inside.
 
     f = alpha_o |log(p * p_g^-1)| - 1                                    (OrtRegion)
     P = k_o/2 max(0, f)^2                                                (OrtFun1)
@@ -157,8 +158,8 @@ class OrientationRegion(_Cone):
 
     The gradient suits the geometric Jacobian: it is the derivative of P with respect to a small
     rotation of the end effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis
-    n of the error. `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n
-    (orient_diff_potential), which has the same direction and 2 phi times the length.
+    n of the error. `formulation="paper"` is alpha_o k_o max(0, f) phi n, as printed in the
+    paper (orient_diff_potential); it has the same direction and 2 phi times the length.
 
     With `coordinates="rotation_vector"` the gradient suits the analytic Jacobian: it is the
     derivative of P with respect to the rotation vector of x, J_l^T times the gradient above.
@@ -197,13 +198,13 @@ class OrientationRegion(_Cone):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class AxisRegion(_Cone):
-    """All orientations whose z axis is within an angle of the goal's; rotation about it is
-    free.
+    """All orientations whose z axis is within an angle of the goal's z axis; the rotation
+    about z is free.
 
     f and P are those of `OrientationRegion` for the angle phi between both axes. The gradient
     is the derivative of P with respect to a small rotation of the end effector about the base
-    axes. It is perpendicular to both axes, so it requests no rotation about the tool's own
-    axis. If the two axes are opposite, the goal determines the axis of rotation.
+    axes. It is perpendicular to both z axes, so it requests no rotation about them. If the
+    two z axes are opposite, it lies along the axis of the rotation from goal to x.
     """
 
     def feedback(
@@ -255,7 +256,7 @@ class VisionRegion(Region):
     """
 
     target: Float[Tensor, "*#batch rows"]
-    """Desired feature position (u, v) [px], or u and v of several points in turn."""
+    """Desired feature position (u, v) [px]; for several points (u_1, v_1, u_2, v_2, ...)."""
     half_size: Float[Tensor, "*#batch rows"]
     """Half axes b_1, b_2 of the ellipse, positive [px]; the ellipse should be in the image."""
     stiffness: float = static(0.3)
@@ -308,7 +309,7 @@ class VisionRegion(Region):
         return P, gradient / self.half_size
 
     def _steer(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
-        """Potential and gradient of a point at its normalised offset."""
+        """Potential of a point, and its gradient with respect to the normalised offset."""
         square = (scaled * scaled).sum(-1, keepdim=True)
         steer = self._saturated if self.formulation == "saturated" else self._paper
         P, slope = steer(square)
@@ -359,7 +360,7 @@ class JointRegion(Region):
         return cls(centre=(lower + upper) / 2, half_range=(upper - lower) / 2, **options)
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both n"]:
-        """f_i of every joint at the nearer limit [rad] ("paper": [rad^2])."""
+        """Region function f_i of every joint [rad] ("paper": [rad^2])."""
         return self._depths(self.half_range - (x - self.centre).abs())[0]
 
     def feedback(
@@ -374,11 +375,11 @@ class JointRegion(Region):
         slope = pull + pull_reference  # dP/d delta, at most zero
         if self.formulation == "paper":
             slope = slope * (2 * distance)
-        # The distance to the nearer limit falls on both sides of the centre.
+        # The distance to the nearer limit decreases away from the centre, on both sides.
         return P, -torch.sign(offset) * slope
 
     def _depths(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Region functions f and f_r from the distance to the limit."""
+        """Region functions f and f_r from the distance to the nearer limit [rad]."""
         if self.formulation == "paper":
             square = distance * distance
             return square - self.margin**2, square - self.reference_margin**2
