@@ -1,8 +1,8 @@
 """State of a primitive that runs in closed loop, and the exact step to the next state.
 
 The equation of motion is linear, so each term (forcing, goal filter, coupling) has a particular
-solution, which is known before and after a step. The difference between the state and the sum of these
-solutions decays as the unforced spring does. Steps of any length are therefore exact.
+solution, which is known before and after a step. The difference between the state and the sum
+of these solutions decays as the unforced spring does. Steps of any length are therefore exact.
 """
 
 import math

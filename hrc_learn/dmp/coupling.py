@@ -62,8 +62,8 @@ def steering(
     The term is gamma R v phi exp(-beta phi). phi is the angle between the velocity v and the
     direction of the obstacle; R rotates v by 90 degrees away from the obstacle (Hoffmann et al.
     2009, "Biologically-inspired dynamical systems for movement generation", eq. 9). The term
-    bends the path and keeps the speed. An obstacle straight ahead has no effect, because neither
-    side is nearer.
+    bends the path and keeps the speed. An obstacle straight ahead has no effect, because
+    neither side is nearer.
 
     Args:
         position: [m].

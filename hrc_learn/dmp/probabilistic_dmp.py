@@ -314,7 +314,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def _given(
         self, root: Float[Tensor, "k rank"], residual: Float[Tensor, "k"]
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian given root z = residual with unit noise; z multiplies columns of `spread`."""
+        """Gaussian given root z = residual with unit noise, for factors z on `spread`."""
         # The prior's identity keeps this positive definite for any number of equal via points.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)

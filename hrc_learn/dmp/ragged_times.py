@@ -94,7 +94,7 @@ class CoefficientTable:
     def locate(
         self, s: Float[Tensor, "B T"], dtype: torch.dtype
     ) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T K"]]:
-        """Piece that contains each time, and values that multiply the coefficients of the piece."""
+        """Piece that contains each time, and values that multiply its K coefficients there."""
         forced = self.response.forced
         pieces, periodic = len(forced.coefficients), forced.periodic
         x = s / forced.interval

@@ -285,7 +285,7 @@ class Response:
         if self.approach:
             force = self.approach_force(s)[..., None]
             forcing = torch.cat([forcing[..., :-2], -force, force], dim=-1)
-        # All columns are offsets from the goal, except the goal's own column, which is 1 larger.
+        # All columns are offsets from the goal, except the goal's column, which is 1 larger.
         free = self.spring.acceleration(state[..., 0, :] - goal, state[..., 1, :])
         return (free + forcing)[..., None, :]
 

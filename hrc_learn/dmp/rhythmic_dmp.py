@@ -163,7 +163,8 @@ def fit_rhythmic_orientation(
     """Fit a rhythm of an orientation to each demonstration of at least one cycle.
 
     The error to the mean orientation oscillates as a `fit_rhythmic` primitive; the goal of the
-    result is the centre of the oscillation. `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
+    result is the centre of the oscillation. `duration` (or `speed`) and `forcing_gain` modulate
+    the rhythm.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).

@@ -1,4 +1,4 @@
-"""Least-squares solvers: from samples to weights and start velocity, and ridge regression.
+"""Least-squares fits of weights and start velocities to samples, and ridge regression.
 
 Demonstrations with the same normalised times are fitted by one matrix product, demonstrations
 with different times by batched normal equations.
@@ -28,8 +28,8 @@ WELL_POSED = 1e-3
 """Smallest ratio of the smallest to the largest diagonal entry of a Cholesky factor; at 1e-4,
 half of the digits of float64 are lost, because the products have the square of this ratio."""
 CONSTANT = 1e-12
-"""Standard deviation relative to the size below which a feature counts as constant: only
-rounding is left when the mean is subtracted."""
+"""Standard deviation of a feature, relative to its size, below which the feature counts as
+constant: only rounding is left when the mean is subtracted."""
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
 """Weights and start velocity dy/ds."""
 
@@ -42,7 +42,7 @@ def fit_samples(
     Args:
         method: `"trajectory"`, least squares on the positions; `"ridge"`, ridge regression on
             the force; `"lwr"`, locally weighted regression on the force as in the paper, which
-            fits each weight alone.
+            fits each weight separately.
         response: Response of the primitive to be fitted.
         samples: One demonstration or many.
         regularization: Ridge, relative to the largest singular value of the design matrix.
@@ -99,7 +99,7 @@ def _fit_ragged(
 def normal_products(
     response: Response, samples: Samples, known: Float[Tensor, "B k D"]
 ) -> Float[Tensor, "B m m"]:
-    """Products for `solve_normal`; those of several demonstrations may be added.
+    """Products for `solve_normal`; products of several demonstrations may be added.
 
     Args:
         response: Response of the primitive, with a basis that is not periodic.
@@ -107,9 +107,9 @@ def normal_products(
         known: The last k coordinates: start velocity dy/ds if it is known, start, and goal.
 
     Returns:
-        Products, over the valid samples, of the first n columns and of the positions without
-        the effect of `known`. The columns are orthonormal on an even grid: if the samples
-        determine all functions, squaring them loses no digits.
+        Products, summed over the valid samples, of n mixed columns and of the positions without
+        the effect of `known`. The mixed columns are orthonormal on an even grid, so products
+        lose no digits if the samples determine all functions.
     """
     M = response.size
     n = M - known.shape[1]
@@ -161,11 +161,11 @@ def solve_normal(
 def _orthonormal_columns(
     response: Response, n: int, device: torch.device
 ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"]]:
-    """Replacement of the first n columns by ones that are orthonormal on an even grid.
+    """Mixtures of the first n columns of the response that are orthonormal on an even grid.
 
     Returns:
-        Coordinates of each column, those after n unchanged, and the singular values of the
-        balanced design matrix.
+        Coordinates that cause each mixture (columns after n stay as they are), and the singular
+        values of the balanced design matrix.
     """
     N = response.basis.count
     count = SAMPLES_PER_FUNCTION * N + 1
@@ -229,7 +229,7 @@ def _trajectory_operator(
     fit_rate: bool,
     regularization: float,
 ) -> tuple[Float[Tensor, "unknown T"], Float[Tensor, "unknown"]]:
-    """Matrix from samples to unknowns, and the effect of a known start velocity on them.
+    """Matrix from samples to unknowns, and the effect of a known start velocity on unknowns.
 
     With y_0 = y(0) and g = y(1) taken from the samples, the residual is linear in the samples,
     so one matrix maps samples to unknowns.
@@ -298,9 +298,9 @@ def fit_ridge(
     *,
     standardize: bool = True,
 ) -> RidgeFit:
-    """Minimise |Y - A X|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
+    """Minimise |Y - A [a B]'|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
 
-    The constant is not penalised, so that a strong penalty leads to the mean of the targets.
+    The constant a is not penalised, so that a strong penalty leads to the mean of the targets.
     With the hat matrix H = A (A'A + P)^-1 A', the residual of sample i in a fit to the others,
     at the same penalty P, is e_i / (1 - H_ii) (PRESS; Allen 1974, "The relationship between
     variable selection and data augmentation").

@@ -84,7 +84,7 @@ class Stepper:
         table = forced.coefficients.cpu() @ torch.from_numpy(weights.copy())
         self._table = PiecewisePolynomial(table, forced.interval, forced.periodic)
         self._end = math.inf if forced.periodic else forced.end
-        # The first step length differs from NaN, so that its matrix is computed.
+        # NaN differs from every step length, so the first step computes its matrix.
         self._transition = math.nan, np.eye(2)
 
     def initial_state(self, **arguments: Any) -> StepperState:
@@ -130,10 +130,10 @@ class Stepper:
         ds = dt * pace / duration
         now = s + ds
         if ds != self._transition[0]:
-            # Loops repeat their step length, so its matrix is kept.
+            # Loops repeat one step length, so keep its matrix.
             self._transition = ds, self._spring.propagator(ds).numpy()
         E = self._transition[1]
-        # After the forcing, the state it caused moves by the spring alone.
+        # After the end of the forcing, the state that it caused moves by the spring alone.
         forced = after = self._forced(now) if s < self._end else E.dot(before)
         if scale is not None:
             before, after = before.dot(scale), after.dot(scale)

@@ -26,15 +26,15 @@ from torch import Tensor
 END = 0
 """Token after which all integers are zero; it also pads."""
 PRIOR = 20.0
-"""Weight of the Laplace distribution that is added to the counts of an integer, in vectors."""
+"""Number of vectors as which the Laplace prior counts, when added to the counted integers."""
 LEAST = 0.02
 """Mean magnitude assumed for an integer that was always zero."""
 HEADROOM = 2.0
-"""Largest magnitude of an integer relative to those seen."""
+"""Largest magnitude of an integer, relative to the largest magnitude in the data."""
 
 
 class Interval(NamedTuple):
-    """An integer as far as it is known: its sign, 0 if unknown, and bounds of its magnitude."""
+    """Knowledge of an integer: its index, its sign (0: unknown), bounds of its magnitude."""
 
     index: int
     sign: int
@@ -48,11 +48,11 @@ class _Tree(NamedTuple):
     index: array
     """Integer that each question is about."""
     threshold: array
-    """Largest magnitude in the first branch; -1: the second branch is that of negative sign."""
+    """Largest magnitude in the first branch; -1: the sign is asked, second branch negative."""
     branches: array
     """Two for each question: the next question, or -1 - i for leaf i."""
     after: list[Interval]
-    """State after each leaf."""
+    """Knowledge after each leaf."""
     decided: list[tuple[Interval, ...]]
     """Integers other than zero that are decided on the way to each leaf."""
 
@@ -65,7 +65,8 @@ class TokenCode:
 
         Args:
             vocabulary_size: Number of tokens, `END` included.
-            table: Probability of each magnitude of each integer, zero above its largest.
+            table: Probability of each magnitude of each integer; zero for magnitudes that are
+                not allowed.
         """
         self.vocabulary_size, self.table = vocabulary_size, table
         self.size = len(table)
@@ -105,7 +106,7 @@ class TokenCode:
                 second = value < 0 if threshold < 0 else abs(value) > threshold
                 node = tree.branches[2 * node + second]
             done, state = state.index > last, tree.after[-1 - node]
-            # One token says that nothing follows, however many integers there are.
+            # `END` says that all remaining integers are zero, however many there are.
             if done and state.index < self.size:
                 return [*ids, END]
             ids.append(-node)
@@ -118,7 +119,7 @@ class TokenCode:
             if state.index == self.size:
                 break
             tree = self._tree(state)
-            # A vocabulary may be larger than the number of vectors that are left.
+            # A token has no leaf if fewer vectors are possible than there are tokens.
             if i == END or i > len(tree.after):
                 return found, True
             found += tree.decided[i - 1]
@@ -132,7 +133,7 @@ class TokenCode:
         return Interval(index, 0, 0, self._largest[index] if index < self.size else 0)
 
     def _split(self, state: Interval) -> tuple[int, float, Interval, Interval]:
-        """Threshold of the next question, probability of its first branch, and both states."""
+        """Threshold of the next question, probability of its first branch, then both states."""
         index, sign, low, high = state
         if low and not sign:
             return -1, 0.5, state._replace(sign=1), state._replace(sign=-1)

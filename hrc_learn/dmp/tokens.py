@@ -1,12 +1,13 @@
-"""Tokens of motions: short sequences of integers. Every sequence decodes to a bounded motion.
+"""Conversion between motions and tokens, which are short sequences of integers.
 
-Language models can predict motions as tokens. The components of a motion are rounded to
-multiples of one step, so components of less variance take fewer bits. This minimises the error
-(reverse water-filling: Cover and Thomas, "Elements of information theory", section 10.3).
-`TokenCode` turns the integers into tokens, the first components first.
+Every sequence of tokens decodes to a bounded motion. Language models can predict motions as
+tokens. The components of a motion are rounded to multiples of one step, so components of less
+variance take fewer bits. This minimises the error (reverse water-filling: Cover and Thomas,
+"Elements of information theory", section 10.3). `TokenCode` turns the integers into tokens,
+the first components first.
 
-Columns that jump between a few values, such as those of grippers, are columns of steps: their
-integers encode when they switch.
+Columns that jump between a few values, such as those of grippers, are called columns of steps.
+Their integers encode the times of the jumps.
 """
 
 from collections.abc import Iterable, Sequence
@@ -34,26 +35,28 @@ from hrc_learn.dmp.token_code import END, HEADROOM, TokenCode
 from hrc_learn.model_files import SavedModel, write_model
 
 PRICE = 0.1155
-"""Price of a bit in squared steps: (ln 4) / 12, by which one more bit reduces the error of fine
-steps."""
+"""Price of a bit in squared steps, (ln 4) / 12. One more bit reduces the squared error by about
+this amount if steps are fine."""
 REPRESENTED = 1 / 3
-"""Largest error of the splines relative to that of the tokens: it adds 5 % to the total."""
+"""Largest error of splines relative to the error of tokens; it adds 5 % to the total error."""
 ROUNDS = 8
 """Repetitions in which step and probabilities adapt to each other."""
 SMALLEST, LARGEST = 16, 2**15
-"""Bounds of the vocabulary."""
+"""Smallest and largest size of the vocabulary."""
 STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
-"""Largest number of values of a column of steps, largest number of its switches in a motion
-(later ones are left out), and largest number of times at which it can switch."""
+"""`STEP_LEVELS`: largest number of values of a column of steps. `SWITCHES`: largest number of
+its switches in a motion (later switches are left out). `MOST_SLOTS`: largest number of times at
+which it can switch."""
 OF_SCALE = 0.07
-"""Tolerance times FAST's scale at equal error, on five teleoperated datasets."""
+"""Product of tolerance and FAST's scale at equal errors, on five teleoperated datasets."""
 
 
 class MotionTokenizer(nn.Module):
     """Map between motions of D columns and tokens 0 ... vocabulary_size - 1.
 
     Token 0 ends and pads sequences. Every sequence decodes to a motion within the demonstrated
-    range, extended by a tenth to either side; its first tokens decode to a coarser motion.
+    range, extended by a tenth to either side; the first tokens of a
+    sequence decode to a coarser motion.
     """
 
     end = END
@@ -72,7 +75,7 @@ class MotionTokenizer(nn.Module):
 
         Args:
             config: `steps` (columns of steps), `slots` (number of times at which they can
-                switch), `step` (to whose multiples components are rounded) and `shift` (mean
+                switch), `step` (components are rounded to multiples of it) and `shift` (mean
                 magnitude of components beyond their integer, in steps).
             components: Components of all other columns.
             code: Code of the integers.
@@ -118,7 +121,7 @@ class MotionTokenizer(nn.Module):
             vocabulary_size: Number of tokens.
             start_velocity: Velocity at the start [1/s], (N, D), if it will be known whenever a
                 motion is encoded or decoded: it saves about 7 % of the tokens.
-            start_known: False: tokens determine the start, too.
+            start_known: True if the start will be known; False: tokens determine it.
             tolerance: Root mean square error of decoded motions, relative to the range of each
                 column between its quantiles of 1 and 99 %.
             steps: Columns that jump between a few values, such as those of grippers; by default
@@ -153,7 +156,7 @@ class MotionTokenizer(nn.Module):
         z = components.encode(parts, velocity) * components.spread
         # Errors of all columns add up.
         aim = tolerance * max(len(smooth), 1) ** 0.5
-        # Start from a step with which all components are exact enough.
+        # Begin with a step at which all components are exact enough.
         step, bits = aim * (12 / max(1, z.shape[1])) ** 0.5, None
         for _ in range(ROUNDS):
             q = _rounded(z / step, bits)
@@ -215,12 +218,12 @@ class MotionTokenizer(nn.Module):
         *,
         order: int = 0,
     ) -> Float[Tensor, "*batch T D"]:
-        """Motions of any sequences of tokens.
+        """Motions for any sequences of tokens.
 
         A motion begins exactly in the given state. It stays within the demonstrated range,
         extended by a tenth to either side. A start outside moves the limits. A motion can
-        leave them if its start velocity puts the second control point outside by more than a
-        quarter of the range.
+        leave the limits if its start velocity puts the second control point outside by more
+        than a quarter of the range.
 
         Args:
             ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.
@@ -229,7 +232,7 @@ class MotionTokenizer(nn.Module):
             start: (*batch, D); by default the mean start, or the encoded one.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
                 tokenizer was fitted with velocities, otherwise the encoded one.
-            order: Derivative with respect to time, 0, 1 or 2; those of steps are zero.
+            order: Derivative with respect to time, 0, 1 or 2; zero for columns of steps.
 
         Raises:
             ValueError: Tokens that are not in the vocabulary, or shapes that do not match.
@@ -338,7 +341,7 @@ class MotionTokenizer(nn.Module):
         """Columns of steps at normalised times."""
         jumps = jumps.unflatten(-1, (-1, SWITCHES))[..., None, :, :]
         at = (jumps.abs() - 1) / self.config["slots"]
-        # Rounding of a time that equals a slot does not delay the switch.
+        # The tolerance keeps rounding from delaying a switch at a requested time.
         now = (jumps != 0) & (s[..., None, None] >= at - 1e-9)
         index = _nearest(start, self.levels)[..., None, :] + (now * jumps.sign()).sum(-1).long()
         index = index.clamp(0, self.levels.shape[1] - 1)
@@ -349,7 +352,8 @@ class MotionTokenizer(nn.Module):
 class ActionProcessor:
     """Tokens of action chunks with the interface of FAST's processor, which LeRobot calls.
 
-    The tokens encode the start of a chunk too, because the interface does not pass it.
+    The tokens encode the start of a chunk too, because the interface does not pass
+    the start.
     """
 
     pad_token_id = eos_token_id = END
@@ -454,9 +458,10 @@ def _nearest(
 def _switches(
     samples: Samples, start: Float[Tensor, "B S"], steps: list[int], levels: Tensor, slots: int
 ) -> Float[Tensor, "B K"]:
-    """Integers of columns of steps: the slots of their switches in turn, negative if downwards.
+    """Integers of columns of steps: numbers of the slots at which they switch, in turn.
 
-    Slot k is at the fraction (k - 1) / slots of the duration.
+    A switch downwards has a negative number. Slot k is at the fraction (k - 1) / slots of the
+    duration.
     """
     y = torch.cat([start[:, None], samples.position.mT[..., steps].to(start)], 1)
     changes = _nearest(y, levels).diff(dim=1) * samples.mask[..., None]

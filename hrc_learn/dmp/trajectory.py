@@ -30,7 +30,7 @@ class PlottableTensor(Tensor):
 
 
 def plottable(values: Tensor) -> Tensor:
-    """The same tensor, readable by NumPy; gradients still flow to where it came from."""
+    """The same tensor, readable by NumPy; gradients still flow through it."""
     if not values.requires_grad or not readable(values):
         return values  # NumPy reads it anyway, or a program is traced or mapped
     return values.as_subclass(PlottableTensor)
@@ -170,12 +170,14 @@ class Trajectory(ArrayOutputs):
 
 
 class ContinuedTrajectory(Trajectory):
-    """Motion that continues from any state; its difference to H x decays as the spring does.
+    """Motion that continues from any state at the normalised time s_0.
 
-    y(s) = H(s) x + E(s - s_0) [state - (H, H')(s_0) x],   E the unforced spring's motion
+    y(s) = H(s) x + E(s - s_0) [state - (H, H')(s_0) x]
 
-    The motion is exact, linear in x and the state, and starts with the given position and
-    velocity. If the state lies on H x, the motion is the remainder of H x.
+    H x is the motion with the coordinates x, from which the state may differ. The difference
+    decays as the unforced spring moves, with the transition matrix E. The motion is exact,
+    linear in x and the state, and starts with the given position and velocity. If the state
+    lies on H x, the motion is the remainder of H x.
     """
 
     def __init__(

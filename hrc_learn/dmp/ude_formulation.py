@@ -2,16 +2,17 @@
 
 eta' = alpha (beta log(g conj q) - eta) + f,   q' = (0, eta) q / 2,   eta = tau omega
 
-("Orientation in Cartesian space dynamic movement primitives", eq. 16; primes are derivatives by
-s = t / tau, the logarithm here has the full angle). With e = log(g conj q) and v = -eta,
+("Orientation in Cartesian space dynamic movement primitives", eq. 16). Primes are derivatives
+with respect to s = t / tau; the logarithm here has the full angle; f is the forcing term. With
+e = log(g conj q) and v = -eta,
 
     v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
 
 which is the linear primitive except for n. This drift is zero while the axis of rotation is
 constant. The linear part is solved exactly, and n is integrated by the Runge-Kutta method of
 order 4 in the frame of the linear motion (Lawson 1967, "Generalized Runge-Kutta processes for
-stable systems"): a step is stable at any length and exact for rotations about one axis. The
-logarithm is followed continuously.
+stable systems"). A step is stable at any length and exact for rotations about one axis. The
+logarithm is continuous over time.
 """
 
 from dataclasses import replace
@@ -45,7 +46,7 @@ class UdePrimitive(JointDMP):
 
     @classmethod
     def refitted(cls, linear: JointDMP, errors: Samples) -> "UdePrimitive":
-        """Primitive whose forcing makes this state follow the motion of a linear primitive.
+        """Primitive whose forcing makes (e, v) follow the motion of a linear primitive.
 
         Args:
             linear: Fitted to the errors.
@@ -72,7 +73,7 @@ class UdePrimitive(JointDMP):
             v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, second)
             force = slope - second + motion.spring.alpha * (v - rate)
             change = (ridge_inverse(motion.basis.forcing(s), REGULARIZATION) @ force).mT
-            # A new tensor, because both primitives have the same weights until here.
+            # A new tensor, because `linear` holds the same tensor of weights.
             motion.weights = torch.nn.Parameter(motion.weights + change.to(motion.weights))
             motion.fit_report = errors.compare(motion.rollout().position)
         return motion
@@ -104,14 +105,14 @@ class UdePrimitive(JointDMP):
         s = self.timestamps if time is None else normalised_time(time, duration)
         start, _, per_s = self.resolve_boundary(boundary, duration)
         start, per_s = torch.broadcast_tensors(start, per_s)
-        # The state (e, v) of a motion of unit duration, whose velocity is v.
+        # Linear part of the state (e, v): a motion of unit duration with the velocity v.
         linear = Boundary(start, None, drift_free_rate(start, per_s))
         unit = self.resolve_duration(1.0, None).expand(self.duration.shape)
         x = self._motion_coordinates(linear, unit, forcing_gain)
         return UdeMotion(coordinates=x, s=s, duration=duration, response=self.response)
 
     def step_columns(self, state: DMPState, dt: Scalars, **inputs: Any) -> DMPState:
-        """State of the error after `dt` [s], of order 4 in `dt`."""
+        """State of the error after `dt` [s], by a method of order 4."""
         v = drift_free_rate(state.position, state.rate)
         begin = replace(state, rate=v)
         half = to_tensor(dt, v.dtype, v.device) / 2
@@ -164,8 +165,8 @@ class UdeMotion(Trajectory):
         return self.integrate()
 
     def integrate(self) -> Float[Tensor, "*batch T 2 3"]:
-        """State (e, v) at the requested times: one step from the knot before each."""
-        # No longer than the interval on which the forcing is smooth.
+        """State (e, v) at the requested times, by one step from the knot before each time."""
+        # At most half a piece of the response, on which the forcing is smooth.
         size = min(MAXIMUM_STEP, self._response.forced.interval / 2)
         s = self.s.expand(*self._batch, -1) if self.s.ndim > 1 else self.s
         knot = (s.detach() / size).floor()
@@ -245,7 +246,7 @@ def deviation(
     Args:
         z: Deviation before the step.
         h: Step in normalised time.
-        spring: Spring of A.
+        spring: Spring that determines A.
         linear: Linear (e, v) at the beginning, the middle and the end of the step.
     """
     begin, middle, end = linear

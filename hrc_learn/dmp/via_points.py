@@ -1,4 +1,4 @@
-"""Motions changed to pass exactly through via points.
+"""Changes of motions so that they pass exactly through via points.
 
 After Zhou, Gao and Asfour 2019, "Learning via-movement primitives": a motion is an elementary
 trajectory plus the shape that a demonstration adds, and via points change the elementary
@@ -19,11 +19,12 @@ from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
 
 SAMPLES_PER_FUNCTION = 8
-"""Times per basis function at which curve and motion are compared: basis functions cannot
-follow a change within an eighth of their distance."""
+"""Times per basis function at which curve and motion are compared. More are not needed: basis
+functions cannot follow changes within an eighth of their distance."""
 OUTSIDE = 1e-9
-"""Height that a basis function may reach outside of a window, relative to its peak. Of the
-Gaussians inside, only the few nearest to the ends of the window exceed this height."""
+"""Height, relative to its peak, that a basis function may reach outside of a window (times in
+which a motion may change). Of the Gaussians inside, only the few nearest to the ends of the
+window exceed this height."""
 RIDGE = 1e-7
 """Ridge that keeps weights with equal effect small, relative to the largest."""
 QUINTIC = torch.tensor(
@@ -36,9 +37,9 @@ DEPENDENT = 1e-12
 OVERSHOOT = 1.5
 """Largest change of a motion relative to that of the curve through its via points."""
 CLOSEST, CLOSEST_TO_WINDOW = 2, 6
-"""Smallest distances of via points without overshoot for any basis, gain or change, in units of
-the distance between basis functions: from one another, start and end; and from the ends of a
-window. At the next smaller distances tried, 1.5 and 5, motions overshoot."""
+"""Smallest distances at which motions do not overshoot, in units of the distance between basis
+functions. `CLOSEST`: between via points, and to start and end. `CLOSEST_TO_WINDOW`: to the ends
+of a window. At the next smaller distances tried, 1.5 and 5, motions overshoot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,12 +63,12 @@ def through_via_points(
 
     Args:
         motion: One primitive, or a batch with the same number of via points each.
-        via: Via points in its columns.
+        via: Via points in the columns of the primitive.
         within: Times [s] between which the motion may change; None: from start to end.
 
     Raises:
-        ValueError: Via points at one time or outside of the window, or too many or too close
-            together for the basis.
+        ValueError: Two via points at the same time, a via point outside of `within`, or too
+            many or too close via points for the basis.
     """
     if motion.basis.periodic:
         raise ValueError("a rhythm has no via points: every time occurs in each period")
@@ -159,7 +160,7 @@ def _change_curve(
 def _window(
     motion: LinearPrimitive, within: tuple[float | int, float | int] | None
 ) -> tuple[float, float]:
-    """Window in normalised time."""
+    """Window in normalised time: start and end of the time in which the motion may change."""
     if within is None:
         return 0.0, 1.0
     duration = motion.duration.double().reshape(-1)
@@ -239,7 +240,7 @@ def piecewise_quintic(
     rate: Float[Tensor, "*batch K D"],
     active: Bool[Tensor, "*batch K D"],
 ) -> Float[Tensor, "*batch G 3 D"]:
-    """Value and two derivatives of a curve through knots, without acceleration at them.
+    """Value and two derivatives of a curve through knots, with zero acceleration at the knots.
 
     Args:
         s: Times from the first to the last knot.
