@@ -1,9 +1,9 @@
-"""Make or extend datasets of version 3.0 from recordings, even from interrupted ones.
+"""Make or extend datasets of version 3.0 from recordings, even from interrupted recordings.
 
-A recording lives in `NAME.recording/`. Its `recording.json` holds an identifier and the number
-of episodes of the dataset that it extends. The finished dataset keeps the identifier. If
-the program stops before it removes the recording, the identifier shows that the dataset already
-holds it.
+A recording is a folder `NAME.recording/`. Its file `recording.json` holds an identifier and, if
+the recording extends a dataset, the number of episodes of this dataset. The finished dataset
+keeps the identifier of its recording. If a program finishes the dataset but stops before it
+removes the recording, the equal identifiers show that the dataset holds all its episodes.
 """
 
 import itertools
@@ -45,13 +45,13 @@ def assemble(
     videos: Sequence[Segments] | None = None,
     tasks: Sequence[str] = (),
 ) -> None:
-    """Write the dataset of staged episodes.
+    """Write a dataset from files that hold one episode each.
 
     Args:
         paths: Files written by `write_episode`, in order.
         target: Folder of the new dataset.
-        earlier: Dataset written by this package that the episodes are appended to. It is not
-            changed; its files are linked into the new dataset, or copied.
+        earlier: Dataset to which the episodes are appended, written by this package. The new
+            dataset gets links to its files, or copies; the earlier dataset is not changed.
         videos: Video segments of each episode; their files are copied. None for the videos that
             were recorded with the episodes; these are linked where possible.
         tasks: Task texts that already have an index, in order of the index.
@@ -65,7 +65,8 @@ def assemble(
     tables: list[pa.Table] = []
     if earlier is not None:
         tables.append(_carry_over(earlier, listed, cameras))
-        # The longer dataset keeps the details and the contract of the earlier one.
+        # The new dataset keeps the contract of the earlier dataset. It also keeps the details,
+        # except those that the recording gives again.
         before = read_sidecar(earlier)
         details = before.details | sidecar.details
         sidecar = replace(sidecar, details=details, contract=before.contract)
@@ -90,10 +91,10 @@ class _EpisodeList:
     Attributes:
         target: Folder of the new dataset.
         tasks: Task texts in the order of their indices.
-        data_files: Number of data files of an earlier dataset.
+        data_files: Number of data files of the earlier dataset.
         episodes: Number of episodes.
         frames: Number of frames.
-        videos: Number of video files of each camera of an earlier dataset.
+        videos: Camera -> number of its video files in the earlier dataset.
     """
 
     def __init__(self, target: Path, link_videos: bool):
@@ -107,7 +108,10 @@ class _EpisodeList:
     def row(
         self, staged: recorded.EpisodeDescription, length: int, file: int, videos: Segments
     ) -> dict:
-        """Place the videos of the next episode, and return its row; `file` is its data file."""
+        """Put the videos of the next episode into the dataset; return the row of this episode.
+
+        `file` is the number of the data file that holds the episode.
+        """
         self.tasks |= dict.fromkeys(staged.tasks)
         row = {
             "episode_index": self.episodes,
@@ -129,7 +133,10 @@ class _EpisodeList:
         return row
 
     def _place_video(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
-        """Place the video file of a segment; a file shared by episodes is placed once."""
+        """Put the video file of a segment into the dataset, and return the segment's columns.
+
+        A file with the videos of several episodes is put there once.
+        """
         placed = self._placed.setdefault(key, {})
         if segment.file not in placed:
             number = placed[segment.file] = self.videos.get(key, 0) + len(placed)
@@ -154,7 +161,7 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
     """One list of all episodes; tables may differ in their columns."""
     try:
         table = pa.concat_tables(tables, promote_options="permissive")
-    except pa.ArrowException:  # lists of the same values may differ in type
+    except pa.ArrowException:  # the types of a column differ too much
         table = _table_of([row for table in tables for row in table.to_pylist()])
     places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
     table = table.drop_columns([name for name in places if name in table.column_names])
@@ -164,7 +171,7 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def _count_files(table: pa.Table, kind: str) -> int:
-    """Number of data files, or of a camera's video files, in a list of episodes."""
+    """Number of files that a list of episodes uses; `kind` is "data" or "videos/CAMERA"."""
     chunks, files = (np.array(table[f"{kind}/{part}_index"]) for part in ("chunk", "file"))
     return 1 + int((chunks * metadata.CHUNK_SIZE + files).max())
 
@@ -182,7 +189,7 @@ def _write_frames(
 
 
 def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Group episodes into files of at most `FILE_SIZE_MB`, at least one episode each."""
+    """Group episodes into files of at most `FILE_SIZE_MB`, with at least one episode each."""
     group, size = [], 0
     for path in paths:
         size += path.stat().st_size
@@ -215,7 +222,7 @@ def _write_metadata(
     stacked: dict[str, dict[str, np.ndarray]] = {}
     for name in table.column_names:
         column = table.column(name)
-        # The dataset has statistics of those features that have them in all episodes.
+        # The dataset gets statistics of a feature only if all episodes have them.
         if name.startswith("stats/") and not column.null_count:
             key, _, statistic = name.removeprefix("stats/").rpartition("/")
             stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
@@ -225,10 +232,10 @@ def _write_metadata(
 
 
 def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> pa.Table:
-    """Link the data and videos of a dataset into the new one, and continue its counts.
+    """Link the files of the earlier dataset into the new one, and set the counts of `listed`.
 
     Returns:
-        Its list of episodes.
+        List of episodes of the earlier dataset.
     """
     folder = open_folder(earlier)
     for file in (*earlier.glob("data/*/*.parquet"), *earlier.glob("videos/**/*.mp4")):
@@ -253,7 +260,7 @@ def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments
 
 
 def put(source: str | Path, target: str | Path, *, link: bool = True) -> None:
-    """Hard-link or copy a file: the original exists until the dataset is complete."""
+    """Hard-link a file to `target`, or copy it if `link` is False or the link fails."""
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
@@ -268,7 +275,7 @@ def put(source: str | Path, target: str | Path, *, link: bool = True) -> None:
 _RECORDING = "recording.json"
 _EPISODE = "episode_[0-9][0-9][0-9][0-9][0-9][0-9]."
 _FILES = (f"{_EPISODE}parquet", f"{_EPISODE}*.mp4", "*.unfinished.mp4", ".*.writing/*")
-"""Patterns of the other files of a recording."""
+"""`_RECORDING`: file with the header of a recording. `_FILES`: patterns of its other files."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,15 +284,15 @@ class _Recording:
 
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
     episodes: store.Count | None = None
-    """Number of episodes of the dataset that the recording extends; None for a new one."""
+    """Number of episodes of the dataset that the recording extends; None for a new dataset."""
 
 
 def begin(root: Path, earlier_episodes: int | None) -> None:
-    """Make the folder of a recording; the caller holds its claim.
+    """Make the folder of a recording. The caller must hold the `store.Claim` of `root`.
 
     Args:
         root: Dataset to be made or extended.
-        earlier_episodes: Number of episodes of the dataset to extend; None for a new one.
+        earlier_episodes: Number of episodes of the dataset to extend; None for a new dataset.
 
     Raises:
         FileExistsError: `root` exists and is not to be extended, an interrupted recording of
@@ -299,7 +306,7 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
                 f"choose another name than {root.name}"
             )
         if _is_done(root, staging) or not _has_episodes(staging):
-            discard(staging)  # it holds nothing that the dataset lacks
+            discard(staging)  # no episode is lost
     if earlier_episodes is None and os.path.lexists(root):
         raise FileExistsError(
             f"{root} already exists: choose another folder, remove it, or append to it "
@@ -316,7 +323,7 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
     try:
         store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
     except OSError:
-        staging.rmdir()  # without its header it is no recording of ours
+        staging.rmdir()  # an empty folder would look like an interrupted recording
         raise
 
 
@@ -324,8 +331,8 @@ def finish(root: Path, claim: store.Claim) -> None:
     """Make or extend a dataset from its recording, then remove the recording.
 
     Raises:
-        DatasetError: No episode was saved for a new dataset.
-        FileExistsError: Another dataset has the name.
+        DatasetError: The dataset would be new, but no episode was saved.
+        FileExistsError: The dataset would be new, but `root` exists already.
     """
     root, staging = store.resolved(root), staging_folder(root)
     if not _is_done(root, staging):
@@ -355,8 +362,8 @@ def finish(root: Path, claim: store.Claim) -> None:
 def recover_dataset(root: str | Path) -> Path:
     """Make the dataset of an interrupted recording from its saved episodes.
 
-    Episodes recorded to extend a dataset are appended to it; if none was saved, the dataset
-    stays as it was.
+    If the recording was to extend a dataset, its episodes are appended to that dataset. Without
+    saved episodes, that dataset stays as it was.
 
     Args:
         root: Folder of the dataset that was being recorded.
@@ -366,9 +373,10 @@ def recover_dataset(root: str | Path) -> Path:
 
     Raises:
         BusyError: The recording is still in progress.
-        FileNotFoundError: There is no recording of that name.
-        FileExistsError: Another dataset has the name.
-        DatasetError: The recording held no saved episode; it is removed.
+        FileNotFoundError: There is no interrupted recording of this dataset.
+        FileExistsError: The dataset would be new, but `root` exists already.
+        DatasetError: The dataset would be new, but no episode was saved. The recording is then
+            removed.
     """
     root = Path(root)
     if not _is_recording(staging_folder(root)):
@@ -411,8 +419,8 @@ def recover_all(path: str | Path) -> list[str]:
 
 
 def discard(staging: Path) -> None:
-    """Remove the folder of a recording; if it holds foreign files, rename it and keep these."""
-    # The header is removed last: it identifies the folder if the removal is interrupted too.
+    """Remove the folder of a recording; if foreign files remain in the folder, rename it."""
+    # The header is removed last: if the removal is interrupted, it still marks the folder.
     store.delete_files(staging, _FILES)
     if not store.delete_files(staging, [_RECORDING]):
         kept = (staging.with_name(f"{staging.name}.kept{n or ''}") for n in itertools.count())
@@ -428,7 +436,7 @@ def _read_header(staging: Path) -> _Recording:
 
 
 def _is_recording(staging: Path) -> bool:
-    """True for a folder with the header of a recording, or with only unfinished files."""
+    """True for a folder with the header of a recording, or with no or only unfinished files."""
     if not staging.is_dir():
         return False
     if (staging / _RECORDING).is_file():
@@ -442,6 +450,6 @@ def _has_episodes(staging: Path) -> bool:
 
 
 def _is_done(root: Path, staging: Path) -> bool:
-    """True if the dataset holds the recorded episodes and only the recording remains."""
+    """True if the dataset already holds the episodes of its recording (equal identifiers)."""
     named = root.is_dir() and (staging / _RECORDING).is_file()
     return named and store.source_of(root) == _read_header(staging).id

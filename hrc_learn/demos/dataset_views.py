@@ -1,4 +1,4 @@
-"""Arm and curves of a dataset for dashboards and pages, in the units of the dataset."""
+"""Arm and curves of a dataset, in its own units, for dashboards and web pages."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FRANKA_WIDTH = 0.08
 
 @dataclass(frozen=True)
 class DatasetArm:
-    """An arm, and the conversion of a dataset's joints and gripper to its configuration."""
+    """The arm of a dataset. It converts the dataset's joint and gripper values."""
 
     arm: Arm
     columns: tuple[int, ...]
@@ -69,7 +69,8 @@ class DatasetArm:
 def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
     """The arm of a dataset's demonstrations.
 
-    Joints are found by their names, else by their order if there are as many as the arm has.
+    Joints are found by their names. If this fails, they are taken in order, provided that the
+    dataset has as many joints as the arm.
 
     Args:
         source: The opened dataset.
@@ -78,7 +79,7 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
     Raises:
         DatasetError: The robot type is no registered arm, the dataset has no joint positions,
             or its joints are not the arm's.
-        ValueError: There is no such arm.
+        ValueError: `robot` names no arm.
     """
     kind = source.folder.robot_type
     arm = ArmChoice(robot).arm() if robot else arm_of_robot(kind)
@@ -113,7 +114,7 @@ class Chart(NamedTuple):
 
 
 def own_unit(units: Mapping[str, UnitDecision], role: str, column: int) -> tuple[str, float]:
-    """Unit of a column in the dataset, and the factor from it to the reader's unit."""
+    """Unit of a column in the dataset, and the factor that converts it to the reader's unit."""
     decision = units.get(role)
     if decision is None:
         return ("m" if role == "gripper" else "rad"), 1.0
@@ -128,7 +129,7 @@ def demonstration_charts(
 
     Args:
         demo: The demonstration.
-        units: Units in the dataset by quantity.
+        units: Quantity -> its unit in the dataset.
     """
     for k, joint in enumerate(demo.joint_names):
         lines = {

@@ -60,11 +60,11 @@ class DatasetWriter:
         details: Mapping[str, object] | None = None,
         append: bool = False,
     ):
-        """Claim the folder; nothing is written into `root` before `finalize`.
+        """Reserve the dataset for this process; `root` is not written before `finalize`.
 
         Args:
             root: Folder of the dataset; it must not exist, except with `append`.
-            fps: Frame rate [1/s]. True stamps are kept in addition if frames give `time`.
+            fps: Frame rate [1/s]. If frames give `time`, their true stamps are kept, too.
             robot_type: Name of the robot in LeRobot's metadata.
             joint_names: Joints, in the order of the values of all joint quantities.
             features: Further features: key, such as "observation.shelf" -> component names.
@@ -73,7 +73,7 @@ class DatasetWriter:
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.
             details: Further values to keep with the dataset, as JSON values.
             append: Append episodes to the dataset `root`, written by a `DatasetWriter` with the
-                same settings. It stays readable until `finalize` replaces it by the longer one.
+                same settings. `finalize` replaces it; until then, it stays readable.
 
         Raises:
             BusyError: Another process is recording this dataset.
@@ -139,7 +139,7 @@ class DatasetWriter:
                 discard(self._staging)
 
     def _kept(self) -> str:
-        """Note on the place of the saved episodes and on how to make a dataset of them."""
+        """Note that names the folder of the saved episodes and the way to a dataset of them."""
         return (
             f"The {self._new_episodes} episodes saved so far are kept in {self._staging}; "
             f"{recovery_advice(self.root)} makes a dataset of them."
@@ -323,7 +323,7 @@ class DatasetWriter:
         return self.episodes - 1
 
     def _write(self, episode: recorded.Episode, task: str) -> tuple[tuple[str, ...], int]:
-        """Write an episode with the images encoded so far; return its quantities and length."""
+        """Write an episode and its images; return its quantities by name and its length."""
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
         episode = recorded.complete(episode, self.fps)
@@ -346,10 +346,10 @@ class DatasetWriter:
         return tuple(episode), frames
 
     def _header(self, columns: Sequence[recorded.RecordedColumn]) -> recorded.RecordingHeader:
-        """Properties of the recording; its features must equal those of a dataset to extend."""
+        """Header of the recording; a dataset to extend must have the same features."""
         features = recorded.lerobot_features(columns) | self._video_features | INDEX_FEATURES
         earlier = features if self._earlier is None else self._earlier.info["features"]
-        # LeRobot may have added properties of the videos.
+        # LeRobot may have added "info" to the videos: leave it out of the comparison.
         theirs = {k: {n: v for n, v in f.items() if n != "info"} for k, f in earlier.items()}
         for key in theirs | features:
             if theirs.get(key) != features.get(key):

@@ -47,7 +47,7 @@ class Demonstration:
     feature_visible: Bool[np.ndarray, " _frames"] | None = None
     """True where the camera saw the feature."""
     human_effort: Float64[np.ndarray, "_frames _joints"] | None = None
-    """Effort d of the person in joint space [N m]."""
+    """Effort of the person, as torques about the joints [N m]."""
     command_position: Float64[np.ndarray, "_frames _joints"] | None = None
     """Commanded joint positions [rad]."""
     command_velocity: Float64[np.ndarray, "_frames _joints"] | None = None
@@ -149,8 +149,8 @@ def joint_columns(available: Sequence[str], wanted: Sequence[str]) -> list[int]:
 class PaddedDemonstrations:
     """Batch of demonstrations; a field is None unless all demonstrations recorded it.
 
-    After the end of a demonstration, `mask` is False, its last row is repeated, and time
-    continues in steps of the last interval, so that time always increases.
+    After the end of a demonstration, `mask` is False and the last row of the demonstration is
+    repeated. Time continues in steps of the last interval, so that it always increases.
     """
 
     mask: Bool[Tensor, "demos frames"]

@@ -28,11 +28,12 @@ _SOURCE = b"hrc_learn.video"
 _ADVICE = "hrc fit image-jacobian --marker N searches the remaining videos"
 
 Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
-"""Pixel (u right, v down) of the feature in an RGB image, or None if it is not visible."""
+"""Function of an RGB image: pixel (u right, v down) of the feature, None if not visible."""
 
 
 Track = tuple[Float64[np.ndarray, "_frames 2"], Bool[np.ndarray, " _frames"]]
-"""Pixels (u right, v down) [px], 0 where the feature is not visible, and its visibility."""
+"""Track of a feature: its pixel in each frame (u right, v down) [px], 0 where it is not
+visible, and a mask of the frames in which it is visible."""
 
 
 class FeatureCache:
@@ -67,14 +68,15 @@ class FeatureCache:
             write_parquet(table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part)
 
     def attach(self, demo: Demonstration, *, if_known: bool = False) -> Demonstration:
-        """The demonstration with the feature of its episode.
+        """The demonstration with this feature, as extracted from its episode.
 
         Args:
             demo: Demonstration from the dataset.
             if_known: Count the feature as not visible if it was not extracted from the episode.
 
         Raises:
-            DatasetError: The feature was not extracted, or belongs to another recording.
+            DatasetError: The feature was not extracted, or has another number of frames than
+                the demonstration.
         """
         path, frames = self.path(demo.episode), len(demo)
 
@@ -129,7 +131,7 @@ class Extraction:
     """Result of `extract_features`."""
 
     name: str
-    """Name of the feature next to the dataset."""
+    """Name of the feature with its camera, such as "front.marker_3"."""
     episodes: int = 0
     """Number of episodes searched by this call."""
     known: int = 0
@@ -137,9 +139,9 @@ class Extraction:
     frames: int = 0
     """Number of frames searched by this call."""
     seen: int = 0
-    """Number of these frames that show the feature."""
+    """Number of frames in which this call found the feature."""
     without_image: int = 0
-    """Number of these frames without an image in the video."""
+    """Number of frames for which this call found no image in the video."""
     left_out: dict[int, str] = field(default_factory=dict)
     """Episode index -> fault of its video."""
 
@@ -163,8 +165,8 @@ def extract_features(
         name: Name of the feature, such as "marker_3".
         detector: Function that makes a detector for each episode, so that a detector that
             tracks the feature from image to image starts afresh.
-        camera: Name of the camera ("front") or its feature; None if there is only one.
-        progress: Wraps the episodes to search, such as with a progress bar.
+        camera: Name of the camera ("front") or key of its feature; None for the only camera.
+        progress: Function that iterates over the episodes to search and shows the progress.
 
     Raises:
         DatasetError: There is no such camera, or the metadata are damaged.

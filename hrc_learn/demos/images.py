@@ -23,7 +23,7 @@ Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]
 (`torch.channels_last`)."""
 
 _THUMBNAIL_RATE = 5.0
-"""Thumbnails per second: from one to the next, a hand-guided arm moves a few centimetres."""
+"""Thumbnails per second: between two of them, a hand-guided arm moves a few centimetres."""
 _JPEG_QUANTISER = 4
 """Quality of JPEG files, 2 (best) to 31."""
 _THUMBNAIL_HEIGHT = 240
@@ -46,7 +46,7 @@ class ImageReader:
     def __init__(self, path: str | Path | DatasetFolder):
         """
         Args:
-            path: Folder of the dataset, or its metadata.
+            path: Folder of the dataset, or the result of `open_folder`.
 
         Raises:
             DatasetError: The metadata cannot be read.
@@ -80,7 +80,7 @@ class ImageReader:
         if len(feature.shape) != 3:
             text = f"declares images of the shape {list(feature.shape)}"
             raise DatasetError(text, file=INFO_PATH, key=camera)
-        # Channels come first or last.
+        # The shape is (channels, height, width) or (height, width, channels).
         first = feature.shape[0] in (1, 3, 4) and feature.shape[2] not in (1, 3, 4)
         height, width = feature.shape[1:] if first else feature.shape[:2]
         return int(height), int(width)
@@ -232,7 +232,7 @@ def thumbnails(
 
     Args:
         reader: Reader of the dataset.
-        demo: Demonstration with all frames of its episode, or with evenly spaced ones.
+        demo: Demonstration with all frames of its episode, or with an even selection of them.
         camera: Feature that holds the images.
         most: Largest number of images: 200 take about 2 MB.
 
@@ -240,7 +240,7 @@ def thumbnails(
         DatasetError: The images cannot be read.
     """
     last = reader.entry(demo.episode).length - 1
-    # Evenly spaced, and never more than the episode has.
+    # The images are evenly spaced; an episode has at most one per frame.
     count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
     frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})
     size = thumbnail_size(*reader.size(camera))

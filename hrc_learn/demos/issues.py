@@ -12,15 +12,16 @@ _UNPRINTABLE = re.compile(
     "[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
 _LONGEST_TEXT, _END = 300, 120
-"""Largest number of characters shown of a text from a file, and the number that a shortened
-text keeps of its end, where the advice stands."""
+"""`_LONGEST_TEXT`: largest number of characters shown of a text from a file.
+`_END`: number of characters that a shortened text keeps at its end, where the advice stands."""
 _LONGEST_MESSAGE = 1000
-"""Largest number of characters shown of a message: its commands and paths must stay whole."""
+"""Largest number of characters shown of a message; large enough to keep its paths whole."""
 _FIGURE_OR_QUOTE = re.compile(r"[-+]?\d[\d.e+-]*|'[^']*'")
 
 
 def plain_text(text: str, longest: int = _LONGEST_TEXT) -> str:
-    """Text from a file, safe to print in a terminal: escapes removed, length bounded.
+    """Text from a file, safe to print in a terminal: its length is bounded, and characters that
+    act on the terminal are replaced by their codes.
 
     Args:
         text: The text.
@@ -70,7 +71,7 @@ class Issue:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Column and text; equal if issues differ only in place, components and numbers."""
+        """Column and text of the issue, without its place, components, numbers and quotes."""
         column = (self.key or "").split(" (")[0]
         words = (w for w in self.message.split() if w.strip(".,:;") not in self.components)
         text = _FIGURE_OR_QUOTE.sub("#", " ".join(words))
@@ -78,7 +79,7 @@ class Issue:
 
     @property
     def reason(self) -> str:
-        """Column and message, for a list about one episode."""
+        """Column and message, for a list of the issues of one episode."""
         return plain_text(f"{self.key}: {self.message}" if self.key else self.message)
 
     def __str__(self) -> str:

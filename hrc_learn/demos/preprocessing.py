@@ -83,7 +83,7 @@ def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) ->
 
 
 def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Demonstration:
-    """Smooth motion and efforts by a Butterworth low-pass, forwards and backwards: no lag.
+    """Smooth motion and efforts by a Butterworth low-pass, forwards and backwards, without lag.
 
     The cut-off of each pass is raised such that the two passes together halve the power at
     `cutoff` (Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4).
@@ -150,8 +150,9 @@ def estimate_twist(
 ) -> Float64[np.ndarray, "_frames 6"]:
     """Linear [m/s] and angular [rad/s] velocity of the end effector, in the base frame.
 
-    The angular velocity is 2 q' q*, with polynomials fitted to the quaternion's components. It
-    does not depend on the choice of the base frame.
+    The angular velocity is 2 q' q*, from the quaternion q, its time derivative q' and its
+    conjugate q*; polynomials are fitted to the components of q. Another base frame gives the
+    same motion.
 
     Args:
         demo: Demonstration with position and orientation.
@@ -172,9 +173,9 @@ def estimate_twist(
 
 
 _JOINT_REST, _LINEAR_REST = (0.01, 0.04), (0.003, 0.01)
-"""Speeds below which a rest begins and above which it ends, for the fastest joint [rad/s] and
-for the end effector [m/s]. Between the two speeds, the last state persists: a speed close to
-one of them does not split a recording."""
+"""`_JOINT_REST`: speeds of the fastest joint below which a rest begins and above which it ends
+[rad/s]. `_LINEAR_REST`: these two speeds for the end effector [m/s]. Between the two speeds,
+the last state persists, so that a speed close to one of them does not split a recording."""
 _SHORTEST_REST = 0.3
 """Shortest rest [s]; shorter ones, as at a turning point, belong to the motion."""
 _REST_WINDOW = 0.15
@@ -182,7 +183,7 @@ _REST_WINDOW = 0.15
 
 
 def resting(demo: Demonstration) -> Bool[np.ndarray, " _frames"]:
-    """Mask of the frames at rest, found by the joints or, without them, by the end effector.
+    """Mask of the frames at rest: joints at rest or, without joints, end effector at rest.
 
     Raises:
         ValueError: The demonstration holds neither joint nor Cartesian positions, or too few
@@ -295,8 +296,8 @@ _SMOOTH = ("joint_position", "joint_velocity", "position", "orientation")
 def resample(demo: Demonstration, fps: float | int) -> Demonstration:
     """Resample a demonstration to a regular grid.
 
-    The grid begins at the first frame; the remainder after its last point, less than one
-    period, is dropped.
+    The grid begins at the first frame. The end of the demonstration after the last grid point,
+    less than one period, is dropped.
 
     Args:
         demo: Demonstration of at least two frames, with even or uneven stamps.
@@ -310,7 +311,7 @@ def resample(demo: Demonstration, fps: float | int) -> Demonstration:
 
 
 def regular_grid(duration: float | int, fps: float | int) -> Float64[np.ndarray, " frames"]:
-    """Times 1/fps apart from 0 to the duration [s].
+    """Times from 0 to the duration in steps of 1/fps [s].
 
     Raises:
         ValueError: `fps` is not positive, or the duration is shorter than a period.
@@ -343,7 +344,7 @@ def at_times(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> Demon
 
 
 def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dict[str, Any]:
-    """Fields and extra columns at other times, which may repeat."""
+    """Fields and extra columns at other times; equal times may follow each other."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     if len(demo) < 2:
@@ -375,7 +376,7 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
 def nearest_frames(
     known: Float64[np.ndarray, " frames"], time: Float64[np.ndarray, " times"]
 ) -> Int64[np.ndarray, " times"]:
-    """Index of the frame nearest to each time, the earlier one of two equally near."""
+    """Index of the frame nearest to each time; of two equally near frames, the earlier one."""
     return np.ceil(np.interp(time, known, np.arange(len(known))) - 0.5).astype(np.int64)
 
 
@@ -488,12 +489,12 @@ _VELOCITY_WINDOW = 0.1
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of a reference, that of median duration.
+    """Warp every demonstration to the timing of the demonstration of median duration.
 
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled
-    likewise. Afterwards, all demonstrations have the frames of the reference, and frame k of
-    each shows the same phase of the task. Recorded joint velocities are estimated anew.
+    likewise. Afterwards, all demonstrations have the times of this reference, and frame k of
+    each shows the same phase of the task. Joint velocities are estimated from the result.
 
     Args:
         demos: At least one demonstration; all must record the quantity that is compared.
@@ -513,7 +514,7 @@ def align(demos: DemonstrationSet) -> DemonstrationSet:
 
 
 def _scale(name: str, motions: list[np.ndarray]) -> np.ndarray:
-    """Range of each component over all motions; for orientations, the largest angle [rad]."""
+    """Range of each component over all motions; for orientations, the largest turn [rad]."""
     if name == "orientation":
         ranges = np.array([max(_angles(q, q[:1]).max() for q in motions)])
     else:

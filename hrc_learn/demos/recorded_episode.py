@@ -20,8 +20,8 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
 
 TIME_KEY = "time"
-"""Feature that holds the true stamps. Policies would use an `observation.time` as an input, but
-no robot provides one."""
+"""Feature that holds the true stamps. It is not called `observation.time`: policies would take
+such a feature as an input, which no robot provides."""
 _METADATA_KEY = b"hrc_learn"
 
 Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
@@ -33,7 +33,7 @@ class RecordedColumn:
     """One recorded quantity and its place in the dataset."""
 
     given: str
-    """Keyword of a frame: a field of `Demonstration`, or a feature key."""
+    """Keyword that gives the quantity: a field of `Demonstration`, or a feature key."""
     role: str | None
     """Role under which the reader finds it; None for a user-defined feature."""
     key: str
@@ -123,7 +123,7 @@ def frame_row(
 
     Args:
         values: Quantity -> numbers.
-        widths: Known quantities and their numbers of components.
+        widths: Known quantity -> its number of components.
         earlier: Earlier frames of the episode, with the same quantities.
 
     Raises:
@@ -216,7 +216,7 @@ class EpisodeDescription:
 
     header: RecordingHeader
     tasks: list[str]
-    """Texts of its tasks, at least one."""
+    """Texts of the episode's tasks, at least one."""
     statistics: Statistics
     provenance: str = ""
     """Origin of an episode that was made from others, as JSON."""
@@ -249,10 +249,10 @@ def write_episode(
         path: File, as in `episode_path`.
         header: Properties of the recording.
         values: Feature -> numbers (frames, components), without LeRobot's index columns.
-        tasks: Texts of its tasks, and the index of the task of each frame.
+        tasks: Texts of the episode's tasks, and the dataset's task index for each frame.
         frames_before: Total number of frames of all earlier episodes.
         others: Columns that hold no numbers, such as images and texts.
-        statistics: Statistics of its images.
+        statistics: Statistics of the episode's images.
         provenance: Origin of an episode that was made from others, as JSON.
     """
     texts, indices = tasks
@@ -299,10 +299,10 @@ def staged_paths(folder: Path, first: int = 0) -> list[Path]:
 
     Args:
         folder: Folder of the recording.
-        first: Index of the first episode: the length of the dataset that is extended, or 0.
+        first: Index of the first episode: number of episodes of the extended dataset, or 0.
 
     Raises:
-        DatasetError: No episode was saved, or one in the middle is missing.
+        DatasetError: No episode was saved, or an episode before the last is missing.
     """
     paths = sorted(folder.glob("episode_*.parquet"))
     if not paths:

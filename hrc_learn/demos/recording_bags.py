@@ -32,7 +32,7 @@ _SHORTEST = 0.5
 _SAME_CLOCK = 0.5
 """Largest difference between stamps and times of reception if both use one clock [s]."""
 _BURST = 2e-4
-"""Median interval below which messages were written at once, not during a motion [s]."""
+"""Median interval below which the messages were not written during a motion, but later [s]."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
 
 
@@ -77,7 +77,7 @@ def read_bag(path: Path) -> list[Recording]:
 
 
 def _opened_bag(path: Path) -> tuple[dict[str, str], Messages]:
-    """Types of the topics of a bag, and its messages."""
+    """Topic -> message type of a bag, and a function that reads its messages."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -96,7 +96,7 @@ def _opened_bag(path: Path) -> tuple[dict[str, str], Messages]:
 
 
 def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
-    """Types of the topics of an MCAP file, and its messages."""
+    """Topic -> message type of an MCAP file, and a function that reads its messages."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -141,9 +141,10 @@ def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
 def _gathered(
     types: Mapping[str, str], messages: Messages
 ) -> tuple[dict[str, Topic], list[str]]:
-    """Topics by field, and joints in the order of the robot description, if it was recorded.
+    """Field -> topic, and joint names in the order of the robot description.
 
-    Drivers publish joints in any order, often alphabetically.
+    Drivers publish joints in any order, often alphabetically. The list of joint names is empty
+    if the bag holds no robot description.
     """
     sets: dict[str, dict[frozenset[str], Topic]] = {}
     edges: dict[tuple[str, str], list[tuple[float, float, np.ndarray]]] = {}
@@ -283,7 +284,7 @@ def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
 
 
 def _during(fields: Mapping[str, Field], start: float, stop: float) -> dict[str, Field]:
-    """Fields from their last frames before `start` to their last ones before `stop` [s]."""
+    """Each field from its last frame up to `start` to its last frame up to `stop` [s]."""
     found = {}
     for name, one in fields.items():
         time = fields[one.clock or name].numbers()[:, 0]
