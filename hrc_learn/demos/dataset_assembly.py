@@ -161,7 +161,7 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
     """One list of all episodes; tables may differ in their columns."""
     try:
         table = pa.concat_tables(tables, promote_options="permissive")
-    except pa.ArrowException:  # the types of a column differ too much
+    except pa.ArrowException:  # Arrow cannot unify the types of a column
         table = _table_of([row for table in tables for row in table.to_pylist()])
     places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
     table = table.drop_columns([name for name in places if name in table.column_names])
@@ -436,7 +436,9 @@ def _read_header(staging: Path) -> _Recording:
 
 
 def _is_recording(staging: Path) -> bool:
-    """True for a folder with the header of a recording, or with no or only unfinished files."""
+    """True for a folder with a recording's header, for an empty folder, and for a folder with
+    unfinished files only.
+    """
     if not staging.is_dir():
         return False
     if (staging / _RECORDING).is_file():

@@ -28,7 +28,7 @@ class DatasetArm:
 
     arm: Arm
     columns: tuple[int, ...]
-    """Column of each of the arm's joints among the dataset's joints."""
+    """For each joint of the arm, its column among the dataset's joints."""
     joints: UnitDecision
     """Unit of the dataset's joints."""
     gripper: UnitDecision | None = None

@@ -73,7 +73,8 @@ class DatasetWriter:
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.
             details: Further values to keep with the dataset, as JSON values.
             append: Append episodes to the dataset `root`, written by a `DatasetWriter` with the
-                same settings. `finalize` replaces it; until then, it stays readable.
+                same settings. `finalize` replaces this dataset by the longer one; until then,
+                it stays readable.
 
         Raises:
             BusyError: Another process is recording this dataset.
@@ -139,7 +140,7 @@ class DatasetWriter:
                 discard(self._staging)
 
     def _kept(self) -> str:
-        """Note that names the folder of the saved episodes and the way to a dataset of them."""
+        """Note with the folder of the saved episodes and the command that recovers them."""
         return (
             f"The {self._new_episodes} episodes saved so far are kept in {self._staging}; "
             f"{recovery_advice(self.root)} makes a dataset of them."

@@ -151,8 +151,8 @@ def estimate_twist(
     """Linear [m/s] and angular [rad/s] velocity of the end effector, in the base frame.
 
     The angular velocity is 2 q' q*, from the quaternion q, its time derivative q' and its
-    conjugate q*; polynomials are fitted to the components of q. Another base frame gives the
-    same motion.
+    conjugate q*; polynomials are fitted to the components of q. The motion found does not
+    depend on the choice of the base frame.
 
     Args:
         demo: Demonstration with position and orientation.
@@ -489,12 +489,12 @@ _VELOCITY_WINDOW = 0.1
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of the demonstration of median duration.
+    """Warp every demonstration to the timing of a reference, the one of median duration.
 
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled
-    likewise. Afterwards, all demonstrations have the times of this reference, and frame k of
-    each shows the same phase of the task. Joint velocities are estimated from the result.
+    likewise. Afterwards, all demonstrations have the times of the reference, and frame k of
+    each shows the same phase of the task. Recorded joint velocities are replaced by estimates.
 
     Args:
         demos: At least one demonstration; all must record the quantity that is compared.

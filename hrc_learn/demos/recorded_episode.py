@@ -149,7 +149,7 @@ def frame_row(
 
 
 def stacked(frames: Sequence[Episode]) -> Episode:
-    """Frames as one episode; {} without frames."""
+    """The episode that consists of these frames; {} if there are none."""
     names = frames[0] if frames else ()
     return {name: np.stack([frame[name] for frame in frames]) for name in names}
 

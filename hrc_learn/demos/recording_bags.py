@@ -32,7 +32,7 @@ _SHORTEST = 0.5
 _SAME_CLOCK = 0.5
 """Largest difference between stamps and times of reception if both use one clock [s]."""
 _BURST = 2e-4
-"""Median interval below which the messages were not written during a motion, but later [s]."""
+"""Median interval between messages below which all were written together afterwards [s]."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
 
 
@@ -275,7 +275,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
 
 
 def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
-    """Times of the last message before each gap and of the first one after it [s]."""
+    """For each gap, times of the last message before and of the first message after it [s]."""
     steps = np.diff(time)
     if not len(steps):
         return [(-np.inf, np.inf)]

@@ -1,4 +1,7 @@
-"""Clocks of recordings: stamps in seconds, and all fields at the stamps of the state."""
+"""Clocks of recordings: stamps of the state in seconds, and the frame of each field at them.
+
+The state is the field of joints or poses that determines the frames of the episode.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,13 +19,13 @@ _EPOCH = (1e9, 3e9)
 _STEPS = (1 / 1500, 0.5)
 """Plausible steps between stamps [s]: 2 Hz to 1.5 kHz."""
 _JUMP = 10.0
-"""Smallest gap between stamps that is reported, as a multiple of the median gap."""
+"""Smallest step between stamps that is reported, as a multiple of the median step."""
 _FASTER = 1.5
-"""States per image above which the states of topics are thinned to one state per image."""
+"""Number of states per image above which recorded topics are thinned to one state per image."""
 
 
 class Clock(NamedTuple):
-    """Frames of a recording's state at which all of its fields have values."""
+    """Frames of the state at which every field of the recording has a value."""
 
     time: Float64[np.ndarray, " frames"]
     """Stamps of the state [s]."""
@@ -131,7 +134,7 @@ def _stamps_of_state(
 def read_stamps(
     recording: Recording, name: str, unit: str = ""
 ) -> Float64[np.ndarray, " _frames"]:
-    """Stamps of a field [s], in the given unit or the one that its name or size tells.
+    """Stamps of a field [s]. Their unit is given or declared, or their name or size tells it.
 
     Raises:
         DatasetError: Stamps do not increase, or their unit is in doubt.

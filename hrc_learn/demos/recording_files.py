@@ -1,4 +1,4 @@
-"""Recordings as fields whose frames are read on demand, and their division into episodes."""
+"""Recordings: fields, with frames that are read on demand, and their division into episodes."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -22,9 +22,9 @@ Read = Callable[[int, int], Shaped[np.ndarray, "_frames ..."]]
 UNNAMED = "array"
 """Name given to an array without a name."""
 _SMALLEST_IMAGE = 16
-"""Smallest shorter side of an array that counts as an image [px]."""
+"""Smallest height and width of an array that counts as an image [px]."""
 _SKIPPED = 100
-"""Largest number of images to skip by reading on; beyond it, the stream is opened anew."""
+"""Largest number of images that are read only to skip them; else the stream is opened again."""
 _EPISODE = re.compile(r"(?:[a-z]+[_\- ]?)*\d+", re.IGNORECASE)
 """Names of groups that hold one episode each: demo_0, episode_12, traj_3, 7."""
 _EPISODE_ENDS = ("episode_ends", "traj_ends", "trajectory_ends")
@@ -50,7 +50,7 @@ class Field:
     """One recorded quantity of one episode."""
 
     shape: tuple[int, ...]
-    """Frames, then the shape of one frame."""
+    """Number of frames, then the shape of one frame."""
     kind: Kind
     read: Read
     """Function that reads the frames from a first to a last one (exclusive)."""
@@ -61,7 +61,7 @@ class Field:
     rate: float = 0.0
     """Frame rate of a video [1/s]."""
     clock: str = ""
-    """Field of its stamps, if the file says which."""
+    """Field with the stamps of this field; "" if the file names none."""
 
     @property
     def frames(self) -> int:
@@ -74,7 +74,7 @@ class Field:
         return int(np.prod(self.shape[1:]))
 
     def part(self, start: int, stop: int) -> "Field":
-        """The field during some of its frames."""
+        """The field with its frames from `start` to `stop` (exclusive) only."""
 
         def read(first: int, last: int) -> np.ndarray:
             return self.read(start + first, start + min(last, stop - start))
@@ -154,7 +154,7 @@ def is_time(name: str, one: Field) -> bool:
 
 
 def time_unit_in(name: str) -> str:
-    """Unit in the name of a field of stamps; "" if it names none."""
+    """Unit in the name of a field of stamps; "" if the name states none."""
     match = _TIME.fullmatch(name.split("/")[-1].lower())
     return unit_in_words((match and match["unit"]) or "")
 
@@ -166,7 +166,7 @@ def make_field(
 
     Args:
         name: Name in the file.
-        shape: Frames, then the shape of one frame.
+        shape: Number of frames, then the shape of one frame.
         dtype: Type of the numbers.
         read: Function that reads some of the frames.
         details: Further attributes of the field.
@@ -241,8 +241,8 @@ def split_episodes(
 
     Args:
         file: The file.
-        fields: Its arrays by their paths.
-        label: Name of the part of the file that holds them.
+        fields: Path in the file -> array.
+        label: Name of the part of the file that holds the arrays.
         details: Further attributes of the recordings.
 
     Raises:
@@ -272,7 +272,7 @@ def split_episodes(
 
 
 def _layer(whole: Recording, name: str, field: Field, number: int, count: int) -> Field:
-    """One demonstration of a three-dimensional array; other arrays belong to all of them."""
+    """One demonstration of a three-dimensional array; other arrays belong to every one."""
     if field.kind != "other" or len(field.shape) != 3:
         return field
     if field.frames not in (1, count):
@@ -323,7 +323,7 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 
 def _ends(whole: Recording) -> list[int] | None:
-    """Frame after the last one of each episode; None for a single episode."""
+    """End of each episode (exclusive frame number); None for a single episode."""
     flags = []
     for name, field in whole.fields.items():
         last = re.split(r"[/.]", name)[-1].lower()

@@ -195,7 +195,7 @@ def _text(value: Any) -> str:
 
 
 def _attributes(attributes: Mapping[str, Any], details: dict[str, Any]) -> None:
-    """Add the frame rate and the task among the attributes of a group to `details`."""
+    """Find a frame rate and a task among attributes; add them to `details` if it lacks them."""
     for name, value in attributes.items():
         key = name.lower()
         with contextlib.suppress(TypeError, ValueError, AttributeError, ZeroDivisionError):
@@ -209,7 +209,7 @@ def _attributes(attributes: Mapping[str, Any], details: dict[str, Any]) -> None:
 
 
 def read_zarr(path: Path) -> list[Recording]:
-    """Episodes of a zarr store, a folder or a .zip file; links and pickles are refused."""
+    """Episodes of a zarr store (folder or .zip file); links and pickles are refused."""
     import zarr
     from zarr.storage import ZipStore
 
@@ -351,7 +351,7 @@ READERS: dict[str, Callable[..., list[Recording]]] = {
 def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
     """Episodes of a folder: numbered files are one episode each, other files together form one.
 
-    A video belongs to the file with whose name its own name begins.
+    If there are several files, the name of a video must begin with the name of its file.
     """
     entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     entries.sort(key=lambda entry: natural(entry.name))

@@ -73,7 +73,7 @@ class ImportPlan:
         """The preview: fields and their meaning, notes, actions and episodes.
 
         Args:
-            actions: True if next states serve as the actions in case none were recorded.
+            actions: True if the next states serve as actions where none were recorded.
         """
         meaning = self.meaning
         rows = [("fields", "understood as", "unit", "sure", "evidence")]
@@ -124,7 +124,7 @@ class ImportPlan:
         return json.dumps(content, indent=2) + "\n"
 
     def _tokens(self, places: Sequence[Place]) -> list[str]:
-        """Fields and ranges of fields that name the columns."""
+        """Fields and ranges of fields, such as "qpos[0:6]", that stand for the columns."""
         fields, tokens = self.recordings[0].fields, []
         # Within a run, the component index increases with the place in the list.
         runs = groupby(enumerate(places), key=lambda one: (one[1][0], one[1][1] - one[0]))
@@ -204,7 +204,7 @@ def write_plan(
 
 
 def _with_next_states(demo: Demonstration) -> Demonstration:
-    """Use joints, pose or state of the next frame as the action; the last one repeats."""
+    """Use joints, pose or state of the next frame as the action; the last frame has its own."""
     following = np.minimum(np.arange(len(demo)) + 1, len(demo) - 1)
     if demo.joint_position is not None:
         return replace(demo, command_position=demo.joint_position[following])

@@ -31,11 +31,11 @@ _REACH = 5.0
 """Distance beyond the reach of any arm on a fixed base [m]."""
 _ANGLES = re.compile(r"(?:^|[._])r_?x$", re.IGNORECASE)
 _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
-"""Number of episodes and frame rate [1/s] for comparing commands with joints. At this rate, the
-longest delay that is tried is 30 frames."""
+"""`_CHECKED_EPISODES`: approximate number of episodes in which commands are compared with
+joints. `_CHECK_RATE`: frame rate of the comparison [1/s]; it limits the delay to 30 frames."""
 _ALIKE = 0.3
-"""The order of unnamed commands is clear if the nearest command of each joint is closer than
-this fraction of the distance of the second nearest one."""
+"""Ratio of the distances from a joint to the nearest and to the second nearest unnamed command.
+The order of the commands is clear if the ratio of every joint is smaller."""
 
 
 @dataclass(kw_only=True)
@@ -43,9 +43,9 @@ class Meaning:
     """Meaning of the fields of recordings, found step by step."""
 
     selections: dict[str, ColumnSelection]
-    """Columns of each quantity, by role; a column is named by a field, not by a feature."""
+    """Role -> columns of the quantity; each column names a field instead of a feature."""
     decisions: dict[str, UnitDecision] = field(default_factory=dict)
-    """Unit of each quantity."""
+    """Role -> unit of the quantity."""
     joint_names: tuple[str, ...] = ()
     kept: dict[str, tuple[tuple[Place, ...], tuple[str, ...]]] = field(default_factory=dict)
     """Feature of the dataset -> columns kept as recorded, and their names in the feature."""
@@ -362,7 +362,7 @@ def _decide_commands(
         meaning: Receives the commands.
         recordings: Episodes.
         named: True if the caller named the commands.
-        actions: Vectors whose names tell that they are an action, but not their content.
+        actions: Fields that hold an action, but do not name its content.
     """
     selections, kept, first = meaning.selections, meaning.kept, recordings[0]
     joints, command = selections.get("joint_position"), selections.get("command_position")
@@ -415,9 +415,9 @@ def _matched(
 def _in_order(
     first: Recording, command: tuple[Place, ...], joints: Sequence[Place]
 ) -> tuple[Place, ...]:
-    """Unnamed commands, put in the order of the joints if that order is clear.
+    """Unnamed commands in the order of the joints, if the motion shows this order clearly.
 
-    Controllers may order the joints differently, and unnamed commands do not show it.
+    Controllers may order the joints differently.
     """
     if not len(command) == len(joints) > 1:
         return command

@@ -1,6 +1,6 @@
 """Messages of robots as numbers, poses and images, recognised by their attributes.
 
-Messages of any ROS version, JSON and protobuf are read alike; no type need be installed.
+Messages of any ROS version, JSON and protobuf are read alike; their types need no installation.
 """
 
 import base64
@@ -37,7 +37,7 @@ type Messages = Callable[..., Iterator[tuple[str, int, Any]]]
 
 @dataclass
 class Topic:
-    """Messages of one topic, or of one set of joints in it."""
+    """Messages of one topic, or of one set of joints in a topic."""
 
     names: tuple[str, ...] | None = None
     received: list[float] = field(default_factory=list)
@@ -108,7 +108,7 @@ def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
-    """Poses of tools and of frames without children in their base, from `/tf`, `/tf_static`."""
+    """Poses in the base frame of tools and of frames without children, from `/tf` topics."""
     parents = {child: parent for parent, child in edges}
     moving = {c for (_, c), rows in edges.items() if np.ptp([r[2] for r in rows], axis=0).any()}
     wanted = [c for c in parents if TOOL.search(c) or c not in parents.values()]

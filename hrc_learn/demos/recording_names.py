@@ -42,14 +42,14 @@ class ImportOptions:
     images: dict[str, str] | None = None
     """Camera -> field; None for all images."""
     units: dict[str, str] = field(default_factory=dict)
-    """Units by quantity."""
+    """Quantity -> its unit."""
     time: str = ""
     """Field of the stamps."""
     joint_names: tuple[str, ...] = ()
     """Joint names."""
     fps: float | int | None = None
-    """Frame rate [1/s] where there are no stamps. With stamps, it is only stored, but faster
-    topics are thinned to it."""
+    """Frame rate [1/s]. It gives the times where there are no stamps. Otherwise, it is stored
+    with the dataset, and topics with a higher rate are thinned to it."""
     duration: float | int | None = None
     """Duration of each episode [s] where there are no stamps."""
     task: str | None = None
@@ -107,9 +107,9 @@ class FieldSearch:
 
     Attributes:
         features: Features by key.
-        states: Vectors whose names tell that they are a state, but not their content.
-        actions: The same for actions.
-        fingers: Fingers among the joints: True for a command, then name and column.
+        states: Fields that hold a state, but do not name its content.
+        actions: Fields that hold an action, but do not name its content.
+        fingers: Fingers among the joints, each as (True for a command, name, column).
         two_fingers: Field with the positions of a gripper's two fingers, "" if there is none.
         left_out: Field -> reason.
     """
@@ -227,7 +227,7 @@ class FieldSearch:
             stem = "qpos" if match and stem in ("pos", "position", "positions") else stem
             key = _KEYS.get(re.sub(r"^(?:robot|arm)\d*_", "", stem), stem)
             prefix = "action" if command else "observation"
-            if stem == "actual_tcp_pose" and match:  # of UR: a rotation vector
+            if stem == "actual_tcp_pose" and match:  # UR: a rotation vector
                 turn, slot = divmod(int(match[2]), 3)
                 plain = f"ee.{'w' if turn else ''}{'xyz'[slot]}"
                 groups.setdefault("observation.ee", []).append((name, plain))

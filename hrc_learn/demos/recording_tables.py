@@ -28,16 +28,17 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     """Columns of a text file.
 
     Fields are separated by commas, semicolons, tabs, bars or blanks; decimal commas are read.
-    Lines that begin with #, % or // are comments, and the last one before the numbers may name
-    the columns. The unnamed index that pandas writes is left out, as are columns of text;
-    dates become seconds.
+    Lines that begin with #, % or // are comments; the last comment before the numbers may name
+    the columns. The unnamed index that pandas writes and columns of text are left out. Dates
+    become seconds.
 
     Args:
         path: The file.
         columns: Names for the columns of a file without a header.
 
     Raises:
-        DatasetError: The file is empty or not in UTF-8, or a row differs from the first one.
+        DatasetError: The file is empty or not in UTF-8, or a row does not hold the expected
+            numbers.
     """
     try:
         # Spreadsheets mark UTF-8 by a byte order mark.
@@ -89,7 +90,9 @@ def _split(line: str, delimiter: str) -> list[str]:
         return line.split()
     fields = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     fields = [field.strip() for field in fields]
-    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields  # it ends the line
+    return (
+        fields[:-1] if len(fields) > 1 and not fields[-1] else fields
+    )  # drop an empty last field
 
 
 def _is_number(field: str) -> bool:

@@ -27,10 +27,11 @@ Image = UInt8[np.ndarray, "_height _width 3"]
 _PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 """Columns of the list of episodes for each video feature."""
 _SAMPLE_PIXELS = 150
-"""Smallest longer side of the reduced images in statistics [px], about as in LeRobot."""
+"""Smallest length to which the longer side of an image is reduced for statistics [px]. LeRobot
+reduces images similarly."""
 _SKIP_SECONDS = 2.0
-"""Gap between wanted images above which the decoder seeks: key frames are rarely farther
-apart."""
+"""Gap between wanted images above which the decoder jumps to a key frame [s]. Key frames are
+rarely farther apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +155,7 @@ def encoded_samples(segment: VideoSegment) -> CameraImages | None:
             whole = None
             if _CODECS[codec] != codec:
                 whole = av.BitStreamFilterContext(_CODECS[codec], stream)
-            # 1 ms later, as times are rounded: seeks the key frame that begins the episode.
+            # Seek the key frame that begins the episode; 1 ms is added as times are rounded.
             container.seek(int((segment.start + 1e-3) / stream.time_base), stream=stream)
             for packet in container.demux(stream):
                 if packet.pts is None:
@@ -263,8 +264,8 @@ def rgb_image(image: Any, size: tuple[int, int] | None = None) -> Image:
     from av.video.reformatter import VideoReformatter
 
     height, width = size or (image.height, image.width)
-    # A new reformatter instead of PyAV's cached one: a process forked after the first use of
-    # that one, such as a data loader's, lacks its threads and would wait for them forever.
+    # PyAV caches a reformatter. A process that is forked after its first use, such as a data
+    # loader, lacks its threads and would wait for them forever: make a new one.
     rgb = VideoReformatter().reformat(image, width, height, "rgb24")
     return rgb.to_ndarray()
 
@@ -276,11 +277,11 @@ def subsampled(image: Image) -> Image:
 
 
 _CODEC = {"preset": "ultrafast", "crf": "20", "g": "2"}
-"""Encoder options. As the recording process itself encodes, speed comes first: 9 ms per
+"""Encoder options. They favour speed, because the recording process itself encodes: 9 ms per
 1440x1080 frame instead of 25 ms, for twice the size. Every second frame is a key frame, as in
-LeRobot: policies read single frames."""
+LeRobot, because policies read single frames."""
 _SAMPLE_EVERY = 5
-"""Number of frames per image that enters the statistics, as in LeRobot."""
+"""Interval between images that enter the statistics [frames], as in LeRobot."""
 
 
 def video_path(folder: Path, key: str, episode: int) -> Path:

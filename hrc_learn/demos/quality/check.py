@@ -51,7 +51,7 @@ MOTION_CHECKS = (
     episode_checks.copied_commands,
 )
 _PLACED = 5
-"""Number of episodes whose joints and poses are compared."""
+"""Largest number of episodes in which joints and positions are compared."""
 CONSISTENCY_CHECKS = (
     consistency.holds,
     consistency.noise,
@@ -102,7 +102,7 @@ def _first_pass(
 ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
     """Run the checks that need no units, and yield the quantities of the sound episodes.
 
-    The profiles of all episodes and the entries of the sound ones are appended to the lists.
+    Appends the profiles of all episodes to `profiles`, and the sound episodes to `sound`.
     """
     folder, columns = dataset.folder, dataset.columns
     for entry, frames in read_sound_episodes(folder, report):
@@ -171,7 +171,7 @@ def _check_motions(
 ) -> None:
     """Check the motion of every sound episode whose units are known, in a second pass."""
     sketches, placed = [], []
-    # No feature extracted from videos is needed.
+    # The checks do not need features extracted from videos.
     source = DemonstrationSource(replace(dataset, own_feature=True), entries, decisions)
     for entry, demo in zip(entries, source.each(), strict=True):
         if isinstance(demo, DatasetError):
@@ -201,7 +201,7 @@ def _usual_motion(
     decisions: Mapping[str, UnitDecision],
     features: Mapping[str, FeatureProfiles],
 ) -> UsualMotion:
-    """Usual fast step and span of joints and commands in SI units, by role."""
+    """Role -> usual fast step and usual span of each joint, in SI units."""
     usual = {}
     for role in ("joint_position", "command_position"):
         selection = columns.selections.get(role)

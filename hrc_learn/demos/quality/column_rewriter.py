@@ -29,7 +29,8 @@ from hrc_learn.store import DATASET, replacing
 NO_TASK = "unnamed task"
 _IN_TABLES = ("video", *metadata.NUMERIC)
 _STATISTICS_IMAGES = 20
-"""Images of an episode that enter its statistics, as in LeRobot for short episodes."""
+"""Largest number of images of an episode that enter its statistics, as in LeRobot for short
+episodes."""
 _LARGEST_NOTE = 2**20
 """Largest card, licence or foreign metadata file that is copied [bytes]."""
 
@@ -95,7 +96,7 @@ def _copy_notes(source: Path, target: Path) -> None:
 
 
 def listed_tasks(folder: DatasetFolder) -> list[str]:
-    """Task texts of a dataset: first the list of tasks by index, then those of episodes."""
+    """Task texts of a dataset: listed tasks by index, then tasks that only episodes name."""
     listed = [folder.tasks[index] for index in sorted(folder.tasks)]
     listed += [task for entry in folder.episodes for task in entry.tasks]
     return [*dict.fromkeys(listed)] or [NO_TASK]
@@ -109,13 +110,13 @@ def new_header(
     fps: float | int | None = None,
     add_time: bool = False,
 ) -> recorded.RecordingHeader:
-    """Properties of a copy of a dataset.
+    """Header of a copy of a dataset.
 
     Args:
         dataset: The old dataset.
-        units: Units from the caller; they also replace those in the contract.
+        units: Role -> unit from the caller, which also replaces the unit in the contract.
         cameras: Features whose videos are copied.
-        fps: Rate to which episodes are resampled [1/s]; None for the old one.
+        fps: Rate to which episodes are resampled [1/s]; None for the old rate.
         add_time: Add the old stamps as `time`.
     """
     folder, old, features = dataset.folder, dataset.sidecar, {}
@@ -150,7 +151,7 @@ def new_header(
 
 
 class ColumnRewriter:
-    """Writer of the episodes of one dataset into a new one."""
+    """Writer of the episodes of one dataset into a new dataset."""
 
     def __init__(
         self,
@@ -229,7 +230,7 @@ class ColumnRewriter:
     def stage(
         self, path: Path, episode: Rewritten, numbers: Mapping[str, int], frames_before: int
     ) -> None:
-        """Write one episode to a staged file.
+        """Write one episode to a file from which the new dataset is assembled.
 
         Args:
             path: The file.
@@ -267,7 +268,7 @@ class ColumnRewriter:
     def _image_statistics(
         self, edit: EpisodeEdit, key: str, images: pa.ChunkedArray | VideoSegment
     ) -> dict[str, list]:
-        """Recorded statistics if all frames remain, else those of some images."""
+        """Image statistics: recorded ones if all frames remain, else those of some images."""
         known = self._recorded.get(edit.entry.index, {}).get(key)
         if known is not None and len(edit) == edit.entry.length:
             return known

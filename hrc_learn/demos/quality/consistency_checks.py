@@ -26,7 +26,7 @@ from hrc_learn.demos.read.profiles import (
 from hrc_learn.demos.read.units import UnitDecision
 
 FEWEST = 3
-"""Smallest number of episodes in which one can be compared with the others."""
+"""Smallest number of episodes for comparing one episode with the others."""
 _IMPOSSIBLE = 1e12
 """Size that no sensor reports: flipped bits, or memory that was never written."""
 _IMPLAUSIBLE = 1e3
@@ -38,8 +38,8 @@ _HALF_TURN = 0.9 * np.pi
 _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
 _OFFSET = 0.1
-"""Distance between command and state at rest that is reported, relative to the joint's range:
-hobby servos stop within a few degrees under load."""
+"""Smallest distance between command and state at rest that is reported, relative to the joint's
+range. Hobby servos under load stop a few degrees away."""
 
 
 def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
@@ -127,7 +127,7 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     levels = feature.stack("distinct") / frames
     # A fifth of the usual levels: values were rounded or the encoder lost bits.
     coarse = (levels < 0.2 * np.median(levels, axis=0)) & moving
-    coarse &= feature.stack("held") / frames < 0.1  # otherwise it rests
+    coarse &= feature.stack("held") / frames < 0.1  # a component at rest is not coarse
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
         for number in np.flatnonzero(odd.any(1)).tolist():
             places = np.flatnonzero(odd[number]).tolist()
@@ -165,7 +165,7 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     """Report columns that are exchanged, negated, offset or reversed in time in one episode.
 
     An episode is described by five numbers per component (5, 50 and 95 % quantiles, start and
-    goal) and compared with the median over all episodes, in units of their spread.
+    goal) and compared with the median over all episodes, in units of the spread over episodes.
     """
     if not feature.key.startswith(("observation.", "state", "action")):
         return
@@ -208,8 +208,8 @@ def _permuted(
     cost = np.abs(own[:, :, None] - usual[:, None, :]).mean(0) / scale
     # The bound keeps one outlier from deciding the whole assignment.
     _, best = linear_sum_assignment(np.minimum(cost, 50))
-    # Cycles of the permutation in which every component is far from its usual values: if only
-    # some components are far, they resemble the others by chance.
+    # Keep cycles of the permutation in which every component is far from its usual values. If
+    # only some components are far, they resemble the others by chance.
     cyclic, after = best != np.arange(len(best)), best
     for _ in best:
         cyclic &= off[after] > _FAR_OFF
@@ -236,7 +236,7 @@ def _moved(
     if len(negated):
         text = "has the other sign than in the other episodes"
         return "error", f"{text}: {listed(names, negated)}"
-    # All components together: single ones look alike in both directions.
+    # Compare all components together: a single component may look alike in both directions.
     back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
     if off.mean() > 2 and back.mean() < 0.4 * off.mean():
         return "warning", "runs the other way than the other episodes"
@@ -255,7 +255,7 @@ def _moved(
 
 
 def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
-    """Mask of components of orientations whose sign has no meaning.
+    """Mask of the components of orientations that can change their sign without a rotation.
 
     These are quaternions, and rotation vectors near half a turn in any episode.
     """
@@ -315,13 +315,13 @@ def command_offsets(
     features: Sequence[FeatureProfiles],
     unit: UnitDecision,
 ) -> Iterator[Issue]:
-    """Report constant offsets of states at rest from their commands, and changes of them.
+    """Report constant offsets of states at rest from their commands, and changed offsets.
 
     Different calibrations of a leader and its follower cause such offsets.
 
     Args:
         command: Columns of the commands.
-        state: Columns of the states that follow them.
+        state: Columns of the states that follow the commands.
         profiles: Profiles of the episodes that have commands.
         features: Profiles of all features.
         unit: Unit of the states.
@@ -356,7 +356,7 @@ def command_offsets(
 def joint_zeros(
     robot_type: str | None, joint_names: Sequence[str], demos: Sequence[Demonstration]
 ) -> Iterator[Issue]:
-    """Report wrong zeros of joints, by the kinematics of a known arm and its tool position.
+    """Report wrong zeros of joints, found from tool positions and the kinematics of the arm.
 
     Args:
         robot_type: Robot type of the dataset.
@@ -389,7 +389,7 @@ def _component_tracking(
     fit, slope = tracking.fit, tracking.slope
     follows = follow & (fit > FOLLOWS)
     lost = np.flatnonzero(follow & ~(fit > LOST) & ~np.isnan(fit))
-    # The slope equals minus the usual one, within half of it.
+    # The slope is the negative of the usual slope, within half of its size.
     opposite = np.abs(slope + usual_slope) < 0.5 * np.abs(usual_slope)
     against = np.flatnonzero(follows & opposite)
     if len(against):

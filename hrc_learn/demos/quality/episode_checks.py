@@ -19,7 +19,7 @@ _JITTER_TOLERANCE = 0.10
 _REGULAR = 0.04
 _GAP = 1.6
 """Multiple of the usual step above which a frame was lost."""
-# A shorter episode is a false start.
+# Episodes with fewer frames or seconds are false starts.
 _SHORT_FRAMES, _SHORT_SECONDS = 10, 0.5
 _FASTEST_ARM = 12.0
 """Largest joint speed of an arm [rad/s]; faster steps are faults of the recording."""
@@ -29,10 +29,11 @@ _SMALLEST_MOTION = 1e-4
 """Smallest motion [rad or m]; encoders and trackers do not resolve smaller ones."""
 _SAME_EPISODE = 1e-3
 """Largest difference of two copies of an episode, relative to the span of the motion."""
-# A spike or jump exceeds this multiple of the usual fast step, and this fraction of the range.
+# Smallest spikes and jumps: multiples of the usual fast step, and fractions of the usual range.
+# A spike or jump must reach both.
 _SPIKE, _SPIKE_FRACTION, _JUMP, _JUMP_FRACTION = 4.0, 0.03, 8.0, 0.1
 _LEAST_SPIKE, _LEAST_JUMP = 0.03, 0.1
-"""Sizes below which spikes and jumps are noise [rad]."""
+"""Allowances for noise [rad], which are added to these smallest sizes."""
 
 
 def finite_values(
@@ -40,7 +41,7 @@ def finite_values(
 ) -> Iterator[Issue]:
     """Check that all values are finite."""
     for key, values in frames.items():
-        # The sum is finite unless a value is not: far cheaper than a mask.
+        # If the sum is finite, all values are. The sum is far cheaper than a mask.
         if np.isfinite(values.sum(dtype=float)):
             continue
         bad = np.argwhere(~np.isfinite(values.astype(float)))
@@ -257,7 +258,7 @@ def joint_speeds(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
     joint = int((speed[frame] / limits).argmax())
     step, name = change[frame, joint], names[joint]
     cause = "a glitch, or frames were lost: look at it, or leave the episode out"
-    if abs(abs(step) - 2 * np.pi) < 0.3:  # the usual motion within a frame
+    if abs(abs(step) - 2 * np.pi) < 0.3:  # tolerates motion within a frame
         cause = "the encoder wrapped: hrc repair unwraps it"
     text = (
         f"{name} jumps by {step:.3g} rad in one frame ({speed[frame, joint]:.3g} rad/s, limit "

@@ -26,10 +26,10 @@ from hrc_learn.geometry import quaternion
 _PAUSE = 0.1
 """Longest time between two reports of a moving robot [s]."""
 _RESTING = 0.01
-"""Fraction of its range within which a value rests: more than the noise of encoders."""
+"""Largest change of a value at rest, relative to its range; more than the noise of encoders."""
 _MEASURED_ANGLES = ("joint_position", "euler_xyz", "euler_intrinsic_xyz")
 _LARGEST_REMAINDER = 0.3 / (2 * np.pi)
-"""Largest remainder of a jump without its whole turns, due to motion within a frame [turns]."""
+"""Largest part of a jump beyond whole turns [turns]; it comes from motion within a frame."""
 _NEIGHBOURS = 4
 """Number of steps on either side that indicate the speed of a joint."""
 _SMOOTH = ("joint_position", "joint_velocity", "position")
@@ -226,7 +226,7 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
 
 
 def _while_all_rest(edit: EpisodeEdit, first: int, last: int) -> tuple[int, int]:
-    """First and last frame to keep, such that all state and action columns rest outside."""
+    """First and last frame to keep: all state and action columns rest before and after them."""
     for key, values in edit.frames.items():
         if not key.startswith(("observation.", "action", "state")) or is_clock(values):
             continue
@@ -282,7 +282,7 @@ def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
                 other = quantities["command_position"] / edit.turn("command_position")
                 fixed |= _turns(other).any(0)
             smooth[:, fixed] = values[:, fixed]
-        # Scaling changes a rotation vector in its last digit.
+        # Conversion changes the last digit of rotation vectors: this is no change.
         changed = np.abs(smooth - values).max(0) > 1e-6 * turn
         smooth[:, ~changed] = values[:, ~changed]
         if changed.any():
@@ -309,8 +309,8 @@ def _turns(
     usual = np.where(whole == 0, np.abs(steps), 0.0)
     padded = np.pad(usual, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)))
     around = sliding_window_view(padded, 2 * _NEIGHBOURS + 1, axis=0).max(-1)
-    # Three times the neighbouring steps, and a thousandth of a turn for noise.
-    # The factor allows for acceleration between neighbouring frames.
+    # The remainder may reach three times the neighbouring steps, because the joint may
+    # accelerate, and a thousandth of a turn more for noise.
     jumps[left > 3 * around + 1e-3] = 0.0
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(jumps, axis=0)])
 
@@ -336,8 +336,8 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     they are: unwrap them first. Stamps must increase.
 
     Raises:
-        DatasetError: The episode is shorter than a period, or it holds transforms, which cannot
-            be interpolated by their entries, or changes per step.
+        DatasetError: The episode is shorter than a period, or it holds changes per step or
+            transforms, which cannot be interpolated entry by entry.
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 

@@ -89,12 +89,12 @@ class _Source:
     """One of the datasets, and the mapping from its columns to those of the first dataset.
 
     Attributes:
-        folder: Its metadata.
-        decisions: Unit of each quantity.
-        meanings: Quantity and joint of each component that has one.
-        units: Unit of each of these components.
-        places: Component of this dataset for each component of a feature of the first one.
-        factors: Factor of each of these components to the unit of the first dataset.
+        folder: Metadata of this dataset.
+        decisions: Quantity -> its unit.
+        meanings: Component -> its quantity and joint, for components that hold a quantity.
+        units: Component -> its unit, for the same components.
+        places: Feature -> components of this dataset in the order of the first dataset.
+        factors: Feature -> factors from these components to the units of the first dataset.
     """
 
     def __init__(self, dataset: OpenedDataset):
@@ -175,7 +175,9 @@ class _Merge:
         return common
 
     def _match(self, source: _Source, key: str) -> None:
-        """Find the source's component and its factor for each component of the first dataset.
+        """Match each component of a feature of the first dataset with one of the source.
+
+        The matching components and the factors of their units are kept in the source.
 
         Raises:
             DatasetError: A component is missing, or its unit cannot be converted.
@@ -200,7 +202,10 @@ class _Merge:
         source.places[key], source.factors[key] = places, np.array(factors)
 
     def _place(self, source: _Source, key: str, index: int) -> int:
-        """Component of a source with the name or meaning of one in the first dataset."""
+        """Index of the source's component that matches one of the first dataset.
+
+        Two components match if their names or their meanings are equal.
+        """
         name = self.first.features[key].component(index)
         wanted = self.first.meanings.get((key, index))
         names = source.features[key].names or ()
@@ -266,7 +271,7 @@ class _Merge:
         for key, feature in features.items():
             others = [source.folder.info["features"].get(key, {}) for source in self.sources]
             if any(other.get("info") != feature.get("info") for other in others):
-                feature.pop("info", None)  # of the videos; LeRobot determines it anew
+                feature.pop("info", None)  # about videos; LeRobot finds it again
         old = own.sidecar
         columns = {role: c for role, c in old.columns.items() if c.key in features}
         parts = tuple(part for part in old.contract.components if part.key in features)

@@ -54,7 +54,8 @@ class EpisodeQuality:
     reasons: list[str] = field(default_factory=list)
     """Reasons: findings of the check, then faults of reading, then unusual measures."""
     place: tuple[float, float] | None = None
-    """First two principal components: similar episodes are close on this map."""
+    """Place on a map of the episodes, the first two principal components of their motions.
+    Similar episodes are close."""
     start: int = 0
     """First frame of the motion; the arm rests before."""
     stop: int = 0
@@ -93,13 +94,13 @@ class Ranking:
 def rank_episodes(path: str | Path, progress: Progress | None = None) -> Ranking:
     """Rank the episodes of a dataset by how doubtful they are.
 
-    The score adds up the findings of `check_dataset`, the distance of the motion from the most
-    similar ones, and unusual durations, gripper motions, rests, jerk and late frames. Memory
-    grows by a few kilobytes per episode, independent of its length.
+    The score adds up the findings of `check_dataset`, the distance from the most similar
+    motions, and unusual durations, gripper motions, rests, jerk and late frames. Memory grows
+    by a few kilobytes per episode, independent of the episode's length.
 
     Args:
         path: Folder of the dataset.
-        progress: Wraps the episodes, such as with a progress bar.
+        progress: Function that iterates over the episodes and shows the progress.
 
     Raises:
         DatasetError: The dataset cannot be read as a whole.
@@ -154,7 +155,7 @@ def _demonstrations(
     """Readable episodes, one at a time; the errors of all others are added to their doubt."""
     dataset = open_dataset(root)
     entries = dataset.folder.episodes
-    # The check reports episodes in other units than the rest.
+    # Faults are ignored here: the check reports episodes with units unlike the rest.
     decisions, _ = dataset.decide_units(entries, {})
     demos = DemonstrationSource(dataset, entries, decisions).each()
     for entry, demo in zip(progress(entries) if progress else entries, demos, strict=True):
@@ -172,7 +173,7 @@ def _measure(
     """Measure an episode.
 
     Returns:
-        Its joints or position, and its gripper, as columns; None if neither is recorded.
+        Joints or position, and gripper, as columns; None if nothing of this is recorded.
     """
     steps = np.diff(demo.time)
     quality.measures = {
@@ -379,7 +380,7 @@ def write_curated(
         path: The dataset.
         out: Folder of the new dataset, which must not exist.
         decisions: Decisions by episode; episodes without one are accepted.
-        progress: Wraps the episodes, as in `repair_dataset`.
+        progress: Function as in `repair_dataset`.
 
     Raises:
         DatasetError: No episode is left, or an accepted one cannot be read.

@@ -44,7 +44,8 @@ from hrc_learn.store import write_json
 
 _LISTS, _INDEX = "meta/episodes", ("episode_index",)
 _STAMP_TOLERANCE = 1e-3
-"""Deviation from a regular clock above which old stamps are kept [s]: float32 rounds finer."""
+"""Deviation from a regular clock above which old stamps are kept [s]. It exceeds the rounding
+errors of float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +142,7 @@ def repair_dataset(
         options: Permitted changes.
         mapping: Columns of quantities that are not found by name, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`; kept in the new dataset.
-        progress: Wraps the episodes, such as with a progress bar.
+        progress: Function that iterates over the episodes and shows the progress.
         kept: Episode index -> frames to keep; all other episodes are left out. None keeps all.
 
     Raises:
@@ -166,7 +167,7 @@ def repair_dataset(
 
 @contextmanager
 def _finished(root: Path) -> Iterator[tuple[Path, list[str]]]:
-    """The dataset, or a readable copy of what a killed recorder left, with a note."""
+    """Folder of the dataset, or of a readable copy if its recorder was killed; and notes."""
     if not (unfinished := unfinished_files(root)):
         yield root, []
         return
@@ -178,9 +179,9 @@ def _finished(root: Path) -> Iterator[tuple[Path, list[str]]]:
 def unfinished_files(root: Path) -> list[str]:
     """Files that LeRobot's recorder (version 3.0) left unfinished when it was killed or failed.
 
-    The recorder writes the rows of each episode at once, but the footers of its files and the
-    list of episodes only when it ends. An episode whose save failed has rows, but no entry in
-    the list.
+    The recorder writes the rows of an episode when it saves the episode, but the footers of its
+    files and the list of episodes only when it ends. If saving an episode fails, the episode
+    has rows, but no entry in the list.
     """
     data, lists = (sorted(root.glob(f"{part}/*/file-*.parquet")) for part in ("data", _LISTS))
     files = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
@@ -278,7 +279,7 @@ def _place(kind: str, path: Path) -> dict[str, int]:
 def _place_videos(
     root: Path, key: str, known: Sequence[dict], rows: Sequence[dict], fps: float
 ) -> None:
-    """Add the videos of a camera that no known episode uses to `rows`, in recording order."""
+    """Assign the unused videos of a camera to the episodes in `rows`, in recording order."""
     kind, left = f"videos/{key}", [*rows]
     for path in sorted(root.glob(f"{kind}/*/file-*.mp4")):
         place, begin = _place(kind, path), 0

@@ -147,7 +147,7 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
 
 
 def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
-    """Check that a file of statistics exists: policies normalise their inputs by them."""
+    """Check that a file of statistics exists: policies normalise their inputs with it."""
     files = (_STATISTICS, "meta/episodes_stats.jsonl")
     if not any((folder.root / file).is_file() for file in files):
         text = "no statistics: LeRobot's policies cannot normalise their inputs"
@@ -219,7 +219,7 @@ def unlisted_files(folder: DatasetFolder) -> Iterator[Issue]:
 
 
 def task_texts(folder: DatasetFolder) -> Iterator[Issue]:
-    """Check that tasks have texts, are listed once, and include those of every episode."""
+    """Check that tasks have texts and are listed once, and that episodes name listed tasks."""
     texts, file = list(folder.tasks.values()), "meta/tasks"
     for index, task in folder.tasks.items():
         if not task.strip():

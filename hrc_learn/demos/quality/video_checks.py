@@ -89,7 +89,7 @@ def _check_camera(
 
 
 def read_stream(path: Path) -> _Stream:
-    """Count the packets of a file.
+    """Count the images of a video, and read its frame rate and size, without decoding.
 
     Raises:
         DatasetError: The file is no video, damaged or truncated.

@@ -1,4 +1,4 @@
-"""Columns of a dataset that hold each quantity: declared, found by name, or given.
+"""Find the columns of a dataset that hold each quantity: declared, named or given ones.
 
 Nothing is taken for a quantity by its position alone. The caller's mapping comes first, then
 the contract or sidecar kept with the dataset, then the naming conventions of `naming`.
@@ -85,7 +85,7 @@ def map_columns(
     Args:
         features: Features declared by the dataset.
         mapping: Role -> columns, as in `load_demos`; None as columns leaves a role out.
-        declared: Columns of quantities that the dataset declares; replaces all guesses.
+        declared: Columns of quantities that the dataset declares. They replace all guesses.
 
     Raises:
         DatasetError: The mapping names a role or column that does not exist.
@@ -427,10 +427,11 @@ def _is_command(feature: Feature) -> bool:
 def _align_joints(
     found: dict[str, ColumnSelection],
 ) -> tuple[tuple[str, ...], dict[str, ColumnSelection], dict[str, tuple[str, ...]]]:
-    """Bring every quantity with one column per joint into the order of the first one.
+    """Bring all quantities with one column per joint into the joint order of the first one.
 
     Returns:
-        Joint names, selections in that order, and joints of the quantities with other joints.
+        Joint names, selections in this order, and role -> joints for quantities with other
+        joints.
     """
     joints = [found[role] for role in JOINT_FIELDS if role in found]
     if not joints:

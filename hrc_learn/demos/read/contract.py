@@ -34,7 +34,8 @@ CONTRACT_ROLES = (*_QUANTITIES, *(role for role in ROLES if role not in _QUANTIT
 _FOLLOWS = 0.6
 """R squared above which a state counts as following its command."""
 _FOOTER = 8192
-"""Size of the end of a Parquet file, which locates its pages and holds statistics [bytes]."""
+"""Size of the end of a data file that enters the fingerprint [bytes]. The end of a Parquet file
+locates its pages and holds statistics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +50,9 @@ class ComponentContract:
     unit: str
     """Unit on disk; "" if unknown."""
     low: float
-    """Lower end of the range: 5 % quantile over episodes of the 0.5 % quantile in each."""
+    """Lower end of the range: 5 % quantile of the 0.5 % quantiles of all episodes."""
     high: float
-    """Upper end of the range: 95 % quantile over episodes of the 99.5 % quantile in each."""
+    """Upper end of the range: 95 % quantile of the 99.5 % quantiles of all episodes."""
     sign: Literal[-1, 0, 1] = 0
     """Direction in which the state follows an increasing command, +1 or -1; 0 if unknown."""
     delay: float | None = None
@@ -141,7 +142,7 @@ class Contract:
         """Columns of each quantity.
 
         Raises:
-            DatasetError: A component does not exist, or a quantity's number of them is wrong.
+            DatasetError: A component does not exist, or a quantity has a wrong number of them.
         """
         found: dict[str, list[ComponentContract]] = {}
         for part in self.components:
@@ -167,9 +168,9 @@ class Contract:
     def keeping(self, kept: "Contract") -> "Contract":
         """This contract with the names and roles of an older one, which may have been edited.
 
-        A component that is now read as another quantity keeps its new role. Quantities have the
-        units of this contract, which obeys the older one; other components keep the units of
-        the older one.
+        A component that is now read as another quantity keeps its new role. Components of
+        quantities keep the unit of this contract; it already follows the older contract. Other
+        components get the unit of the older contract.
         """
         known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:
@@ -181,7 +182,7 @@ class Contract:
         return replace(self, components=tuple(parts))
 
     def without_doubt(self) -> tuple["Contract", list[str]]:
-        """The contract without doubtful units, and the components that lose their unit."""
+        """The contract without doubtful units, and the names of the components concerned."""
         doubtful = [p for p in self.components if p.unit and p.confidence < CONFIDENT]
         parts = [replace(p, unit="") if p in doubtful else p for p in self.components]
         return replace(self, components=tuple(parts)), [f"{p.key}/{p.name}" for p in doubtful]
@@ -196,9 +197,9 @@ class SidecarColumn:
     """Columns that hold one quantity."""
 
     key: str
-    """Feature."""
+    """Key of the feature."""
     names: tuple[str, ...]
-    """Names of its components."""
+    """Names of the components of the feature that hold the quantity."""
 
 
 @dataclass(frozen=True, kw_only=True)

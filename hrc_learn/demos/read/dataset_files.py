@@ -32,7 +32,7 @@ def require_file(root: Path, file: str, episode: int | None = None) -> None:
     Args:
         root: Folder of the dataset.
         file: Path relative to `root`.
-        episode: Episode that needs it.
+        episode: Episode that needs the file, for the message.
 
     Raises:
         DatasetError: There is no such file, it is a device or a pipe, may not be read, is a
@@ -49,7 +49,7 @@ def require_file(root: Path, file: str, episode: int | None = None) -> None:
             head = stream.read(len(_POINTER))
     except FileNotFoundError as error:
         raise DatasetError("not found: the copy is incomplete", **place) from error
-    except OSError as error:  # circular links too
+    except OSError as error:  # also circular links
         raise DatasetError(f"cannot be read: {error.strerror}", **place) from error
     if head == _POINTER:
         text = "is a pointer of Git LFS, not the file itself: run `git lfs pull` in the dataset"
@@ -243,7 +243,7 @@ _MAGIC = b"PAR1"
 _TRUE, _FALSE, _BYTE, _I32, _I64, _BINARY, _LIST, _STRUCT = 1, 2, 3, 5, 6, 8, 9, 12
 """Types of Thrift's compact protocol, in which Parquet writes its headers."""
 _Struct = dict[int, tuple[int, Any]]
-"""Type and value of each field of a struct, by its number."""
+"""Number of a field -> its type and value."""
 
 
 class _Page(NamedTuple):
@@ -252,7 +252,7 @@ class _Page(NamedTuple):
     start: int
     end: int
     plain_size: int
-    """Header and uncompressed content [bytes]."""
+    """Size of the header and of the uncompressed content [bytes]."""
     values: int
     """Number of values, 0 for a dictionary."""
 
@@ -273,7 +273,7 @@ def finished_parquet(content: bytes, example: pa.Table) -> bytes:
 
     Args:
         content: Content of the file, with pages as pyarrow writes them (Snappy, dictionaries).
-        example: One row of a table with the columns of the file.
+        example: Table with the columns of the file and one row.
     """
     sink = pa.BufferOutputStream()
     pq.write_table(example, sink)

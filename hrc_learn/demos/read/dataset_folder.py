@@ -242,9 +242,10 @@ def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
 
 
 def places_v2(episode: int, chunks_size: int) -> dict[str, int]:
-    """Fields of a path in version 2, which keeps one file per episode.
+    """Fields of a path template in version 2, which keeps one file per episode.
 
-    Some converters use the field name of version 3 for the folder of `chunks_size` files.
+    A chunk is a folder of `chunks_size` files. Some converters use the name of version 3 for
+    the number of the chunk.
     """
     chunk = episode // chunks_size
     return {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": episode}
@@ -281,7 +282,7 @@ def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
     """Complete statistics of the features, by episode index.
 
     Raises:
-        DatasetError: Their file is damaged.
+        DatasetError: A file of statistics is damaged.
     """
     found: dict[int, Statistics] = {}
     lines = "meta/episodes_stats.jsonl"

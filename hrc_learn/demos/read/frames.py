@@ -35,7 +35,7 @@ def read_frames(
 
 
 def raising[T](found: Iterable[T | DatasetError]) -> Iterator[T]:
-    """The items; the first error among them is raised."""
+    """Yield the items, and raise the first error among them."""
     for item in found:
         if isinstance(item, DatasetError):
             raise item
@@ -234,7 +234,7 @@ def _not_finite(
     """Error for a value that is not finite; such values of an invisible feature become 0."""
     seen = quantities.get("feature_visible")
     for role, values in quantities.items():
-        # The sum is finite unless a value is not: far cheaper than a mask.
+        # If the sum is finite, all values are. The sum is far cheaper than a mask.
         if np.isfinite(values.sum()):
             continue
         bad = ~np.isfinite(values)
@@ -286,7 +286,8 @@ def frame_timestamps(
     """Stamps of one episode [s].
 
     A column of true stamps is preferred. LeRobot's own `timestamp` is frame / fps by
-    definition; if it agrees with that to the resolution of float32, it is computed in float64.
+    definition. If the values agree with this to the resolution of float32, frame / fps is
+    computed in float64 instead.
 
     Raises:
         DatasetError: The stamps do not increase.

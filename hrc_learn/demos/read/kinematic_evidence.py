@@ -1,7 +1,7 @@
 """Joint positions compared with the recorded pose of the end effector by forward kinematics.
 
-The forward kinematics of a known arm give the recorded positions, up to the place of base and
-tool, only if the unit, order, signs and zeros of the recorded joints are right.
+The forward kinematics of a known arm give the recorded positions only if the unit, order, signs
+and zeros of the recorded joints are right. The positions of base and tool need not be known.
 """
 
 import itertools
@@ -25,8 +25,8 @@ _FRAMES = 80
 _LEAST_MOTION = 0.01
 """Smallest motion of the end effector for a comparison [m]."""
 _AGREES, _AGREES_RELATIVE = 4e-3, 0.03
-"""Residuals up to which positions agree [m], and relative to the motion: arms are calibrated to
-millimetres."""
+"""`_AGREES`: residual up to which positions agree [m]; arms are calibrated to millimetres.
+`_AGREES_RELATIVE`: the same, relative to the motion. The larger bound counts."""
 _WORSE = 3.0
 """Ratio of residuals above which one interpretation is preferred to another."""
 _UNITS = {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi}
@@ -41,7 +41,7 @@ class Agreement:
     residual: float
     """Root mean square distance [m]."""
     other: float
-    """Residual of the unchanged joints [m], in rad or deg, whichever is less."""
+    """Residual of the joints as recorded, read as rad or as deg, whichever is less [m]."""
     change: str = ""
     """Signs or order that differ from the record, in words."""
 
@@ -131,7 +131,7 @@ def residual(
 ) -> float:
     """Root mean square distance of the positions from forward kinematics [m].
 
-    The origin of the base and the place of the tool on the flange are fitted.
+    The positions of the base and of the tool on the flange are fitted.
     """
     left = _left(arm, q, position)
     return float(np.sqrt((left**2).mean() * 3))
@@ -140,7 +140,11 @@ def residual(
 def _left(
     arm: Arm, q: Float64[np.ndarray, "frames joints"], position: Float64[np.ndarray, "frames 3"]
 ) -> Float64[np.ndarray, " numbers"]:
-    """Residuals of the positions after the best fit p = p_flange + R_flange tool + base."""
+    """Differences of the positions from p_flange + R_flange tool + base [m].
+
+    The pose of the flange (p_flange, R_flange) comes from forward kinematics; the constant
+    vectors `tool` and `base` are fitted.
+    """
     pose = arm.forward(torch.from_numpy(np.ascontiguousarray(q)))
     turns = quaternion.to_matrix(pose.orientation).numpy()
     free = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], axis=2)
@@ -151,9 +155,9 @@ def _left(
 def zero_offsets(
     arm: Arm, q: Float64[np.ndarray, "frames joints"], position: Float64[np.ndarray, "frames 3"]
 ) -> Float64[np.ndarray, " joints"]:
-    """Offsets of the joint positions with which forward kinematics give the positions [rad].
+    """Offsets [rad] which, added to the joints, make forward kinematics give the positions.
 
-    Offsets below 0.5 degrees are set to 0; so are all, if they do not explain the error.
+    Offsets below 0.5 degrees are set to 0. All offsets are 0 if they do not explain the error.
 
     Args:
         arm: The arm.

@@ -25,7 +25,8 @@ from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 NUMERIC = ("float", "int", "uint", "bool")
 """Prefixes of the dtypes of numbers."""
-# Bounds of one numeric column; the force field of a wrist sensor has some hundred components.
+# Largest numbers of components and of axes of a numeric column. The force field of a wrist
+# sensor has some hundred components.
 _WIDEST, _MOST_AXES = 100_000, 8
 SIDECAR_PATH = "meta/hrc_learn.json"
 
@@ -66,7 +67,7 @@ def read_features(info: dict) -> dict[str, Feature]:
 
 
 def read_feature(key: str, declared: dict) -> Feature:
-    """One feature.
+    """Feature from its declaration in `meta/info.json`.
 
     Raises:
         DatasetError: The declaration is malformed. Names that do not fit the shape are ignored.
@@ -117,11 +118,11 @@ _PANDAS_INDEX = {"index_columns": ["task"], "column_indexes": [], "columns": [_T
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 Statistics = dict[str, dict[str, list]]
-"""Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
+"""Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> values by component."""
 
 
 def place(template: str, number: int, **fields: str) -> str:
-    """Path of the file of that number; a chunk holds `CHUNK_SIZE` files."""
+    """Path of the file with this running number; a chunk holds `CHUNK_SIZE` files."""
     chunk, file = divmod(number, CHUNK_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **fields)
 

@@ -54,7 +54,7 @@ _NAMES = [
     for table in ("components", "numbered")
     for role, rest in WORDS[table]
 ]
-"""Role, pattern of the whole name, and True if it needs a word for the tool."""
+"""Role, pattern of the whole name, and True if the name needs a word for the tool."""
 _SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _QUATERNION_SLOTS = {"w": 0, "x": 1, "y": 2, "z": 3}
 

@@ -28,7 +28,8 @@ _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
 _REST, _FEWEST_STILL = 5, 5
-"""Number of frames over which a component at rest hardly moves, and fewest such frames."""
+"""`_REST`: number of frames over which a component at rest hardly moves. `_FEWEST_STILL`:
+smallest number of frames at rest that give an offset."""
 _REST_MOTION = 0.005
 """Largest motion at rest, relative to the range."""
 FOLLOWS = 0.8
@@ -38,8 +39,8 @@ LOST = 0.4
 _SAME_SLOPE = 0.3
 """Largest relative difference from the typical slope, for components in the same unit."""
 _SAME_UNIT, _LATE = np.log(2.0), 0.75
-"""Largest logarithm of the slope (a factor of 2), and largest delay [s], for a state that
-follows commanded positions."""
+"""`_SAME_UNIT`: largest logarithm of the slope (a factor of 2) for a state that follows
+commanded positions. `_LATE`: largest delay of such a state [s]."""
 PROMPT = 0.2
 """Delay within which an arm follows [s]; at longer delays, a slow motion resembles its rate."""
 RATE_WINDOW = 0.2
@@ -112,9 +113,10 @@ class EpisodeProfile:
     columns: dict[str, ColumnProfile]
     """Profile of each feature."""
     tracking: dict[str, Tracking] = field(default_factory=dict)
-    """Tracking by role: `command_position` against the joints, `command_velocity` against the
-    joint rates, and `rates` for position commands against the joint rates, unless the joints
-    follow them promptly as positions. Rates are means over `RATE_WINDOW`."""
+    """Relations by name. `command_position`: joint positions that follow position commands.
+    `command_velocity`: joint rates that follow velocity commands. `rates`: joint rates that
+    follow position commands, unless the joints promptly follow these as positions. Rates are
+    means over `RATE_WINDOW`."""
 
 
 def profile_columns(
@@ -321,7 +323,7 @@ def track(
     if frames < 20 or reach < 1:
         return None
     size = np.minimum(state.std(0), command.std(0))
-    # Larger than rounding errors of the values.
+    # The motion must exceed the rounding errors of the values.
     moving = size > 1e-9 * (1 + np.abs(state).max(0))
     if not moving.any():
         return None
@@ -436,7 +438,7 @@ def commanded_rates(
 
 
 def are_positions(trackings: Sequence[Mapping[str, Tracking]], fps: float) -> bool:
-    """True if the joints follow commands as positions, in the same unit; also if none moves."""
+    """True if the joints follow commands as positions in the same unit, or if none moves."""
     votes = []
     for tracking in (known["command_position"] for known in trackings if len(known)):
         near = (tracking.fit > LOST) & (np.abs(np.log(np.abs(tracking.slope))) < _SAME_UNIT)

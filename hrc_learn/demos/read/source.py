@@ -1,4 +1,4 @@
-"""Demonstrations read from a LeRobot dataset, at once or one after another."""
+"""Demonstrations read from a LeRobot dataset, all together or one after another."""
 
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -42,7 +42,8 @@ _POSES = 5
 """Number of episodes whose poses are compared with the kinematics."""
 _COMMAND = "command_position"
 _WHOLE_STEP, _SPEED = (0.1, 1.5), (2 / 3, 1.5)
-"""Ranges in which the motion per unit of a command counts as 1: per step, and per second."""
+"""Ranges of the joint motion per unit of a command. `_WHOLE_STEP`: motion in one step, for
+commands that give the whole step. `_SPEED`: motion in one second, for possible velocities."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +144,7 @@ class OpenedDataset:
         given: Mapping[str, str],
         sample: Collection[int] | None = None,
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
-        """Decide on units as `units_from_episodes` does, and whether commands are changes."""
+        """Decide on units as `units_from_episodes`; also find commands that are changes."""
         fps, trackings, poses = self.folder.fps, [], []
         asked = _COMMAND in self.columns.selections.keys() - {*self.declared_units, *given}
 
@@ -171,10 +172,10 @@ class OpenedDataset:
     def _by_kinematics(
         self, joints: UnitDecision, poses: Sequence[tuple[np.ndarray, np.ndarray]], factor: Any
     ) -> UnitDecision:
-        """Decision on the unit of the joints, by the kinematics of a known arm if they agree.
+        """Decision on the unit of the joints, by the kinematics if they agree with the poses.
 
         Args:
-            joints: Decision by the values of the joints.
+            joints: Decision from the values of the joints; returned if the kinematics disagree.
             poses: Joint positions and positions of the end effector, as recorded.
             factor: Factor from recorded positions to metres.
         """
@@ -210,7 +211,7 @@ def _meaning_of_commands(
     trackings: Sequence[Mapping[str, profiles.Tracking]],
     fps: float,
 ) -> dict[str, UnitDecision]:
-    """Decisions to replace if the commands are not positions of the joints."""
+    """Decisions that replace the old ones if the commands are not positions of the joints."""
     command, selection = decisions[_COMMAND], columns.selections[_COMMAND]
     if (found := profiles.commanded_rates(trackings, fps)) is None:
         if not selection.numbered or profiles.are_positions(trackings, fps):
@@ -268,7 +269,7 @@ def open_dataset(path: str | Path, mapping: MappingSpec | None = None) -> Opened
 
 @runtime_checkable
 class OpenLeRobotDataset(Protocol):
-    """Attributes used of an open `LeRobotDataset`."""
+    """Attributes of an open `LeRobotDataset` that are used here."""
 
     root: Path
     episodes: list[int] | None
@@ -475,7 +476,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         """Demonstration of a raw episode of this dataset.
 
         Raises:
-            DatasetError: Its stamps do not increase, or its orientations are invalid.
+            DatasetError: The stamps do not increase, or the orientations are invalid.
         """
         entry, frames, quantities = episode.entry, episode.frames, episode.quantities
         factors = {role: self.units[role].factor for role in quantities}

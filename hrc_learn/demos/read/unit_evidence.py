@@ -13,17 +13,18 @@ from hrc_learn.demos.read.naming import WORDS
 from hrc_learn.demos.read.quantities import SIZES
 
 CONFIDENT = 0.75
-"""Confidence from which a guessed unit is used without a question."""
+"""Smallest confidence at which a guessed unit is used without a question."""
 ASSUMED = 0.95
-"""Highest confidence of a guess from the size of values: it is assumed, not known."""
+"""Largest confidence of a guess from the size of values. The guess is assumed, not known."""
 
 _BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES.items()}
-"""Largest value by quantity and unit, allowing for noise."""
-# Wrists may turn more than once, and no demonstration in degrees stays within 13 degrees.
+"""Quantity -> unit -> largest value, with an allowance for noise."""
+# Largest joint angles in rad and in deg. Wrists may turn more than once. No demonstration in
+# degrees stays within 13 degrees.
 _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
-# LeRobot divides a turn by 4095.
+# Unit, and step of an encoder in it. LeRobot divides a turn by 4095.
 _ENCODERS = (("deg", 360 / 4095), ("deg", 360 / 4096), ("rad", math.tau / 4096))
 _FEWEST_STEPS, _FEWEST_ENCODERS = 10, 3
 _SLIDE = 0.12
@@ -31,10 +32,12 @@ _SLIDE = 0.12
 # Old datasets of LeRobot name the columns of joints and of poses alike.
 _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
 FEWEST_JOINTS, _POSE_AND_FINGERS = 5, 8
-"""Number of joints of the smallest usual arms; number of columns of a pose and two fingers."""
+"""`FEWEST_JOINTS`: number of joints of the smallest usual arms.
+`_POSE_AND_FINGERS`: number of columns of a pose and two fingers."""
 # LeRobot clips normalised positions at exactly 100.
 _CLIP, _CLIPPED = 100.0, 0.002
-"""This value, and the smallest fraction of frames at it in a column that counts as clipped."""
+"""`_CLIP`: this value.
+`_CLIPPED`: fraction of the frames at this value above which a column counts as clipped."""
 GUESSED_BY_SIZE = tuple(SIZES)
 """Quantities other than joints whose unit is guessed from the size of their values."""
 _UNIT_LENGTH = 2e-3
@@ -44,7 +47,7 @@ _HOBBY, _HOBBY_JOINTS = re.compile(WORDS["hobby"], re.IGNORECASE), {*WORDS["hobb
 
 
 class Sizes(NamedTuple):
-    """Values of each component, over the frames of one or more episodes."""
+    """Statistics of the values of each component, over the frames of one or more episodes."""
 
     peak: Float64[np.ndarray, " components"]
     """99.5 % quantile of the absolute values."""
@@ -53,11 +56,11 @@ class Sizes(NamedTuple):
     whole: Bool[np.ndarray, " components"]
     """True where all values are whole numbers."""
     unit_length: Bool[np.ndarray, " components"]
-    """True where this component and the next three have unit length together, and move."""
+    """True where this component and the next three are a vector of unit length that changes."""
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
     step: Float64[np.ndarray, " components"] = np.zeros(1)
-    """Step of which all differences of values are multiples, as of an encoder; 0 if none."""
+    """Step of an encoder: all differences of values are its multiples. 0 if there is none."""
 
 
 class Guess(NamedTuple):
@@ -92,7 +95,7 @@ def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
 
 
 def _encoder_step(values: Float64[np.ndarray, " frames"]) -> float:
-    """Step of the encoder that measured the values; 0 if their differences are no multiples."""
+    """Step of the encoder that measured the values; 0 if their differences fit no step."""
     apart = np.diff(np.unique(values))
     # In float32, a step has a relative error of about 1e-4.
     if len(apart) < _FEWEST_STEPS or apart.min() < 1e-5 * np.abs(values).max():
@@ -182,7 +185,7 @@ def _degrees_or_range(
     labels: Sequence[str],
     robot_type: str,
 ) -> Guess:
-    """Degrees, or LeRobot's -100..100 of a joint's range."""
+    """Guess whether values are degrees or LeRobot's -100..100 of a joint's range."""
     reach = f"values usually reach {largest:.3g}"
     hobby = is_hobby_arm(robot_type, labels)
     if largest > _CLIP + 0.05:

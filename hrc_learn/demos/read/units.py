@@ -49,7 +49,7 @@ class UnitDecision:
     other: str = ""
     """Second candidate for the unit; "" if there is none."""
     leader: str = ""
-    """Quantity whose unit this one takes over; "" if none."""
+    """Other quantity that gives this quantity its unit; "" if there is none."""
 
     @property
     def factor(self) -> float | Float64[np.ndarray, " components"]:
@@ -129,7 +129,7 @@ def unit_factor(role: str, unit: str) -> float:
 
 
 def units_of(role: str) -> dict[str, float]:
-    """Units of a quantity with their factors; commands come in units per step as well."""
+    """Units of a quantity and their factors, without the units per step of commands."""
     own = ROLES[role].unit
     options = next(units for units in DIMENSIONS.values() if own in units)
     if role in ("gripper", "joint_position", "command_position"):
@@ -157,7 +157,8 @@ def decide_units(
         selections: Columns of the quantities, whose names are evidence.
         sizes: Sizes of the values on disk, for quantities whose unit must be guessed.
         stated: Units by role, or of each component, from the caller or the dataset.
-        frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
+        frame_step: Step of the true stamps in their unit on disk, divided by the nominal period
+            in seconds.
         robot_type: Robot type of the dataset, "" if unknown.
     """
     decisions: dict[str, UnitDecision] = {}
@@ -281,7 +282,7 @@ def _guess_joint_units(
 
 
 def _guess_time(frame_step: float) -> UnitDecision:
-    """Unit of the stamps: the one that brings their step closest to the frame rate."""
+    """Unit of the stamps: the one that brings their step closest to the nominal period."""
     sizes = DIMENSIONS["time"]
     # The bound avoids the logarithm of a step of zero.
     off = {unit: abs(math.log10(max(frame_step, 1e-3) * size)) for unit, size in sizes.items()}
@@ -309,8 +310,8 @@ def units_from_episodes(
 ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
     """Unit of each quantity, from the size of its values where it must be guessed.
 
-    The size of a component is the median over episodes of its peak in each, so that no single
-    frame or episode decides.
+    The size of a component is the median of its peaks in all episodes, so that no single frame
+    or episode decides.
 
     Args:
         selections: Columns of the quantities.
@@ -341,7 +342,7 @@ def units_from_episodes(
         )
         time = quantities.get("time", np.empty((0, 1)))
         if len(time) > 1:
-            # As a multiple of the nominal period.
+            # Step in the unit on disk, divided by the nominal period in seconds.
             steps.append(float(np.nanmedian(np.diff(time[:, 0]))) * fps)
     deciding = [m for entry, m in measured if sample is None or entry.index in sample]
     deciding = deciding or [m for _, m in measured]
@@ -378,7 +379,10 @@ def _contradictions(
     decision: UnitDecision,
     measured: Sequence[tuple[EpisodeEntry, Mapping[str, Sizes]]],
 ) -> Iterator[DatasetError]:
-    """Episodes about 57.3 times as large or small as the others: degrees among radians."""
+    """Errors of episodes with values about 57.3 times as large or as small as in the others.
+
+    Such episodes hold degrees among radians, or radians among degrees.
+    """
     role = selection.role
     if role not in ("joint_position", "command_position", *ORIENTATION_ROLES):
         return
