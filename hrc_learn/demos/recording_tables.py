@@ -90,9 +90,7 @@ def _split(line: str, delimiter: str) -> list[str]:
         return line.split()
     fields = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     fields = [field.strip() for field in fields]
-    return (
-        fields[:-1] if len(fields) > 1 and not fields[-1] else fields
-    )  # drop an empty last field
+    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields  # no empty end
 
 
 def _is_number(field: str) -> bool:
