@@ -1,4 +1,4 @@
-"""Curation page in a browser, on which episodes are accepted, trimmed and rejected."""
+"""Serve a browser page on which a person accepts, trims and rejects episodes of a dataset."""
 
 from __future__ import annotations
 
@@ -32,19 +32,20 @@ from hrc_learn.teleoperation.gate.gate import Visitor, incoming
 from hrc_learn.teleoperation.gate.messages import CurationMessage, Decide, curation_message
 
 _BLOCK = 32
-"""Number of images sent at once: about a second of video, few enough to be shown soon."""
+"""Number of images sent together: about a second of video, few enough to be shown soon."""
 _TALLEST = 360
 """Images are scaled down to this height [px]."""
 _MOST_LINES = 12
-"""Largest number of curves of a column that is drawn although its meaning is unknown."""
+"""Largest number of components of a column of unknown meaning; a larger one is not drawn."""
 _MOST_POINTS = 2000
-"""Largest number of points of a curve; longer ones are reduced to extremes of sections."""
+"""Largest number of points of a curve. A longer curve is reduced to the extremes of its
+sections."""
 _CLIENT = Path(__file__).parent / "curation_client"
 
 
 class CurationPage:
-    """Browser page for reviewing ranked episodes. Decisions are saved at once, next to the
-    dataset.
+    """Browser page for reviewing ranked episodes. Each decision is saved immediately, next to
+    the dataset.
 
         with CurationPage(rank_episodes(path), out) as page:
             print(page.url)

@@ -1,7 +1,7 @@
-"""Dashboards in a browser: Rerun's viewer and recordings, served through the gate.
+"""Serve dashboards to a browser: Rerun's viewer and recordings, through the gate.
 
-Rerun's own servers require no secret and accept any host name. They serve no data here: one of
-them provides the files of the viewer once, and the gate serves these.
+Rerun's own servers require no secret and accept any host name. Therefore they serve no data
+here: one of them only provides the files of the viewer, once, and the gate serves these files.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recording of demonstrations on request (start, stop, save or discard), with quality checks.
+"""Record demonstrations on request (start, stop, save or discard), with quality checks.
 
 The page asks the person to confirm before it saves a doubtful demonstration. lerobot-record
 cannot ask, so its robots only warn at the end of an episode.
@@ -25,17 +25,17 @@ from hrc_learn.teleoperation.hand_guiding import Frame
 STILL = 0.005
 """Motion of a joint [rad] or the gripper [m] up to which the demonstration has not begun."""
 _REST = (0.3, 0.7)
-"""Rest kept before and after the motion [s]: primitives smooth motions, and need time to reach
-the goal."""
+"""Rest kept before and after the motion [s]: movement primitives smooth motions, and need time
+to reach the goal."""
 _SHORTEST = 0.5
-"""Shortest demonstration [s]: a mouse click on a link moves the arm for less."""
+"""Shortest demonstration [s]: a mouse click on a link moves the arm for a shorter time."""
 _MOST_LOST, _LONGEST_GAP = 0.05, 0.2
-"""Fraction of lost frames, and gap [s], above which a demonstration is doubted. At 0.5
-m/s the end effector moves 10 cm during such a gap.
+"""Fraction of lost frames, and gap [s], above which a demonstration is doubted. During such a
+gap, the end effector moves by 10 cm at 0.5 m/s.
 """
 _AT_LIMIT = 0.03
-"""Distance from its limit up to which a joint counts as being at the limit [rad]: the safety
-filter stops it 0.02 before the limit."""
+"""Distance from its limit up to which a joint counts as being at the limit [rad]. The safety
+filter stops the joint 0.02 rad before the limit."""
 _LONGEST_AT_LIMIT = 0.5
 """Time at a limit above which a demonstration is doubted [s]: a joint may touch its limit
 briefly."""
@@ -196,7 +196,8 @@ _DRAFT_EVERY = 2.0
 """Shortest period of drafts of the open demonstration [s]."""
 
 UNNAMED = "not named"
-"""Task of a demonstration that was open when the program ended, without a name."""
+"""Task of a draft, or of a demonstration that was open when the program ended, if the person
+has not named the task."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,13 +216,14 @@ class RecorderStatus:
 class DemonstrationRecorder:
     """Records one demonstration at a time, and writes those that are worth saving.
 
-    A person needs seconds from the button to the arm, and back: this rest is left out.
+    A person needs seconds from the button to the arm, and back: the recorder leaves out most of
+    this rest before and after the motion.
 
     A thread writes the episodes, so that the control loop never waits for the disk. The dataset
-    is complete when the `with` block has ended; without an episode, none is written. A
-    demonstration that is still open then is saved, even after a signal or an error. During
-    recording, a draft is written every `_DRAFT_EVERY` seconds, less often if it is long; after
-    a power cut, `recover_dataset` makes an episode of it.
+    is complete when the `with` block has ended; without an episode, no dataset is written. A
+    demonstration that is open when the block ends is saved, even after a signal or an error.
+    During recording, a draft is written every `_DRAFT_EVERY` seconds, less often for a long
+    demonstration; after a power cut, `recover_dataset` makes an episode of the draft.
 
     Attributes:
         state: State of the current demonstration.

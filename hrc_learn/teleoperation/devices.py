@@ -50,7 +50,7 @@ BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
 
 # Rumble: the slow motor reports contact and nearby people, the quick one an input that the arm
 # does not follow. Pulses are easier to notice than motors that run continuously.
-PULSE_EVERY, _PULSE = 0.25, 0.12  # [s]
+PULSE_EVERY, _PULSE = 0.25, 0.12  # period and duration of the pulses [s]
 _LEAST_RUMBLE = 0.1  # fraction of full strength; motors hardly turn below
 _CONTACT = (20.0, 60.0)
 """Contact forces at which pulses begin, and at which they are strongest [N]. Friction of the
@@ -210,8 +210,9 @@ class KeyboardState:
     """Keys held down, and the direction that they request.
 
     Terminals report presses and repeats but no releases. A press therefore counts for a short
-    time, and a held key repeats before that time is over (after a quarter to half a second at
-    first, then every 30 ms). A keyboard that falls silent requests no motion.
+    time (`_KEY_HOLDS`). A held key repeats every 30 ms, but for the first time only after a
+    quarter to half a second, so that the motion may pause once. A keyboard that falls silent
+    requests no motion.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
@@ -342,8 +343,9 @@ class HapticDevice(Human):
 
         f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
 
-    with x_arm the device position at which the pointer would be at the end effector. The axes
-    of the device are those of the base if the person faces the arm: x towards the person, z up.
+    with the device's position x, and the position x_arm of the device at which the pointer
+    would be at the end effector. The device's axes are those of the base if the person faces
+    the arm: x towards the person, z up.
 
         with HapticDevice.open(panda) as device:
             HandGuidedArm(panda, arm, device)

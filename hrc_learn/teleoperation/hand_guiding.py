@@ -1,10 +1,11 @@
-"""Hand guiding: pulls at the arm's links become null-space input d, a held end effector is
-guided, several inputs are combined and filtered, and a hand-guided arm follows them.
+"""Guide an arm by hand: pulls at the links become null-space input d, a held end effector
+follows the hand, and several inputs are combined and filtered.
 
-This is the mixed interface of the paper. There, the displacement of a joint's gizmo commands a
-proportional velocity, mapped to the joints by the pseudo-inverse of that joint's Jacobian
-(section VII), named "pinv" here. By default it is a force instead, mapped by the transpose. The
-gizmo of the end effector guides the end effector.
+This is the mixed interface of the paper, with gizmos (handles that a person drags) on joints
+and end effector. In the paper, the displacement of a joint's gizmo commands a proportional
+velocity, which the pseudo-inverse of the joint's Jacobian maps to the joints (section VII;
+"pinv" here). By default, the displacement is a force here, which the transpose maps to the
+joints. The gizmo of the end effector guides the end effector.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,9 +27,9 @@ from hrc_learn.skills.step_report import PersonFeedback, filter_hindrance
 
 ForceMapping = Literal["transpose", "pinv"]
 DEFAULT_MAPPING: ForceMapping = "transpose"
-"""Default mapping of a pull: a force. After projection into the null space, the paper's
-pseudo-inverse moves the elbow a quarter to a third as fast, and in 6 to 23 % of all directions
-against the pull (benchmarks/bench_pull_mapping.py).
+"""Default mapping of a pull: a force. Compared with it, and after projection into the null
+space, the paper's pseudo-inverse moves the elbow a quarter to a third as fast, and in 6 to 23 %
+of all directions against the pull (benchmarks/bench_pull_mapping.py).
 """
 
 
@@ -60,7 +61,7 @@ class InteractionForceConfig:
     max_force: float = 45.0
     """Largest force [N]."""
     damping: float = 3.0
-    """c_d: null-space input per velocity [N m s/rad]."""
+    """c_d of the mapping "pinv": null-space input per joint velocity [N m s/rad]."""
     max_nullspace_input: float = 20.0
     """Bound on d of each joint [N m]; d is scaled as a whole."""
     turn_rate: float = 4.0
@@ -98,8 +99,9 @@ def force_to_nullspace_input(
         d = J^T f         ("transpose")
         d = c_d J^+ v(f)  ("pinv", the paper's section VII)
 
-    The torques of a force never move the joint against the pull, not even after the projection
-    into the null space of the task; the paper's mapping can.
+    with the Jacobian J of the pulled point. The torques of a force never move this point
+    against the pull, not even after the projection into the null space of the task; the paper's
+    mapping can.
 
     Args:
         chain: The arm.
@@ -147,7 +149,7 @@ def gizmo_nullspace_input(
         joint: The joint that moves the link, counted from 1.
         point: Point at which the link is held, in the base frame [m]; the joint's origin if
             None.
-        displacement: Vector from there to the gizmo, in the base frame [m].
+        displacement: Vector from this point to the gizmo, in the base frame [m].
         config: Gains and bounds.
 
     Raises:
@@ -172,7 +174,7 @@ def guiding_twist(
         pose: Pose of the end effector.
         velocity: Requested velocity [m/s]; capped, with its direction kept.
         config: Gains and largest speeds.
-        turn: Rotation added to the rule's orientation (wxyz); None: none.
+        turn: Rotation added to the rule's orientation (wxyz); None: no rotation.
     """
     orientation = coarse_orientation(pose.position)
     if turn is not None:
@@ -206,9 +208,9 @@ class HandGuidingConfig:
     dt: float = 0.01
     """Control step [s]."""
     damping: float = 3.0
-    """c_d [N m s/rad]."""
+    """c_d: null-space input per null-space velocity [N m s/rad]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Settings of the safety filter, which knows the limits of the arm's driver."""
+    """Settings of the safety filter, which enforces the limits of the arm's chain."""
 
     __post_init__ = check_positive
 
@@ -254,9 +256,9 @@ class GuidedStep:
 class HandGuidedArm:
     """Executes a person's input at each step, within the safety filter's limits.
 
-    u = J^+ v + N c_d^-1 d is the law of the paper (eq. globalControl), with the end-effector
-    motion v from the person instead of the camera. Without a motion of the person, v is the
-    attraction to the drawn region and target.
+    The joint velocity is J^+ v + N c_d^-1 d, with the null-space projection N (paper, eq.
+    globalControl). Here, the end-effector motion v comes from the person instead of the camera.
+    If the person requests no motion, v is the attraction to the drawn region and target.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.

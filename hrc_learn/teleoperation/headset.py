@@ -1,6 +1,4 @@
-"""Scene of the page for browsers: meshes of bodies, and the files and state of the headset
-client.
-"""
+"""Prepare the scene for browsers: meshes of bodies, files and data of the headset client."""
 
 from __future__ import annotations
 
@@ -22,7 +20,8 @@ else:
     Trimesh = Any
 
 END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
-"""Bodies that move with the end effector, including the last link: dragging them guides it."""
+"""Bodies that move with the end effector, including the last link. Dragging one of them guides
+the end effector."""
 
 
 PEDESTAL = Box(
@@ -38,14 +37,14 @@ _TRIANGLES = 1500
 135,000, and a browser without a graphics processor draws it in half the time.
 """
 _AGGRESSION = 5
-"""Aggression of fast-simplification, 0 to 10. With `_TRIANGLES`, 99 % of the Panda's
-surfaces stay within 1 mm, and cable sockets within 8 mm. With its default of 7, 99 % stay
-within 3 mm.
+"""Parameter `aggression` of fast-simplification, 0 to 10. With this value and `_TRIANGLES`,
+99 % of the Panda's surfaces move by less than 1 mm, and cable sockets by less than 8 mm. With
+the default of 7, 99 % move by less than 3 mm.
 """
 
 _OFF = 0.002
-"""Largest change of a mesh's bounding box by simplification [m]. In the UR5e and the Sawyer, it
-would remove whole parts: such meshes stay as they are."""
+"""Largest change of a mesh's bounding box by simplification [m]. A mesh that would change more
+stays as it is: some meshes of the UR5e and the Sawyer would lose whole parts."""
 
 
 CLIENT = Path(__file__).parent / "xr_client"
@@ -134,7 +133,7 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
 
 
 def _held(body: Body) -> dict[str, Any]:
-    """Name and joint of a body, and capsules for picking it."""
+    """Description of a body for the client: name, joint, and capsules for picking the body."""
     capsules = [[*c.start, *c.end, c.radius] for c in body.capsules]
     # A box is picked by its bounding sphere.
     capsules += [

@@ -1,4 +1,4 @@
-"""The browser page from which a person guides the arm: a substitute for an AR headset."""
+"""Serve the browser page from which a person guides the arm, as with an AR headset."""
 
 from __future__ import annotations
 
@@ -55,15 +55,15 @@ class PageConfig(AddressConfig):
     """Gains and bounds of gizmos."""
     silence: float = 0.12
     """Time without a sign of life from the controlling client after which the arm holds still
-    until the next one [s].
+    until the next sign of life [s].
     """
     timeout: float = 0.6
     """Time without a sign of life after which everything held is released, and longest time
     that the page may be busy during a drag [s].
     """
     meshes: bool = True
-    """Draw the arm with its meshes; otherwise as capsules, with which a browser without a
-    graphics processor draws twice as many frames in AR.
+    """True draws the arm with its meshes, False with capsules. With capsules, a browser without
+    a graphics processor draws twice as many frames in AR.
     """
     touch_points: tuple[messages.Point, ...] = (
         (0.4, 0.0, 0.0),
@@ -71,7 +71,7 @@ class PageConfig(AddressConfig):
         (0.4, 0.3, 0.0),
     )
     """Points of the real workplace, in the base frame, that a person in a headset touches to
-    lay the virtual arm over the real one [m]; three at least, well apart."""
+    lay the virtual arm over the real one [m]; at least three, 10 cm apart or more."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,10 +84,10 @@ class PageConfig(AddressConfig):
             )
 
 
-# Smallest distance between touched points [m]: 1 cm off at 10 cm turns the arm by 6 degrees.
+# Smallest distance between touch points [m]: here, a touch 1 cm off turns the arm by 6 degrees.
 _APART = 0.1
 _PERIOD = 0.04
-"""Period of refreshes, which compute the efforts and draw the scene anew [s]."""
+"""Period of refreshes, which renew the person's efforts and the scene [s]."""
 _PANEL_EVERY = 5  # refreshes of the scene per refresh of the panel: text may be slower
 _MOST_FAILURES = 25
 """Number of successive failed refreshes after which the page ends: one second. A failed refresh
@@ -107,8 +107,8 @@ class Page:
                 page.show(status)
 
     The control loop spends time only in `human.read`, `place` and `show`, which exchange
-    references.
-    viser's objects are changed only in viser's own event loop, as its queues break otherwise.
+    references. viser's objects are changed only in viser's own event loop, because its queues
+    break otherwise.
 
     Attributes:
         human: Combined input of the people at the page.
@@ -233,8 +233,8 @@ class Page:
 
     @property
     def alive(self) -> bool:
-        """True while the page follows the arm. Leaving the block raises the error that stopped
-        it.
+        """True while the page follows the arm. If an error has stopped the page, leaving the
+        `with` block raises this error.
         """
         return self._error is None
 
@@ -262,7 +262,7 @@ class Page:
         return self._chain.link_poses(torch.from_numpy(state.joint_position))
 
     def _guarded(self) -> None:
-        """Refresh input and scene, periodically and at once when hands have moved."""
+        """Refresh input and scene: periodically, and as soon as hands have moved."""
         due, ticks, failures = 0.0, 0, 0
         while not self._closing.is_set():
             self._wake.wait(max(due - time.monotonic(), 0.0))
@@ -283,8 +283,10 @@ class Page:
                     return
 
     def _refresh(self) -> GizmoCommand | None:
-        """Renew the input, and the scene for clients that draw it themselves; None before the
-        first reading of the arm.
+        """Renew the person's input, and the scene for clients that draw it themselves.
+
+        Returns:
+            The command; None before the first reading of the arm.
         """
         state, links = self.human.state, self._links()
         if state is None or links is None:
@@ -398,7 +400,7 @@ class Page:
             "task": self.task,
             "pushed": feedback.pushed,
             "followed": round(feedback.followed, 3),
-            "pulse": rumble_strength(feedback),  # controllers shake as a gamepad
+            "pulse": rumble_strength(feedback),  # a headset's controllers rumble, too
             "reasons": [reason.text for reason in feedback.reasons],
             "felt": felt_words(feedback),
             "sent": self._asked,
@@ -406,11 +408,11 @@ class Page:
 
 
 def slow_words(silence: float, lag: float, config: PageConfig) -> str:
-    """Reason why a drag is not followed; empty if it is.
+    """Reason why the arm does not follow a drag; empty if it follows.
 
     Args:
         silence: Time without a sign of life from the controlling client [s].
-        lag: Time for which its page did not respond [s].
+        lag: Time for which the client's page did not respond [s].
         config: Settings of the page.
     """
     if lag > config.timeout / 2:

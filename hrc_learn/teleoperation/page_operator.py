@@ -1,4 +1,7 @@
-"""People at the page as one `Human`: what they hold by mouse or hand, and their input."""
+"""Combine the people at the page into one `Human`: held gizmos (by mouse or hand), other input.
+
+A gizmo is a link of the arm, or its end effector, as a handle that a person drags.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ _NO_TURN = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldGizmo:
-    """Gizmo held in a browser."""
+    """Gizmo that a person holds in a browser."""
 
     joint: int | None
     """Joint that moves the link held, counted from 1; None: the end effector is held."""
@@ -45,11 +48,11 @@ Key = tuple[Hashable, str]
 
 
 class HeldGizmos:
-    """All held gizmos, each until it is released or its holder leaves, and the rotation that
-    people add to the end effector's orientation with its rings.
+    """Record of all held gizmos, and of the rotation that people add to the end effector's
+    orientation with the rings of its gizmo.
 
-    That rotation stays after release, and the next drag adds to it. Safe to use from several
-    threads.
+    A gizmo is held until it is released or its holder leaves. The added rotation stays after
+    release, and the next drag adds to it. Safe to use from several threads.
     """
 
     def __init__(
@@ -81,8 +84,8 @@ class HeldGizmos:
         Args:
             key: Holder and gizmo.
             held: Joint and point held; None: the gizmo is only turned.
-            turned_from: Present orientation of its rings, from which their rotation counts
-                (wxyz); None: no rings are held.
+            turned_from: Present orientation of the gizmo's rings (wxyz), from which the added
+                rotation counts; None: no rings are held.
         """
         with self._lock:
             if held is not None:
@@ -131,7 +134,7 @@ class HeldGizmos:
     def release(self, holder: Hashable = None, name: str | None = None) -> None:
         """Release one gizmo of a holder, all gizmos of a holder, or all that are held.
 
-        After a lost connection has returned, its gizmo must be taken again.
+        Once a lost connection has returned, the person must take the gizmo again.
         """
 
         def chosen(key: Key) -> bool:
@@ -197,7 +200,8 @@ class HeadsetHands:
             guides: True if the end effector can be held.
         """
         self._held, self._guides = held, guides
-        # None: the next message only states what is held already, and moves nothing.
+        # Last grip of each hand. None: the next message only states what is held already, and
+        # moves nothing.
         self._grips: dict[str, Grip] | None = None
         self.tracked: Mapping[str, TrackedHand] = {}
 
@@ -326,7 +330,7 @@ def gizmo_command(
         config: Gains and bounds of gizmos.
         direction: Direction in which keys move the end effector, as a fraction of the largest
             speed; zero: no key is pressed.
-        turn: Rotation added to the coarse orientation rule (wxyz); None: none.
+        turn: Rotation added to the coarse orientation rule (wxyz); None: no rotation.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
     d, velocity = np.zeros(len(chain.joint_names)), config.speed * direction

@@ -1,6 +1,4 @@
-"""Sessions at the page with a simulated arm: recording demonstrations, or watching a job and
-pulling the arm's body.
-"""
+"""Run sessions at the page: record demonstrations, or watch a job and pull the arm's body."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -123,7 +121,7 @@ class PageSessionConfig:
 
 
 class PageSession:
-    """Steps the simulated arm as the person at the page asks, and records demonstrations.
+    """Steps the arm as the person at the page asks, and records demonstrations.
 
     Attributes:
         world: World of the arm.
@@ -235,7 +233,9 @@ class PageSession:
                 )
 
     def _go_home(self) -> None:
-        """Bring the arm home: without a driver it jumps, otherwise it moves straight."""
+        """Bring the arm home. Without a driver, the arm jumps; with a driver, it moves on a
+        straight line in joint space, unless that would cause a collision.
+        """
         if self._jumps:
             self.world.hold(self._workplace.scene.objects[0].name, self._home)
             self.arm.restart()

@@ -1,9 +1,10 @@
-"""Clients of the page: one of them has control, and each has two sockets.
+"""Serve the clients of the page: each has two sockets, and one client has control of the arm.
 
-The sockets are a session and a view, which viser serves.
+The sockets of a client are its session, and its view of the scene, which viser draws and
+serves.
 
-viser accepts any client that reaches its port and trusts what it receives. Its port therefore
-requires a secret, and messages reach it only through the gate.
+viser accepts any client that reaches its port, and trusts all messages. Its port therefore
+requires a secret here, and messages reach it only through the gate.
 """
 
 from __future__ import annotations
@@ -120,8 +121,8 @@ class Control:
 
         Args:
             client: Client that gives it.
-            lag: Time since its page last responded [s]: the worker gives signs of life even if
-                the page hangs.
+            lag: Time since the client's page last responded [s]. A worker in the browser gives
+                the signs of life, even if the page hangs.
         """
         with self._lock:
             if (one := self._clients.get(client)) is None:
@@ -154,8 +155,8 @@ class Control:
             self._acted = self._clock()
 
     def ask(self, client: str) -> None:
-        """Request control. The client gets it at once if it is free, else when the controlling
-        client hands over or is idle.
+        """Request control. If no client has control, this client gets it immediately; otherwise
+        when the controlling client hands over or is idle.
         """
         with self._lock:
             one = self._clients.get(client)

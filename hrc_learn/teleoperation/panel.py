@@ -1,4 +1,4 @@
-"""Panel next to the scene: status, buttons, folders of controls and settings."""
+"""Build the panel next to the scene: status, buttons, folders of controls and settings."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def panel_texts() -> Any:
     return templates.get_template("panel.html", globals=vars(palette)).module
 
 
-# Smallest contact force shown [N]: simulated joint friction feels like 17 N. Smallest change of
-# a gripper's opening that is a slip rather than noise [m].
+# `_LEAST_CONTACT`: smallest contact force shown [N]; simulated joint friction feels like 17 N.
+# `_LEAST_SLIP`: smallest change of a gripper's opening that is a slip rather than noise [m].
 _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
 
 
@@ -153,7 +153,7 @@ class Panel:
         self._latest = ""
 
     def _add_recording(self, request: Callable[[Request], None], task: str) -> None:
-        """Start, stop, save and discard demonstrations."""
+        """Add the controls that start, stop, save and discard demonstrations."""
         self._task = self._gui.add_text("Task", task)
         self._switch = self._gui.add_button("Start", color="red", icon=_ICONS["start"])
         self._switch.on_click(in_loop(lambda _: request(self._next)))
@@ -167,7 +167,7 @@ class Panel:
             self._keep = self._keep or group  # the first: save and discard
 
     def _add_end_effector(self, scene: PageScene) -> None:
-        """Move the end effector by keys, turn it, open and close it."""
+        """Add the controls that move and turn the end effector and operate the gripper."""
         fine = self._gui.add_checkbox(
             "Fine turn",
             False,
@@ -242,8 +242,8 @@ class Panel:
         Args:
             status: Status of the session.
             feedback: Feedback of the arm.
-            nullspace_input: d requested now [N m].
-            people: Browsers that show the page.
+            nullspace_input: Null-space input d requested now [N m].
+            people: Number of browsers that show the page.
         """
         texts = panel_texts()
         self._told.content = str(texts.feedback(feedback, felt_words(feedback)))

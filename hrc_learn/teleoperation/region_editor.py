@@ -1,4 +1,4 @@
-"""Drawing, moving and sizing the Cartesian region with the mouse, and marking the target."""
+"""Draw, move and size the Cartesian region with the mouse, and mark the target."""
 
 from __future__ import annotations
 
@@ -74,7 +74,8 @@ def meet_box(
         centre: Centre of the box [m].
         half_size: Half size of the box [m].
     """
-    # Parallel to a slab, both distances become huge: of one sign outside it, of two inside.
+    # For a ray parallel to a slab, both distances become huge: with equal signs if the origin
+    # is outside the slab, with opposite signs if it is inside.
     safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
     near = (centre - half_size - origin) / safe
     far = (centre + half_size - origin) / safe

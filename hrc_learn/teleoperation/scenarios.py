@@ -1,6 +1,6 @@
-"""Scenarios to learn in the simulated workplace: reset, demonstration, execution, success.
+"""Tasks to learn in the simulated workplace: set up, demonstrate, execute, and judge success.
 
-Success is read from MuJoCo's contacts and poses.
+Success is judged by MuJoCo's contacts and poses.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ _HEIGHT = 0.15  # height to which the object is lifted [m]
 _TREMOR = 2e-4  # amplitude of the end effector's tremor while it grasps [m]
 
 
-# Settings of the placing expert, and the time at which it releases the object [s].
+# `_PLACING`: settings of the placing expert. `_LET_GO`: time at which it releases the object
+# [s].
 _PLACING = PlacingDemonstrationConfig()
 _LET_GO = _PLACING.duration + _PLACING.settle
 
@@ -123,10 +124,10 @@ class Grasping:
 
 
 Scenario = Placing | Grasping
-"""Task shared by the demonstrator and the learned policy.
+"""Task of both the demonstrator and the learned policy.
 
-`begin(world, rng)` sets up the scene and returns a demonstrator for it; the clock of the world
-starts at zero. `succeeded(world)` is true if the task is done.
+`begin(world, rng)` sets up the scene, with the world's clock at zero, and returns a
+demonstrator. `succeeded(world)` is true if the task is done.
 """
 
 
@@ -187,8 +188,8 @@ class ScenarioRun:
             scenario: Task to perform.
             fps: Commands per second of the world's time.
             seed: Seed of the first initial configuration.
-            imperfections: Imperfections of arm, calibration and workplace, drawn anew for each
-                seed; None: no imperfections.
+            imperfections: Imperfections of arm, calibration and workplace, drawn for each seed
+                again; None: no imperfections.
             worker: Reaction of the arm to a worker at the table; None: no worker. Each seed
                 draws another worker.
         """
@@ -258,14 +259,14 @@ class ScenarioRun:
     def object_pixel(self) -> Float[np.ndarray, "2"]:
         """Pixel (u, v) of the object's marker in the fixed camera.
 
-        It is detected once per configuration, and never hidden by the arm.
+        The marker is detected once per configuration. The arm never hides it.
 
         Raises:
             ValueError: The object is not in view.
         """
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
-            sensor = self._sensor  # first: making its background takes random numbers
+            sensor = self._sensor  # before reseeding: its background takes random numbers
             _reseed(self._noise, [self.seed, 1])
             self._pixel = sensor.detect().get(marker)
         if self._pixel is None:
@@ -314,7 +315,7 @@ class ScenarioRun:
         """Move the fixed camera to another pose, from which it still sees the table.
 
         Args:
-            change: Displacement from its pose in the scene.
+            change: Displacement from the camera's pose in the scene.
             rng: Source of the direction.
 
         Raises:
@@ -326,7 +327,11 @@ class ScenarioRun:
         self._pixel = None
 
     def _watched(self) -> Float[np.ndarray, "points 3"]:
-        """Positions of objects on the table, and of the tool's marker at and above them [m]."""
+        """Points that the camera must see, in the base frame [m].
+
+        Corners of the objects' region on the table, and of the region of the tool's marker at
+        two heights above it.
+        """
         place = self.scenario.workplace
         middle, half = (x.numpy() for x in place.object_region())
         corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]) * half

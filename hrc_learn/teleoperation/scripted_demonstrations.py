@@ -1,5 +1,5 @@
-"""Demonstrations by the scripted expert, and their recording: visual servoing, and placing with
-the null-space posture.
+"""Demonstrate with the scripted expert, and record the frames: visual servoing, and placing
+with pulls at the elbow.
 """
 
 import math
@@ -120,10 +120,11 @@ def servo_expert(
     rng: np.random.Generator,
     turned: float = 0.0,
 ) -> ScriptedExpert:
-    """Expert that moves over the table and ends at a given point, gripper down.
+    """Expert that moves over the table and ends at the point `above` [m], gripper down.
 
-    The motions train the image Jacobian. The end points define the goal pixel of the marker and
-    the orientation of the approach.
+    On the way, the gripper turns by `turned` [rad] about the vertical. The motions train the
+    image Jacobian. The end points define the goal pixel of the marker and the orientation of
+    the approach.
     """
     middle = workplace.hover().position.numpy()
     size = workplace.robot.hand_size
@@ -267,8 +268,10 @@ def _arranged(
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
-    """Turn within reach with which the gripper closes along the object's x axis [rad], or the
-    end of the reach that is nearest to it.
+    """Turn of the gripper, within the turns that the arm can reach (`hover_turns`) [rad].
+
+    With this turn, the gripper closes along the object's x axis. If the arm reaches no such
+    turn, it is the nearest end of the range.
     """
     low, high = workplace.hover_turns
     yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
@@ -276,8 +279,8 @@ def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
     return min(turn, high) if turn - high <= low + np.pi - turn else low
 
 
-# Number of places and paths tried: a camera that sees half of the table misses all of twenty
-# places once in a million.
+# Number of object poses and of paths tried: a camera that sees half of the table misses twenty
+# random poses in a row once in a million.
 _DRAWS = 20
 # Speed of the fastest joint on the way to a filmed demonstration [rad/s].
 _LEAD_SPEED = 1.2

@@ -1,5 +1,5 @@
-"""Scripted people: one pulls the arm at given times, an expert guides the end effector
-along way points.
+"""Simulate people by scripts: one pulls the arm at given times, an expert guides the end
+effector along way points.
 """
 
 import math
@@ -48,7 +48,7 @@ class ScriptedForce:
         return s * s * (3.0 - 2.0 * s)
 
     def force(self, time: float, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Force at a time on a joint whose origin is there now [N]."""
+        """Force on the joint at a time [N]; `origin` is the joint's present position [m]."""
         pull = self.stiffness * (np.array(self.towards) - origin)
         size = float(np.linalg.norm(pull))
         return pull * self.strength(time) * min(1.0, self.max_force / max(size, TINY))
@@ -105,7 +105,7 @@ class ScriptedPerturbation(Human):
         Args:
             chain: The arm.
             forces: Pulls to exert.
-            begin: Time from which their intervals count [s]; None: from the call of `begin`.
+            begin: Time at which the script starts [s]; None: when `begin` is called.
         """
         self._chain = chain
         self.forces = tuple(forces)
@@ -200,7 +200,8 @@ class Tremor:
 _GAIN = 4.0
 
 Orientation = Callable[[Float[torch.Tensor, "3"], float], Float[torch.Tensor, "4"]]
-"""Orientation (wxyz) the end effector should have at a position [m] and time [s]."""
+"""Rule that gives the wanted orientation of the end effector (wxyz), from its position [m] and
+the time [s]."""
 
 
 class ScriptedExpert(Human):

@@ -1,4 +1,4 @@
-"""Touch of the arm itself, estimated from the external torques of its joints.
+"""Detect touches of the arm itself, from estimated external torques of its joints.
 
 A push at the elbow moves the arm in the null space, a push at the end effector pauses the task,
 and a sudden contact stops the arm. This needs no device, only estimates of external torques.
@@ -42,14 +42,14 @@ class TouchConfig:
     """
 
     elbow_force: float = 7.0
-    """Force above which a touch of the elbow begins [N]. It ends below half of this force, and
-    counts fully from twice this force on."""
+    """Force above which a touch of the elbow begins [N]. The touch ends below half of this
+    force, and has its full effect above twice this force."""
     gain: float = 2.0
     """Null-space input per null-space torque. With a damping of 3 N m s/rad, 20 N at an elbow
     that moves by 0.1 m per radian cause 0.13 m/s."""
     evidence: float = 16.0
-    """Threshold of the log evidence for a touch minus that for none. Friction reached 15 in
-    undisturbed jobs; 20 N give 25 to 600.
+    """Threshold of the log evidence for a touch minus the log evidence for no touch. Friction
+    reached 15 in undisturbed jobs; a touch of 20 N gives 25 to 600.
     """
     hand_force: float = 10.0
     """Force at the end effector above which the task pauses [N]. The touch ends below half of
@@ -59,16 +59,16 @@ class TouchConfig:
     collision_rise: float = 30.0
     """Change of force within `collision_time` that is too large for a pushing hand [N]."""
     collision_time: float = 0.04
-    """[s]"""
+    """Interval over which `collision_rise` counts [s]."""
     collision_force: float = 110.0
     """Force that stops the arm however slowly it rises [N]: the smallest quasi-static limit of
     ISO 10218-2:2025, Annex M (ISO/TS 15066:2016, table A.2), except for face and head."""
     torque_deviation: float = 0.3
     """Standard deviation of the part of each joint's torque that no bias explains [N m]."""
     smoothing: float = 0.03
-    """Time constant of the filter of the torques, before a touch is detected in them [s]."""
+    """Time constant of the filter of the torques from which a touch is detected [s]."""
     longest_touch: float = 20.0
-    """Duration after which a touch is taken for a load [s]."""
+    """Duration after which a touch counts as a load [s]."""
     gripper_settles: float = 0.5
     """Duration after a finger motion in which contact with the object is expected [s]."""
 
@@ -78,9 +78,10 @@ class TouchConfig:
 class TorqueBias:
     """Bias of the external torques of an untouched arm, estimated online.
 
-    tau = -J_z^T w + o - F tanh(dq / v), with the weight w of a load at the end effector, an
-    offset o of each joint (errors of its gravity model) and dry friction F, which changes sign
-    with the direction of motion. A Kalman filter estimates them; each is a random walk.
+    tau = -J_z^T w + o - F tanh(dq / v), with joint velocities dq and a small velocity v. J_z is
+    the Jacobian's row of vertical motion, w the weight of a load at the end effector, o an
+    offset of each joint (errors of its gravity model), and F dry friction, which changes sign
+    with the direction of motion. A Kalman filter estimates w, o and F, each a random walk.
     """
 
     # Initial standard deviations of w [N], o and F [N m]: for a load of 0.5 kg, and for the
@@ -90,8 +91,8 @@ class TorqueBias:
     # Standard deviations of their change within a second [N, N m]: loads are picked up, and the
     # error of the gravity model changes with the posture.
     _DRIFT = (0.3, 0.1, 0.03)
-    # Standard deviation of the friction of a joint at rest, relative to its size: it may take
-    # any value up to it, in either direction.
+    # Standard deviation of the friction of a joint at rest, relative to F: friction may then
+    # take any value up to F, in either direction.
     _STICKS = 0.7
 
     def __init__(self, joints: int, deviation: float):
@@ -266,9 +267,9 @@ def touched_place(
 
     Args:
         before: Place that was touched last.
-        above: Force at the elbow.
-        hand: Force at the end effector.
-        none: Evidence that nothing is touched.
+        above: Force at the elbow that explains the torques best.
+        hand: Force at the end effector that explains the torques best.
+        none: Log evidence that nothing is touched.
         config: Thresholds.
     """
     likelier = hand.evidence - above.evidence
@@ -359,10 +360,12 @@ class Touch(Human):
         )
 
     def _nobody_touches(self) -> bool:
-        """True if the arm has been untouched long enough to update the bias."""
+        """True if the bias may be updated: the arm has been untouched for long enough, or
+        touched for so long that the touch must be a load.
+        """
         if self.place != "nothing":
             self._let_go = self._time
-        # When the arm stops, friction may hide the hand that has stopped it for a while.
+        # When a hand has stopped the arm, friction may hide the hand for a while.
         if self._time - self._let_go > self._config.released:
             self._alone = self._time
         since = self._time - self._alone
@@ -377,7 +380,7 @@ class Touch(Human):
         return self._expected or since < self._config.gripper_settles
 
     def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
-        """Null-space torques [N m], faded in above the dead band."""
+        """Null-space input [N m]: zero up to `elbow_force`, full from twice this force on."""
         beyond = float(np.linalg.norm(self.force)) / self._config.elbow_force - 1.0
         gain = self._config.gain * min(max(beyond, 0.0), 1.0)
         return gain * (arm.null @ (arm.null.T @ self._felt))

@@ -136,7 +136,7 @@ def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
     """TLS context of a page on the network; None if only this machine can reach the page and
     no certificate is configured.
 
-    If none is configured, `openssl` makes a certificate, which is kept in the cache folder and
+    Without a configured certificate, `openssl` makes one. It is kept in the cache folder and
     used again while it is valid, so that browsers warn about it once.
 
     Raises:
@@ -199,7 +199,7 @@ def qr_code(text: str) -> str:
     """QR code for a terminal, dark on light, with two rows of the code per line.
 
     Args:
-        text: Encoded text.
+        text: Text to encode.
 
     Returns:
         Lines of text; empty if OpenCV cannot encode it.

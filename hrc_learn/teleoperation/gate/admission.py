@@ -1,4 +1,4 @@
-"""Admission of clients: exact hosts and origins, and the two secrets of an address."""
+"""Admit clients: check host and origin of each request, and its secret."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from hrc_learn.teleoperation.gate.address import Address, AddressConfig, network
 Right = Literal["act", "watch"]
 """Right of a client: to act on the arm or the data, or only to watch."""
 
-_WRONG_SECRETS, _FORGIVEN = 20.0, 1.0  # at once, and per second: 144 bits cannot be guessed
+# Wrong secrets allowed at once, and per second: a secret of 144 bits cannot be guessed.
+_WRONG_SECRETS, _FORGIVEN = 20.0, 1.0
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data:; frame-ancestors 'none'; form-action 'none'"
 )
-"""The page may load from and send to its own origin only, and may not be framed."""
+"""Content security policy: the page may load from and send to its own origin only, and no page
+may show it in a frame."""
 
 HEADERS = {
     "Content-Security-Policy": _POLICY,

@@ -1,8 +1,9 @@
-"""Gate for all browser traffic: page, headset, curation and dashboards.
+"""Serve all browser traffic through one gate: page, headset, curation and dashboards.
 
-The gate serves files and sockets in a thread of its own. Files of a page are public; its data
-and sockets need a secret (see `Admission`). Every socket belongs to a client, whose name
-its page draws at random, and an error of a client closes the sockets of that client only.
+The gate serves files and sockets in a thread of its own. The files of a page are public; data
+and sockets need a secret (see `Admission`). A client is a page open in a browser; it draws its
+name at random. Every socket belongs to a client, and an error of a client closes only the
+sockets of this client.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ else:
     ServerConnection = Request = Response = Any
 
 _LARGEST = 16_384  # bytes of a message: the longest of ours has 1.5 kB
-_RATE, _BURST = 400.0, 800.0  # messages a second and at once: a mouse makes 2 x 125
+_RATE, _BURST = 400.0, 800.0  # messages per second, and at once: a mouse sends 2 x 125 per s
 _HANDSHAKE = 30.0
 """Longest time from connecting to the answer [s]; the slowest answer is a block of images."""
 _SESSION_WAIT = 3.0
-"""Longest time that another socket waits for the session of its client [s]."""
-_POLL = 0.05  # period of checking for that session [s]
+"""Longest time that a socket waits until the session of its client is open [s]."""
+_POLL = 0.05  # period of checking for the session [s]
 _FAREWELL, _CLOSING = 0.5, 1.0  # longest times to send the last message, and to close [s]
 _PING, _PONG = 5.0, 10.0  # time between pings, and longest time to the answer [s]
 _TOO_MUCH, _FAILED, _FULL = 1008, 1011, 1013  # codes of the WebSocket protocol (RFC 6455)
@@ -59,7 +60,7 @@ class Content:
 
     body: bytes
     kind: str
-    """Its MIME type."""
+    """MIME type of the content."""
 
     @classmethod
     def of(cls, name: str, body: bytes) -> Content:
@@ -82,10 +83,10 @@ def folder_contents(folder: Path, prefix: str = "/static/") -> dict[str, Content
 
 @dataclass(frozen=True, kw_only=True)
 class Visitor:
-    """Client of a page."""
+    """Client of a page, with its right."""
 
     client: str
-    """Random name, drawn by its page."""
+    """Random name of the client, drawn by its page."""
     right: Right
 
 
@@ -127,8 +128,8 @@ class Gate:
         Args:
             config: Host, port and certificate.
             contents: Public content by path.
-            routes: Conversations by the first part of the path of a socket. "session" needs the
-                secret; the others need an open session of the same client.
+            routes: Conversation for each kind of socket, by the first part of the socket's
+                path. "session" needs the secret; all others need an open session of the client.
             data: Returns the content of a path for clients with a secret, or None; called in
                 threads.
 
@@ -243,10 +244,10 @@ class Gate:
         return content
 
     async def _admit(self, request: Request) -> None:
-        """Check a socket that asks to be opened.
+        """Check a request to open a socket.
 
         Raises:
-            RefusedError: It may not be opened.
+            RefusedError: The socket may not be opened.
         """
         if not self._admission.from_ours(request.headers.get("Origin", "")):
             raise RefusedError(403, "Another site may not connect.")
@@ -295,7 +296,7 @@ class Gate:
 
 
 async def first_of(*work: Awaitable[None]) -> None:
-    """Wait until one of several ends, and cancel the others."""
+    """Wait until one of several tasks ends, and cancel the others."""
     tasks = [asyncio.ensure_future(one) for one in work]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -319,7 +320,7 @@ def _path(request: Request) -> str:
 
 
 def _place(request: Request) -> tuple[str, str]:
-    """Route and client of a socket's path."""
+    """Route and name of the client, from a socket's path."""
     route, _, client = _path(request).strip("/").partition("/")
     return route, client
 

@@ -1,5 +1,4 @@
-"""Schemas of the messages that browsers may send: those of our own clients, and of viser's
-page.
+"""Schemas of all messages that browsers may send, from our own clients and from viser's page.
 
 A message that fits no schema raises `MessageError`. Decoders parse no deeper than the schema.
 """
@@ -49,7 +48,7 @@ class Beat(_Message, tag="beat"):
     """A sign of life, several times a second."""
 
     lag: _Time
-    """Time since the page last responded [s]."""
+    """Time since the page last responded to its worker, which sends these messages [s]."""
 
 
 class Hello(_Message, tag="hello"):
@@ -85,7 +84,7 @@ class Gripper(_Message, tag="gripper"):
 
 
 class Region(_Message, tag="region"):
-    """Drawn box."""
+    """Drawn box; an active one attracts the end effector."""
 
     centre: Point
     half_size: tuple[_Positive, _Positive, _Positive]
