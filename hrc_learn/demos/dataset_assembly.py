@@ -3,7 +3,7 @@
 A recording is a folder `NAME.recording/`. Its file `recording.json` holds an identifier and, if
 the recording extends a dataset, the number of episodes of this dataset. The finished dataset
 keeps the identifier of its recording. If a program finishes the dataset but stops before it
-removes the recording, the equal identifiers show that the dataset holds all its episodes.
+removes the recording, the equal identifiers show that the dataset holds the recorded episodes.
 """
 
 import itertools

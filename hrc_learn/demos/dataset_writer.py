@@ -324,7 +324,7 @@ class DatasetWriter:
         return self.episodes - 1
 
     def _write(self, episode: recorded.Episode, task: str) -> tuple[tuple[str, ...], int]:
-        """Write an episode and its images; return its quantities by name and its length."""
+        """Write an episode and its images; return its quantity names and its length."""
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
         episode = recorded.complete(episode, self.fps)

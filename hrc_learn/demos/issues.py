@@ -144,7 +144,7 @@ class ValidationReport:
             self.errors.append(error.issue)
 
     def attempt[T](self, read: Callable[[], T]) -> T | None:
-        """Result of a step of the check, or None and an error in the report if it fails.
+        """Result of a step of the check. If the step fails: None, and an error in the report.
 
         Foreign data can fail in unforeseen ways; the check reports them instead of crashing.
         """

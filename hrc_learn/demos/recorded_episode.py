@@ -35,7 +35,7 @@ class RecordedColumn:
     given: str
     """Keyword that gives the quantity: a field of `Demonstration`, or a feature key."""
     role: str | None
-    """Role under which the reader finds it; None for a user-defined feature."""
+    """Role under which readers find the quantity; None for a user-defined feature."""
     key: str
     """Feature of the dataset that holds the quantity."""
     names: tuple[str, ...]
@@ -243,7 +243,7 @@ def write_episode(
     statistics: Statistics | None = None,
     provenance: str = "",
 ) -> None:
-    """Write one episode; `path` exists only once it is complete and on disk.
+    """Write one episode; `path` exists only once the file is complete and on disk.
 
     Args:
         path: File, as in `episode_path`.

@@ -32,7 +32,8 @@ _SHORTEST = 0.5
 _SAME_CLOCK = 0.5
 """Largest difference between stamps and times of reception if both use one clock [s]."""
 _BURST = 2e-4
-"""Median interval between messages below which all were written together afterwards [s]."""
+"""Smallest median interval between messages of a running robot [s]. Messages that were written
+together after the motion are closer."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
 
 
@@ -284,7 +285,7 @@ def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
 
 
 def _during(fields: Mapping[str, Field], start: float, stop: float) -> dict[str, Field]:
-    """Each field from its last frame up to `start` to its last frame up to `stop` [s]."""
+    """Fields between two times [s]; each also keeps its last frame at or before `start`."""
     found = {}
     for name, one in fields.items():
         time = fields[one.clock or name].numbers()[:, 0]

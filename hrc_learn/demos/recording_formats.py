@@ -109,7 +109,7 @@ def read_parquet(path: Path) -> list[Recording]:
 
 
 def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
-    """Episodes of a .npz file, or of a .npy file, whose columns may be given names."""
+    """Episodes of a .npz or .npy file; `columns` names the columns of a .npy file."""
     arrays, details = dict(_numpy_arrays(path)), {}
     _attributes({n: a[()] for n, a in arrays.items() if not a.shape}, details)
     if UNNAMED in arrays:
@@ -118,7 +118,7 @@ def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
 
 
 def _numpy_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays of a file, whose format is found by its content, not by its suffix."""
+    """Names and arrays of a .npz or .npy file; the content tells the format, not the suffix."""
     name = None
     with path.open("rb") as stream:
         single = stream.read(6) == b"\x93NUMPY"

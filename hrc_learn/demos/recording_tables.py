@@ -90,7 +90,7 @@ def _split(line: str, delimiter: str) -> list[str]:
         return line.split()
     fields = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     fields = [field.strip() for field in fields]
-    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields  # no empty end
+    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields  # without an empty end
 
 
 def _is_number(field: str) -> bool:
@@ -126,7 +126,7 @@ def _parsed(
         text = f"{place} does not hold {len(names)} numbers separated by {delimiter!r}"
         raise DatasetError(text, file=path) from error
     for name, column in zip(table.column_names, table.columns, strict=True):
-        # A column of text begins with text; a word among numbers is damage.
+        # A column of text begins with text. A word after numbers is an error in the file.
         words = column.to_pylist() if pa.types.is_string(column.type) else ["text"]
         wrong = [k for k, word in enumerate(words) if word is None or not _is_number(word)]
         if not wrong:

@@ -99,7 +99,7 @@ def _segments_v3(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment
 
 
 def _segments_v2(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment]]:
-    """The same for versions 2.0 and 2.1, which keep one file per episode and camera."""
+    """As `_segments_v3`, for versions 2.0 and 2.1 with one file per episode and camera."""
     size = int(folder.info.get("chunks_size", 1000))
     for entry in folder.episodes:
         places = places_v2(entry.index, size)

@@ -282,7 +282,7 @@ def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
                 other = quantities["command_position"] / edit.turn("command_position")
                 fixed |= _turns(other).any(0)
             smooth[:, fixed] = values[:, fixed]
-        # Conversion changes the last digit of rotation vectors: this is no change.
+        # Conversion alters the last digit of rotation vectors: do not count this as a change.
         changed = np.abs(smooth - values).max(0) > 1e-6 * turn
         smooth[:, ~changed] = values[:, ~changed]
         if changed.any():

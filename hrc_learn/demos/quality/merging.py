@@ -53,7 +53,7 @@ def merge_datasets(
     Args:
         paths: The datasets, two or more. They are not changed.
         out: Folder of the new dataset, which must not exist.
-        fps: Rate to which datasets of other rates are resampled [1/s]; None refuses these.
+        fps: Rate to which datasets of other rates are resampled [1/s]; None refuses them.
         videos: Keep the videos; they are copied without re-encoding.
 
     Raises:

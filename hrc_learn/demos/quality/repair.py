@@ -348,7 +348,7 @@ class _Repair:
         return read_each(self.folder, self.folder.episodes, self.folder.numbers)
 
     def episodes(self, progress: Progress | None) -> Iterator[copying.Rewritten]:
-        """Repaired episodes; the report counts them, and those that are left out."""
+        """Repaired episodes; the report counts them and lists the episodes left out."""
         report = self.report
         entries = progress(self.folder.episodes) if progress else self.folder.episodes
         for entry, frames in zip(entries, self._read(), strict=True):

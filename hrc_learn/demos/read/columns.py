@@ -196,7 +196,7 @@ def column_places(
         role: Quantity that takes the columns.
         text: The text.
         features: Features by key.
-        file: File that declares them, for messages.
+        file: File that declares the features, for messages.
 
     Raises:
         DatasetError: There is no such column, or there are several.
@@ -235,7 +235,7 @@ def feature_key(
     file: str | Path,
     components: Sequence[str] = (),
 ) -> str:
-    """Feature with this key, or the only one whose path ends in it, as in `column_places`.
+    """Feature with this key, or the only feature with a path that ends in it.
 
     Raises:
         DatasetError: There is no such feature, or there are several, or several components.
