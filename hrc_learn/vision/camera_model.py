@@ -64,8 +64,8 @@ class CameraModel:
         Args:
             eye: Camera centre in the base frame [m].
             target: Point to look at in the base frame [m].
-            roll: Turn about the optical axis [rad]. At zero the base's z axis points up in
-                the image, or its x axis where the camera looks straight up or down.
+            roll: Turn about the optical axis [rad]. At zero, the base's z axis points up in the
+                image; if the camera looks straight up or down, the base's x axis points up.
         """
         z = target - eye
         distance = float(np.linalg.norm(z))
@@ -99,8 +99,8 @@ class CameraModel:
             points: Positions in the base frame [m].
 
         Returns:
-            (u right, v down) [px]. Points outside the image get the pixel that they would have;
-            `in_view` finds the points inside.
+            (u right, v down) [px]. Points outside the image get the pixel that they would have
+            in a larger image; `in_view` finds the points inside.
         """
         p = self.to_camera(points)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -130,7 +130,7 @@ class CameraModel:
         # Ten steps of the fixed point are enough for common lenses, thirty for wide ones.
         steps = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
         points, lens = pixels.reshape(-1, 1, 2), np.array(self.distortion)
-        # OpenCV 5 has one function for both.
+        # In OpenCV 5, `undistortPoints` also replaces `undistortPointsIter`.
         undistort: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
         found = undistort(points, self.matrix, lens, R=None, P=None, criteria=steps)
         return np.asarray(found).reshape(pixels.shape)
@@ -140,7 +140,7 @@ class CameraModel:
         p = self.to_camera(points)
         u, v = np.moveaxis(self.project(points), -1, 0)
         inside = (u >= -0.5) & (u <= self.width - 0.5) & (v >= -0.5) & (v <= self.height - 0.5)
-        # Far outside the image the distortion polynomial may fold points back into it.
+        # Far outside the image, the distortion polynomial may fold points back into the image.
         r = np.hypot(p[..., 0], p[..., 1])
         return np.asarray(inside & (r <= self.view_radius * p[..., 2]))
 
@@ -180,7 +180,7 @@ class CameraModel:
         p, still, lens = self.to_camera(point), np.zeros(3), np.array(self.distortion)
         if not p.size:  # OpenCV returns nothing
             return np.zeros((*p.shape[:-1], 2, 6))
-        # The derivative with respect to a shift of all points is that for each point.
+        # A common shift of all points moves each pixel as a shift of its own point would.
         _, slope = cv2.projectPoints(p.reshape(-1, 3), still, still, self.matrix, lens)
         slope = np.asarray(slope[:, 3:6], dtype=float).reshape(*p.shape[:-1], 2, 3)
         J_point = slope @ self.pose[:3, :3].T

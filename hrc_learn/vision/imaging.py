@@ -1,8 +1,8 @@
 """Realistic images, with lens distortion, blur and sensor noise, and a camera without OpenGL.
 
-The camera draws only markers, by exact ray casting into a static background: they are enough
-for visual servoing and take a fraction of a renderer's time. Sweeps and machines without OpenGL
-use this camera in place of the simulator's.
+The camera draws only markers, by exact ray casting into a static background. Markers are enough
+for visual servoing, and drawing them takes a fraction of a renderer's time. Sweeps and machines
+without OpenGL use this camera in place of the simulator's.
 """
 
 import zlib
@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, UInt8
 from hrc_learn.vision.camera_model import NONE, CameraModel, Coefficients
 from hrc_learn.vision.markers import PLATE_MODULES, Marker, marker_texture
 
-# Number of noise samples drawn for an image; rows are random windows of them (see `_noise`).
+# Number of noise samples drawn for an image; each row takes a random window of them (`_noise`).
 _POOL = 1 << 16
 
 
@@ -49,9 +49,9 @@ class ImageNoise:
         return image.copy() if self.blur == 0 else image
 
     def _noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        """Gaussian noise, int16, whose rows are random windows of one pool of samples.
+        """Gaussian noise (int16) in which each row is a random window of one pool of samples.
 
-        Independent samples for a 1440x1080 frame cost 50 ms, this costs 2 ms. Rows reuse
+        Independent samples for a 1440x1080 frame cost 50 ms, windows of a pool 2 ms. Rows reuse
         samples at random shifts, which no corner detector can notice. Parts of a frame smaller
         than the pool get independent samples.
         """
@@ -65,10 +65,10 @@ class ImageNoise:
 
 
 class Lens:
-    """Turns the image of an ideal pinhole, which renderers make, into that of a camera.
+    """Turns the image of an ideal pinhole camera into the image of a camera with a lens.
 
-    Render `pinhole`, then `apply` the lens. With barrel distortion, a lens sees more than a
-    pinhole of the same size, so `pinhole` is wider.
+    Renderers make pinhole images: render `pinhole`, then `apply` the lens. With barrel
+    distortion, a lens sees more than a pinhole of the same size, so `pinhole` is wider.
 
     Attributes:
         model: The camera to imitate.
@@ -103,7 +103,7 @@ class Lens:
 
 
 def pixel_rays(model: CameraModel) -> Float32[np.ndarray, "h w 2"]:
-    """Normalised (x/z, y/z) direction seen by every pixel, to 1e-3 px."""
+    """Normalised (x/z, y/z) direction seen by every pixel, accurate to 1e-3 px."""
     return _rays((model.height, model.width), model.focal, model.principal, model.distortion)
 
 
@@ -128,7 +128,8 @@ MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 _MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
 # Grey levels of a lit print: white is not 255, black not 0.
 _PAPER, _INK = 235.0, 25.0
-# Texels along the longer edge of a print, and of a table.
+# `_PRINT`: texels along the longer edge of a carton's print.
+# `_WOOD`: texels along each edge of a picture of wood grain.
 _PRINT, _WOOD = 512, 1024
 # A plate closer to the camera plane than this is not drawn: its projection diverges [m].
 _NEAR = 0.02
@@ -156,7 +157,7 @@ class SyntheticCamera:
         Args:
             model: Camera, with its pose and lens.
             markers: The markers that may appear.
-            poses: Called at each frame; ids it leaves out are not drawn.
+            poses: Called at each frame; markers without a pose are not drawn.
             rng: Source of the noise.
             noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
             hidden: Called at each frame; returns the ids that are occluded.
@@ -173,7 +174,7 @@ class SyntheticCamera:
         self._canvas = self._clean.copy()  # equals `_clean` between frames
         self._rays = pixel_rays(model)
         self._textures = {id: _octaves(id) for id in self.markers}
-        # Wide enough for the blur of a plate's edge to end inside the region redrawn.
+        # Wide enough that the blur of a plate's edge ends inside the redrawn region.
         self._margin = 2 + int(np.ceil(3 * self._noise.blur))
 
     def read(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -269,7 +270,7 @@ def table_top(width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
 def carton(
     name: str, colour: tuple[float, float, float, float]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Print of a carton, which depends on its name: stripes, a badge and words."""
+    """Print of a carton: stripes, a badge and words, all drawn from the carton's name."""
     import cv2
 
     rng = np.random.default_rng(zlib.crc32(name.encode()))
@@ -303,7 +304,10 @@ def wood_grain(rng: np.random.Generator) -> UInt8[np.ndarray, "side side 3"]:
 
 
 def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
-    """Opacity-weighted grey and opacity of a plate with a transparent border, by resolution."""
+    """Textures of a plate with a transparent border, one for each of `_MODULE_PIXELS`.
+
+    Channels are grey level times opacity, and opacity.
+    """
     octaves = []
     for module in _MODULE_PIXELS:
         white = marker_texture(id, module * PLATE_MODULES) / 255.0
@@ -314,7 +318,10 @@ def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
 
 
 def _octave(plate_pixels: Float[np.ndarray, "4 2"]) -> int:
-    """Index of the texture resolution nearest to that of the image: edges are a pixel soft."""
+    """Index of the texture with a resolution nearest to that of the plate in the image.
+
+    Edges in the image are then about one pixel soft.
+    """
     edges = np.linalg.norm(plate_pixels - np.roll(plate_pixels, 1, axis=0), axis=1)
     octave = np.log2(max(edges.mean() / PLATE_MODULES, 1.0))
     return min(int(np.rint(octave)), len(_MODULE_PIXELS) - 1)

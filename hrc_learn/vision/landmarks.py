@@ -1,9 +1,9 @@
 """Detection of tool and objects without markers, by SIFT features (Lowe 2004).
 
-A tool is a cloud of points fixed to a link of the arm; its pixel is that of one place on the
-link, computed by perspective-n-point from all matching points. An object is a set of reference
-views; the similarity between one view and the image gives the object's pixel and direction.
-Every finding has a covariance; None means that nothing was found.
+A tool is a cloud of points fixed to a link of the arm. The detector reports the pixel of one
+reference point on the link, computed by perspective-n-point from all matching points. An object
+is a set of reference views; the similarity transform from one view to the image gives the
+object's pixel and direction. Every finding has a covariance; None means that nothing was found.
 """
 
 from __future__ import annotations
@@ -20,27 +20,28 @@ ASIDE = 0.06
 """Largest distance of an object from where it is expected, as a fraction of image width."""
 RATIO = 0.8
 """Largest ratio of the distances to the best and to the second best descriptor."""
-# Points of a tool closer than this are views of one point [m].
+# Points of a tool closer together than this count as views of the same point [m].
 _SAME_POINT = 0.006
-# Largest error of a match [px] in an image of 1440x1080, and its width, to scale for others.
+# `_REACH`: largest error of a match [px at the image width `_WIDTH`].
+# `_WIDTH`: image width for which such lengths are given [px].
 _REACH, _WIDTH = 5.0, 1440
-# Fewest points that agree on a tool, and on an object.
+# Fewest points that must agree on a tool (`FEWEST_POINTS`) and on an object.
 FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
-# RANSAC samples of four matches each: in clutter, only one match in ten may be right.
+# Number of RANSAC samples of four matches each: in clutter, only one match in ten may be right.
 _TRIALS = 5000
-# Least standard deviation of a feature's place [px].
+# Least standard deviation of a feature's position in the image [px].
 _LEAST_NOISE = 0.15
-# Range of an object's size relative to its view.
+# Range of an object's size in the image, relative to its size in the view.
 _SCALES = (0.5, 2.0)
-# Margin around the last finding that is searched first [px in an image of `_WIDTH`].
+# Margin around the last finding that is searched first [px at the image width `_WIDTH`].
 _MARGIN = 70
 # Number of images between full-resolution searches for items that stay unseen.
 _CLOSE_LOOK_EVERY = 5
 # Only images wider than this are searched at half resolution [px].
 _LARGE = 960
 
-# Change of grey level from which on a pixel counts as changed, and width by which such areas
-# are dilated [px].
+# `_CHANGED`: a pixel counts as changed if its grey level changes by more than this.
+# `_GROWN`: width of the square with which areas of changed pixels are dilated [px].
 _CHANGED, _GROWN = 14, 9
 
 Grey = UInt8[np.ndarray, "height width"]
@@ -94,7 +95,7 @@ class Features:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Place of a tool or an object in an image."""
+    """Position of a tool or an object in an image."""
 
     pixel: Float[np.ndarray, "2"]
     """(u, v) [px]."""
@@ -115,13 +116,13 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Tool:
-    """Points on a link, and the place whose pixel is reported for the tool."""
+    """Points on a link, and the reference point that is reported as the tool's position."""
 
     points: Float[np.ndarray, "n 3"]
     """Points in the frame of the link [m]."""
     descriptors: UInt8[np.ndarray, "n 128"]
     place: Float[np.ndarray, "3"]
-    """Reported place in the frame of the link [m]."""
+    """Reference point in the frame of the link [m]; its pixel is reported."""
     optics: tuple[float, float, float, float]
     """Focal length [px], principal point (u, v) [px] and radial coefficient of the camera."""
 
@@ -172,7 +173,7 @@ class Tool:
         return Finding(pixel=pixel[0, 0], covariance=covariance, points=pixels[kept])
 
     def _matches(self, seen: Features) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """Indices of features, and of the points that they match better than any other."""
+        """Indices of features, and of the tool's points that they match clearly best."""
         if min(len(seen.pixels), len(self.points)) < FEWEST_POINTS:
             return np.zeros(0, int), np.zeros(0, int)
         # Other views of the same point do not compete with the best match.
@@ -199,7 +200,7 @@ class Object:
 
 
 def match_view(view: Features, seen: Features, width: int) -> Finding | None:
-    """Place of a view's origin in an image, and direction of its first axis; None: not found.
+    """Pixel of a view's origin and direction of its first axis in an image; None: not found.
 
     Args:
         view: Features of the view.
@@ -250,7 +251,7 @@ def nearest(
     Args:
         own: Descriptors.
         others: Descriptors that are compared with them.
-        count: Number of the nearest; with fewer others, the last one is repeated.
+        count: Number of nearest descriptors; if there are fewer, the last one is repeated.
     """
     a, b = own.astype(np.float32), others.astype(np.float32)
     square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
@@ -289,10 +290,10 @@ class Landmarks:
 
 
 class LandmarkDetector:
-    """Finds landmarks in a stream of images, first near the place of the last finding.
+    """Finds landmarks in a stream of images, first near their last position.
 
     Items not found there are searched for in the whole image, at half resolution and now and
-    then at full resolution; places are always refined at full resolution.
+    then at full resolution. Findings are always refined at full resolution.
     """
 
     def __init__(self, landmarks: Landmarks):
@@ -303,7 +304,7 @@ class LandmarkDetector:
     def find(
         self, image: UInt8[np.ndarray, "height width 3"], names: Sequence[str]
     ) -> dict[str, Finding]:
-        """Findings by name, `tool` or that of an object; what is not found is left out.
+        """Findings by name (`tool`, or an object's name), without items that are not found.
 
         Raises:
             ValueError: The image differs in size from the images of the demonstrations.
@@ -345,11 +346,11 @@ def _refined(item: Tool | Object, image: np.ndarray, near: Finding | None) -> Fi
 
 
 def draw_finding(image: UInt8[np.ndarray, "height width 3"], finding: Finding) -> None:
-    """Draw features, their outline, the place with two standard deviations, and a direction.
+    """Draw features, their outline, the pixel with two standard deviations, and a direction.
 
     Args:
-        image: RGB, drawn on in place.
-        finding: What was found in it.
+        image: RGB image, which is changed in place.
+        finding: Finding in this image.
     """
     import cv2
 

@@ -102,8 +102,9 @@ class MarkerDetector:
     A marker is searched for near its last position, then in the whole image at half resolution,
     and only then at full resolution; corners are always refined at full resolution. This takes
     a fraction of the time of a plain search and is no less accurate. While a marker stays
-    unseen, full resolution is tried on every few images only. If two markers in an image have
-    the same id, neither is reported, with a warning, unless just one is near the last position.
+    unseen, full resolution is tried only once in a few images. If two markers in an image have
+    the same id, a warning is given and neither is reported, unless exactly one of them is near
+    the last position.
     """
 
     def __init__(self, ids: Iterable[int]):
@@ -120,8 +121,8 @@ class MarkerDetector:
         parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
         # Lines fitted to the contour keep the rough corners within reach of the refinement.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
-        # The outline of the white plate is a square too. At the default distance it hides the
-        # marker within it when both lie near the edge of the image.
+        # The outline of the white plate is a square too. At the default minimum distance, this
+        # square hides the marker inside when both lie near the edge of the image.
         parameters.minMarkerDistanceRate = 0.05
         self._aruco = cv2.aruco.ArucoDetector(dictionary(), parameters)
         self._last: dict[int, Corners] = {}
@@ -136,8 +137,8 @@ class MarkerDetector:
 
         Args:
             image: RGB or grey.
-            ids: Those of the detector's markers that matter now; None: all of them. A marker
-                that is out of sight costs a search of the whole image.
+            ids: The detector's markers to search for in this image; None: all of them. A
+                marker that is out of sight costs a search of the whole image.
         """
         wanted = self.ids if ids is None else self.ids.intersection(ids)
         found: dict[int, Corners] = {}
@@ -205,7 +206,7 @@ def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
 
 def angle(corners: Float[np.ndarray, "4 2"]) -> float:
     """Direction of a marker's x axis in the image, from u towards v [rad]."""
-    # The mean of its upper and its lower edge.
+    # Sum of the directions of the marker's upper and lower edge.
     u, v = corners[1] - corners[0] + corners[2] - corners[3]
     return float(np.arctan2(v, u))
 
