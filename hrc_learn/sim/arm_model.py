@@ -38,8 +38,8 @@ FINGER_STROKE = 0.04
 """Travel of one finger [m]; the gripper opens to twice this."""
 
 
-_THICKNESS = 0.002  # of a plate [m]
-_TEXELS = 400  # texels along its edge: a whole number for each of the 8 modules
+_THICKNESS = 0.002  # thickness of a marker plate [m]
+_TEXELS = 400  # texels along a plate's edge: a whole number for each of the 8 modules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
             f"{name}_plate",
             (half, half, _THICKNESS / 2),
             (0.9, 0.9, 0.9, 1.0),
-            # Just below the picture, or the two would flicker through each other.
+            # Just below the picture: in one plane, box and picture would flicker.
             pos=np.array(plate.position) - 0.75 * _THICKNESS * normal,
             quat=plate.orientation,
             mass=0.02,
@@ -156,7 +156,7 @@ class ArmModelConfig:
     def armature(self, joint: int) -> float:
         """Inertia of the motor and its gear, at the joint [kg m^2]."""
         torque = self.torque(joint)
-        # Small motors have lighter rotors; from 50 N m on, the Panda's inertia is assumed.
+        # Small motors have lighter rotors; at 50 N m and above, the Panda's inertia is assumed.
         return 0.1 * min(1.0, torque / 50.0) if self.robot.name not in _SERVOS else 0.1
 
 
@@ -164,7 +164,7 @@ _SERVOS = dict.fromkeys(
     ("panda", "fr3"),
     ((2e4, 2e4, 1.5e4, 1.5e4, 6e3, 6e3, 4e3), (600.0, 600.0, 450.0, 450.0, 150.0, 150.0, 80.0)),
 )
-"""Gains of Franka's arms."""
+"""Position gains [N m/rad] and velocity gains [N m s/rad] of the joints of Franka's arms."""
 _STIFFNESS, _DAMPING = 230.0, 0.03
 """Servo gains of other arms, scaled from the Panda's strongest joint: stiffness per torque
 [1/rad] and damping per stiffness [s].
@@ -381,7 +381,7 @@ class MujocoArm:
         # the link masses that the arm assumes.
         own = model.body_rootid == model.body("link0").id
         self._unknown = np.where(own, model.body_mass * (1.0 - model.body_gravcomp), 0.0)
-        # Filtered estimate of the external torques [N m]; None: the filter starts anew.
+        # Filtered estimate of the external torques [N m]; None: the filter has no value yet.
         self._felt: np.ndarray | None = None
         # Position errors at which the servos' torques saturate [rad].
         strongest = model.actuator_forcerange[self._position_servos, 1]
@@ -402,8 +402,8 @@ class MujocoArm:
     def _external_torque(self) -> Float[np.ndarray, " joints"]:
         """External torque as estimated from joint torque sensors [N m].
 
-        It contains contacts, external forces, joint friction (which such arms do not model
-        well) and weights that are unknown to the arm.
+        The estimate contains contacts, external forces, joint friction (which real arms do not
+        model well) and weights that are unknown to the arm.
         """
         data = self._data
         torque = data.qfrc_constraint + data.qfrc_applied
@@ -427,7 +427,7 @@ class MujocoArm:
         )
 
     def place(self, joint_position: Float[np.ndarray, " joints"], gripper_width: float) -> None:
-        """Set the joints at once, at rest. For resets, not for control."""
+        """Put the joints at given positions, at rest; for resets, not for control."""
         self._reference = np.array(joint_position, dtype=float)
         self._channel.rest()
         self._felt = None
@@ -441,8 +441,8 @@ class MujocoArm:
     def drive(self) -> None:
         """Advance the servos' reference by one physics step.
 
-        The reference leads each joint at most by the error at which its servo saturates, so a
-        joint that a contact blocked does not make up for the missed motion afterwards.
+        The reference is ahead of each joint by at most the error at which the joint's servo
+        saturates. So a joint that a contact blocked does not make up for the missed motion.
         """
         q = self._data.qpos[self.joints]
         dt = self._model.opt.timestep

@@ -1,5 +1,7 @@
-"""Cameras of the workplace, rendered by OpenGL without a screen or drawn without OpenGL, and
-disturbances: a camera that is moved or refocused, and a marker that is occluded.
+"""Cameras of the workplace and their disturbances.
+
+Images are rendered by OpenGL without a screen, or drawn without OpenGL. Disturbances are a
+camera that is moved or refocused, and a marker that is occluded.
 """
 
 from __future__ import annotations
@@ -114,7 +116,7 @@ class OffscreenRenderer:
 
 def _free(gl, context: mujoco.MjrContext) -> None:
     # OpenGL frees objects of the current context by number. If the context of another renderer
-    # were current, its objects would be freed and its images black from then on.
+    # were current, the other renderer would lose its objects and return black images.
     gl.make_current()
     context.free()
     gl.free()
@@ -319,7 +321,12 @@ class ChangingCamera:
         return self.history[-1][1]
 
     def change(self, time: float, model: CameraModel) -> None:
-        """Use another camera from a time on [s]."""
+        """Use another camera from now on.
+
+        Args:
+            time: Time of the change [s].
+            model: Model of the new camera.
+        """
         self._camera = self._open(model)
         self.history.append((time, model))
 

@@ -29,7 +29,8 @@ RIGHT = 1
 """Number of the hand that holds the object (0 left, 1 right)."""
 HELD_OUT = np.array([0.0, -0.09, -0.03])
 """Offset from the grip of the hand to the middle of an object held by its near end, in the base
-frame [m]; the worker faces -y. It is large, as a hand's capsule is thicker than fingers.
+frame [m]; the worker faces -y. The offset is large because the hand's capsule is thicker than
+fingers.
 """
 BENCH, BACK, HAND_OVER = "to the bench", "back", "hand over"
 """Kinds of hand movements."""
@@ -39,13 +40,14 @@ UNHURRIED = HumanSpeeds(reaching=0.9)
 takes about a second.
 """
 
-# Ranges of distance from the bench's edge and of height above the bench at which the object is
-# held out [m]: a forearm's length over the bench, at the height of the elbow.
+# The object is held out at this distance from the bench's edge (`_OVER_BENCH`) and this height
+# above the bench [m]: a forearm's length over the bench, at the height of the elbow.
 _OVER_BENCH, _HEIGHT = (0.26, 0.42), (0.24, 0.36)
-# Range of the object's x relative to the worker, whose right is -x, and range of x that an arm
-# reaches well [m].
+# `_ASIDE`: range of the object's x relative to the worker, with -x to the worker's right [m].
+# `_WITHIN`: range of the object's x that the robot reaches well [m].
 _ASIDE, _WITHIN = (-0.22, 0.04), (0.08, 0.42)
-# Largest lean while holding an object out [rad]; places tried until one is within reach.
+# `_LEANS`: largest lean of the trunk while the worker holds an object out [rad].
+# `_TRIED`: number of places tried until one is within the worker's reach.
 _LEANS, _TRIED = 0.45, 200
 # Speed of the final approach to the gripper, as a fraction of that of other movements.
 _CAREFUL = 0.3
@@ -95,7 +97,9 @@ class HandOver:
         return self.visit.worker.grip(ends, RIGHT) + HELD_OUT
 
     def brought_to(self, place: Float[np.ndarray, "3"], now: float) -> HandOver:
-        """Move the object to a place [m] from a time on [s], as far as the arm reaches."""
+        """Handover continued at time `now` [s]: the worker moves the object to a place [m], or
+        as near to this place as the worker reaches.
+        """
         visit, last = self.visit, self._last()
         target = in_worker_frame(visit.worker, last.place, last.heading, place - HELD_OUT)
         lean = visit.worker.lean_to(target, RIGHT)
@@ -107,7 +111,7 @@ class HandOver:
         return self._continued(script)
 
     def left(self, now: float) -> HandOver:
-        """Release the object and walk away, from a time on [s]."""
+        """Handover ended at time `now` [s]: the worker releases the object and walks away."""
         visit, last = self.visit, self._last()
         worker = visit.worker
         script = PoseWriter(last, now, self.speeds, worker.config.stature)

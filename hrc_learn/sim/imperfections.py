@@ -1,6 +1,6 @@
 """Imperfections of a simulated work cell: arm, calibration, camera, objects.
 
-`Imperfections` holds the size of the errors, `Imperfections.draw` draws the errors of one run.
+`Imperfections` holds the sizes of the errors; `Imperfections.draw` draws the errors of one run.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from hrc_learn.vision import ImageNoise
 _MOST_OBJECTS = 8
 # Constant lag of the simulated servos [s]: compensation reduces path errors from 1.5 to 0.4 mm.
 _SIMULATED_SERVOS = 0.01
-# Time from a control step to full braking of the arm [s]; distance by which person and arm may
-# protrude from their capsules, including the arm's calibration error [m].
+# `_RAMP`: time from a control step to full braking of the arm [s].
+# `_BEYOND_CAPSULES`: distance by which person and arm may protrude from their capsules [m],
+# including the arm's calibration error.
 _RAMP, _BEYOND_CAPSULES = 0.02, 0.05
 _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
@@ -44,7 +45,7 @@ class Imperfections:
     command_delay: float = 0.020
     """Delay between a command and the motion of the servos [s]."""
     command_jitter: float = 0.002
-    """Standard deviation of that delay from one command to the next [s]."""
+    """Standard deviation of `command_delay` from one command to the next [s]."""
     servo_lag: float = 0.010
     """Time constant with which the servos follow a changed velocity [s]."""
     slowness: float = 0.3
@@ -60,7 +61,7 @@ class Imperfections:
     torque_noise: float = 0.2
     """Standard deviation of an estimated external joint torque [N m]."""
     torque_lag: float = 0.010
-    """Time constant of the low-pass filter of that estimate [s]."""
+    """Time constant of the low-pass filter of the torque estimate [s]."""
     base_error: float = 1e-3
     """Range of the base's position error along each axis [m]."""
     base_turn: float = 1e-3
@@ -212,7 +213,7 @@ class DrawnImperfections:
         hand.pos = hand.pos + shift
         hand.quat = _turned(hand.quat, self.tool_turn)
         if self.payload > 0:
-            # At the palm, as a small sphere: the inertia matters less than the mass.
+            # The load is a small sphere at the palm: its inertia matters less than its mass.
             load = hand.add_body(name="payload", pos=(0.0, 0.0, 0.03))
             load.add_geom(
                 name="payload",
@@ -244,9 +245,9 @@ class DrawnImperfections:
 
 
 class CommandChannel:
-    """Delays commands on their way to an arm: each by its own delay, but in their order.
+    """Delays each command to an arm by a random time, but keeps the order of the commands.
 
-    The arm then follows with its servos' lag and its driver's acceleration limits.
+    The arm then follows with the lag of its servos and the acceleration limits of its driver.
     """
 
     def __init__(self, drawn: DrawnImperfections, acceleration: Float[np.ndarray, " joints"]):
@@ -277,7 +278,7 @@ class CommandChannel:
         self._pending.append((due, np.array(joint_velocity, dtype=float)))
 
     def advance(self, time: float, dt: float) -> Float[np.ndarray, " joints"]:
-        """Joint velocity that the servos follow in a step of `dt` from `time` on [rad/s]."""
+        """Joint velocity that the servos follow from `time` to `time + dt` [rad/s]."""
         # Clocks add up steps of rounded length: a nanosecond early still counts as due.
         while self._pending and self._pending[0][0] <= time + 1e-9:
             self._wanted = self._pending.popleft()[1]

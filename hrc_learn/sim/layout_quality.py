@@ -1,9 +1,9 @@
-"""Quality of a layout for an arm, from kinematics alone.
+"""Quality of a layout (places of table and cabinet) for an arm, from kinematics alone.
 
 The arm follows the paths of the job without physics. The smallest margin to joint limits,
 singularities and furniture is the quality of the starting posture. Above the table, the camera
-must also see the marker on the gripper, for all turns of the gripper within half a turn: after
-half a turn, a parallel gripper grasps in the same way.
+must also see the marker on the gripper while the gripper takes all turns of half a circle about
+the vertical. Half a circle is enough: then a parallel gripper grasps in the same way again.
 """
 
 import math
@@ -25,13 +25,14 @@ from hrc_learn.vision import CameraModel
 type Clearances = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Distance of an arm from the furniture and from itself at joint positions [m]."""
 
-# Values that give quality 1: distance from joint limits [rad], smallest singular value [m/rad],
-# distances of the arm from furniture and from itself [m]. Largest joint speed without loss of
-# quality, as a fraction of its limit.
+# Values that give quality 1. `_MARGIN`: distance from joint limits [rad]. `_SINGULAR`: smallest
+# singular value [m/rad]. `_CLEAR`, `_APART`: distance of the arm from furniture and from itself
+# [m]. `_SPEED`: largest joint speed, as a fraction of its limit.
 _MARGIN, _SINGULAR, _CLEAR, _APART, _SPEED = 0.25, 0.08, 0.04, 0.01, 0.8
-# Tracking error from which on a pose counts as not reached: distance [m] and angle [rad].
+# A pose counts as not reached from this tracking error on: distance [m] or angle [rad].
 _LOST = 5e-3
-# Samples of a path to a shelf, of one across the table, and of half a turn above it.
+# Numbers of samples: of a path to a shelf (`_STEPS`), of a path across the table (`_ACROSS`),
+# and of half a turn of the gripper above the table.
 _STEPS, _ACROSS, _HALF_TURN = 60, 8, 24
 _DURATION = 14.0  # duration of the motion to a shelf [s]
 
@@ -128,8 +129,8 @@ def marked_turns(
         camera: Camera that must see the marker.
         plate: Plate with the marker, on one of its two possible sides.
         middle: Pose of the tool centre point above the middle of the table.
-        reach: Largest distances from there, along x and y [m].
-        hover: Joint positions there [rad].
+        reach: Largest distances from the middle, along x and y [m].
+        hover: Joint positions at `middle` [rad].
     """
     q, error = _turned_above_table(robot, middle, reach, hover)
     reached = _quality(robot, clearances, q, error)
@@ -139,7 +140,8 @@ def marked_turns(
         for first in range(_HALF_TURN + 1):
             window = slice(first, first + _HALF_TURN + 1)
             seen, least = float(good[window].mean()), float(reached[window].amin())
-            # Views count first, to 1 %, then quality, less the distance from the middle.
+            # The fraction of views counts first, rounded to 1 %. Then the quality counts, less
+            # the shift of these turns from the middle ones.
             off_middle = abs(first - _HALF_TURN / 2) / _HALF_TURN
             score = (round(seen, 2), least - off_middle)
             if best is None or score > best[0]:
@@ -153,7 +155,9 @@ def marked_turns(
 def _turned_above_table(
     robot: Arm, middle: Pose, reach: tuple[float, float], hover: Float[Tensor, " joints"]
 ) -> tuple[Float[Tensor, "turns places joints"], Float[Tensor, "turns places"]]:
-    """Joint positions above five places, for turns of the gripper by -180 to 180 degrees."""
+    """Joint positions above five places of the table, for turns of the gripper by -180 to 180
+    degrees, and the tracking errors there.
+    """
     corners = [[0, 0, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]
     aside = torch.tensor(corners).double() * torch.tensor([*reach, 0.0]).double()
     fraction = torch.linspace(0.0, 1.0, _ACROSS, dtype=torch.float64)
@@ -191,8 +195,8 @@ def _other_side(plate: Plate) -> Plate:
 def marker_seen(
     robot: Arm, camera: CameraModel, plate: Plate, q: Float[Tensor, "*batch joints"]
 ) -> Bool[Tensor, "*batch"]:
-    """True if a camera sees the whole plate on the gripper: in the image, and no link in
-    between.
+    """True if a camera sees the whole plate on the gripper: the plate is inside the image, and
+    no link hides it.
 
     Args:
         robot: The arm.

@@ -264,7 +264,8 @@ class RecordedWorld:
             for mesh in body.meshes:
                 add_mesh(spec, drawn, mesh)
             for box in body.boxes:
-                if box.name or not body.meshes:  # as in every other picture of a body
+                # Boxes with a name are drawn in addition to meshes.
+                if box.name or not body.meshes:
                     add_box(drawn, "", box.half_size, box.colour, pos=box.centre)
             for capsule in () if body.meshes else body.capsules:
                 add_capsule(drawn, "", capsule, capsule.colour)

@@ -37,7 +37,7 @@ HAND_MARKER = 7
 OCCLUDER = "occluder"
 """Name of the board that occludes markers."""
 OCCLUDER_HALF_SIZE = (0.07, 0.09, 0.004)
-"""[m]"""
+"""Half edges of this board [m]."""
 OCCLUDER_COLOUR = (0.55, 0.36, 0.30, 1.0)
 WORKER_BODIES = tuple(f"worker_{part}" for part in PARTS)
 """Names of the bodies, and of the capsules, that a worker is made of."""
@@ -58,11 +58,11 @@ class CabinetConfig:
     front: float = -0.50
     """y of the boards' front edges [m]."""
     depth: float = 0.36
-    """[m]"""
+    """Depth of the boards [m]."""
     bottom: float = -0.72
-    """Foot of the walls, below the robot's base [m]."""
+    """Height of the walls' lower end [m]; the robot's base is at zero."""
     top: float = 0.86
-    """Top of the walls [m]."""
+    """Height of the walls' upper end [m]."""
     shelves: Mapping[str, float] = field(
         default_factory=lambda: MappingProxyType({"lower": 0.12, "middle": 0.36, "upper": 0.60})
     )
@@ -180,7 +180,7 @@ class UnmarkedLook:
     clutter: int = 10
     """Number of small items on the rim of the table."""
     distractors: int = 2
-    """Number of cartons like the object with another print."""
+    """Number of cartons with the object's size and another print."""
     shadows: bool = True
     """True: a lamp casts shadows."""
 
@@ -198,7 +198,7 @@ class UnmarkedLook:
             spec.geom(item.name).rgba = (1.0, 1.0, 1.0, 1.0)
         item = config.objects[0]
         for k in range(self.clutter + self.distractors):
-            # On the rim of the table, clear of where objects are put.
+            # On the rim of the table, away from the places of objects.
             side, along = rng.uniform(0.62, 0.95) * rng.choice([-1, 1]), rng.uniform(-0.9, 0.9)
             reach = (side, along) if rng.uniform() < 0.5 else (along, side)
             w, d, _ = table.half_size
@@ -279,7 +279,7 @@ def unmarked(
 
 
 def build_scene(config: SceneConfig) -> mujoco.MjSpec:
-    """Describe the workplace as an `MjSpec`, whose `compile()` makes the model."""
+    """Describe the workplace as an `MjSpec`; `MjSpec.compile` makes the model."""
     spec = mujoco.MjSpec()
     spec.modelname = "hrc_learn workplace"
     _set_options(spec, config)
@@ -366,7 +366,7 @@ def _add_object(spec: mujoco.MjSpec, item: ObjectConfig, printed: bool) -> None:
     add_plate(spec, body, f"{item.name}_marker", top)
 
 
-# Collision bit of a worker. Furniture lacks it: the worker may lean on the table.
+# Collision bit of a worker. Furniture lacks this bit: the worker may lean on the table.
 _FEELS_WORKER = 2
 
 
@@ -390,7 +390,7 @@ def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig
             rgba=colour,
             contype=_FEELS_WORKER,
             conaffinity=0,
-            # Contacts are detected as usual, but exert a force only from a depth of 1 m on.
+            # Contacts are detected as usual, but exert a force only at depths above 1 m.
             margin=-1.0,
             gap=1.0,
         )

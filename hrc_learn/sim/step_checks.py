@@ -19,8 +19,8 @@ from hrc_learn.protocols import Touch
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 FASTEST = 1e3
-"""Largest plausible speed of a coordinate [m/s or rad/s]: the arm's joints reach 2.6 rad/s, and
-a falling object reaches it after 100 s. MuJoCo itself warns at 1e10 only."""
+"""Largest plausible speed of a coordinate [m/s or rad/s]. The arm's joints reach 2.6 rad/s, and
+a falling object would reach `FASTEST` after 100 s. MuJoCo itself warns only at 1e10."""
 
 _INDEXED = {
     int(mujoco.mjtWarning.mjWARN_BADQPOS): "qpos",
@@ -52,7 +52,7 @@ class ContactMonitor:
         Args:
             model: The model.
             movers: Bodies that move, with all bodies that they carry.
-            obstacles: Bodies that they should not touch.
+            obstacles: Bodies that the movers should not touch.
         """
         self._model = model
         mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
@@ -153,7 +153,7 @@ class PhysicsWatch:
             PhysicsError: A speed is implausible or not a number.
         """
         speed = np.abs(self._data.qvel)
-        # Written so that NaN is found too.
+        # This form of the comparison also finds NaN.
         if not speed.max(initial=0.0) <= FASTEST:
             self.check()
             dof = int(np.nanargmax(speed))
@@ -185,7 +185,12 @@ class PhysicsWatch:
         self._time = data.time
 
     def _body(self, place: int, values: str = "qvel") -> str:
-        """Name of the body whose coordinate stands at a place of `qpos`, `qvel` or `qacc`."""
+        """Name of the body that an entry of `qpos`, `qvel` or `qacc` belongs to.
+
+        Args:
+            place: Index of the entry.
+            values: Name of the array.
+        """
         model = self._model
         starts = model.jnt_qposadr if values == "qpos" else model.jnt_dofadr
         joint = int(np.searchsorted(starts, place, side="right")) - 1

@@ -26,14 +26,14 @@ _THIGH, _SHANK, _ANKLE_HEIGHT, _FOOT = 0.245, 0.246, 0.039, 0.152
 _HIP_HEIGHT, _SHOULDER_HEIGHT, _CHIN_HEIGHT = 0.530, 0.818, 0.870
 _TRUNK = _SHOULDER_HEIGHT - _HIP_HEIGHT
 
-# Breadths and circumferences of men of 1.756 m, rounded, as fractions of this: Gordon et al.
-# (2014), "2012 anthropometric survey of U.S. Army personnel", NATICK/TR-15/007.
+# Breadths and circumferences of men of 1.756 m, rounded, as fractions of this stature: Gordon
+# et al. (2014), "2012 anthropometric survey of U.S. Army personnel", NATICK/TR-15/007.
 _MEASURED = 1.756
 _TABLES = read_toml(Path(__file__).with_name("worker_parts.toml"))
 _RADII = {kind: radius / _MEASURED for kind, radius in _TABLES["radii"].items()}
-_SHOULDER_HALF = (0.510 / 2) / _MEASURED - _RADII["upper_arm"]  # of the deltoids' breadth
+_SHOULDER_HALF = (0.510 / 2) / _MEASURED - _RADII["upper_arm"]  # from the deltoids' breadth
 _CHEST_HALF = 0.300 / 2 / _MEASURED - _RADII["chest"]
-_PELVIS_HALF = 0.346 / 2 / _MEASURED - _RADII["pelvis"]  # of the hips' breadth
+_PELVIS_HALF = 0.346 / 2 / _MEASURED - _RADII["pelvis"]  # from the hips' breadth
 
 # Fifth to 95th percentile of the statures of women and men [m]: Huston (2009), "Principles of
 # biomechanics".
@@ -57,9 +57,11 @@ _PAIRS = {
 # Sign of y of the left and the right part of a pair.
 _SIDES = np.array([[1.0], [-1.0]])
 
-# Largest extension of an arm or leg: the direction in which a straight one bends is undefined.
+# Largest extension of an arm or leg, as a fraction of its length: for a straight limb, the
+# direction of bending would be undefined.
 _STRETCHED = 0.995
-# Directions in which left elbows and knees point, in the worker's frame; right ones have -y.
+# Directions in which the left elbow and the left knee point, in the worker's frame. For the
+# right ones, y has the opposite sign.
 _ELBOW, _KNEE = (-0.8, 0.2, -0.7), (1.0, 0.1, 0.0)
 # For both arms and both legs, left ones first: these directions, and lengths of the two links.
 _BENT_TO = np.array([(x, side * y, z) for x, y, z in (_ELBOW, _KNEE) for side in (1, -1)])
@@ -72,10 +74,10 @@ _BALANCE = 0.06
 # Lean of the head as a fraction of the trunk's: people look up while they lean.
 _HEAD_LEANS = 0.7
 _LIFT = 0.04  # height of a foot in its swing, as a fraction of the stature
-# Time over which velocities are averaged [s], a compromise of noise and lag: three images.
+# Time over which velocities are averaged [s]: three images, as a compromise of noise and lag.
 _SPAN = 0.1
 IMAGE_RATE = 30.0
-"""Images a second of an ordinary depth camera."""
+"""Images per second of an ordinary depth camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +87,7 @@ class WorkerConfig:
     stature: float = 1.75
     """Height of the standing body [m]."""
     floor: float = -0.72
-    """Height of the floor, below the robot's base [m]."""
+    """Height of the floor [m]; the robot's base is at zero."""
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> WorkerConfig:
@@ -111,7 +113,8 @@ class Posture:
     stride: Float[np.ndarray, "*time"]
     """Distance of the left foot in front of the pelvis, and of the right foot behind it [m]."""
     swing: Float[np.ndarray, "*time"]
-    """Lifted foot and its relative height: 1 the left one, -1 the right one, 0 none."""
+    """Relative height of the lifted foot: up to 1 for the left foot, down to -1 for the right
+    foot; 0: no foot is lifted."""
     hands: Float[np.ndarray, "*time 2 3"]
     """Grip of the left and the right hand, in the worker's frame [m]; both sink with the pelvis
     during a stride.
@@ -222,8 +225,8 @@ class Worker:
         return pelvis, _vector(np.sin(lean), 0.0, np.cos(lean))
 
     def _hip_height(self, stride: float | np.ndarray) -> float | np.ndarray:
-        """Height of the pelvis on straight legs whose feet are a stride in front of or behind
-        it [m].
+        """Height of the pelvis [m] on straight legs with the feet a stride in front of or
+        behind the pelvis.
         """
         leg = _STRETCHED * (_THIGH + _SHANK) * self._size
         reach = np.minimum(np.abs(stride), 0.8 * leg)
@@ -232,14 +235,15 @@ class Worker:
     def _add_limbs(
         self, own: np.ndarray, posture: Posture, pelvis: np.ndarray, neck: np.ndarray
     ) -> None:
-        """Add arms and legs, both sides at once."""
+        """Add the arms and legs of both sides."""
         h, sides = self._size, _SIDES * np.array([0.0, 1.0, 0.0])
         shoulder = neck[..., None, :] + _SHOULDER_HALF * h * sides
         hip = pelvis[..., None, :] + _PELVIS_HALF * h * sides
         hand = posture.hands.copy()
         sinks = self._hip_height(posture.stride) - self._hip_height(0.0)
         hand[..., 2] += np.asarray(sinks)[..., None]
-        # The hand continues the line from the shoulder, so the wrist lies on it, too.
+        # The hand points along the line from the shoulder to its grip, and the wrist lies on
+        # this line, too.
         towards = _unit(hand - shoulder)
         wrist = hand - _GRIP * _HAND * h * towards
         ankle = np.empty_like(hip)
@@ -287,7 +291,7 @@ def _two_links(
     second: np.ndarray,
     bent_to: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint and end of two links that lead from a start to an end, or as near as they can."""
+    """Joint and end of two links from a start towards an end, as near to it as they reach."""
     way = end - start
     distance = np.linalg.norm(way, axis=-1, keepdims=True)
     towards = way / distance
@@ -318,7 +322,7 @@ class WorkerSensor:
     """Implements the `PersonTracker` protocol: a body tracker on an RGB-D camera.
 
     Each end of a capsule has independent noise in each image. Velocities come from these
-    positions alone, so they are noisy as well, and lag behind by half of 0.1 s.
+    positions alone, so they are noisy as well, and lag by about 0.05 s.
     """
 
     def __init__(

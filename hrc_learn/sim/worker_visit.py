@@ -45,7 +45,7 @@ class HumanSpeeds:
     """Turning speed about the vertical [rad/s]."""
 
     def drawn(self, rng: np.random.Generator) -> HumanSpeeds:
-        """Speeds of one visit: 50 to 95 % of these."""
+        """Speeds of one visit: 50 to 95 % of these largest speeds."""
         # A margin remains: the body also sways up and down, and elbows may outrun hands.
         return HumanSpeeds(
             walking=rng.uniform(0.6, 0.9) * self.walking,
@@ -100,12 +100,12 @@ class WorkerVisit:
 
     @property
     def begin(self) -> float:
-        """Time of entering [s]."""
+        """Time at which the worker enters [s]."""
         return float(self.time[0])
 
     @property
     def end(self) -> float:
-        """Time of having left [s]."""
+        """Time at which the worker has left [s]."""
         return float(self.time[-1])
 
     @cached_property
@@ -138,7 +138,7 @@ class WorkerVisit:
         turns = vigour * np.minimum(np.abs(change[..., 2]), 1.0)
         stride = walks * self.step / 2 * np.sin(phase)
         hands = row[..., 4:].reshape(*row.shape[:-1], 2, 3).copy()
-        # Arms swing against the legs, by little: one of them may carry something.
+        # Arms swing against the legs, but only a little: a hand may carry something.
         hands[..., 0, 0] -= 0.15 * stride
         hands[..., 1, 0] += 0.15 * stride
         return Posture(
@@ -239,7 +239,7 @@ class BenchScript(PoseWriter):
 
     Attributes:
         top: Height of the bench [m].
-        edge: y of its far edge [m].
+        edge: y of the bench's far edge [m].
         ready: Hands over the edge of the bench, in the worker's frame [m].
         leaving: Final position of the worker [m].
     """
@@ -276,7 +276,13 @@ class BenchScript(PoseWriter):
         self.ready = np.array([[0.16 * h, s * 0.13 * h, above] for s in (1, -1)])
 
     def enter(self, begin: float, speeds: HumanSpeeds, side: int) -> None:
-        """Walk to the bench from a time on [s], with something in a hand (0 left, 1 right)."""
+        """Begin the script: walk to the bench with an object in one hand.
+
+        Args:
+            begin: Time at which the worker begins to walk [s].
+            speeds: Speeds of the worker.
+            side: Hand with the object: 0 left, 1 right.
+        """
         h, hands = self._worker.config.stature, self._worker.hanging_hands()
         hands[side] = [0.20 * h, (0.05, -0.05)[side] * h, 0.63 * h]
         heading = nearest_turn(direction(self.stand - self._entrance), self.facing)
@@ -390,7 +396,7 @@ def random_visit(
 
 
 def _hand_for(target: np.ndarray) -> int:
-    """The hand on the side of the point to reach."""
+    """Number of the hand on the side of a point to reach: 0 left, 1 right."""
     return int(target[1] < 0)
 
 

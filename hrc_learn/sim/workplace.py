@@ -38,12 +38,14 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 # Distances of table and cabinet from the base, relative to the usual ones.
 _SCALES = (1.0, 0.85, 0.7, 0.55)
 # An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint,
-# and the wrists of some other arms turn little out of it. Their cabinet stands straight to the
-# side of this axis, at these multiples of the scaled distance, and home lies on the way there,
-# at these fractions of the cabinet's distance. As the wrist is right above the tool, such an
-# arm works lower over the table, and the camera sees its marker from the far side.
+# and the wrists of some other arms turn little out of this plane. For such arms, the cabinet
+# stands straight to the side of this axis, at the multiples `_BESIDE` of the scaled distance.
+# Home lies on the way there, at the fractions `_ON_THE_WAY` of the cabinet's distance. As the
+# wrist is right above the tool, the arm works lower over the table (`_HOVER_BESIDE`), and the
+# camera stands farther out (`_CAMERA_BESIDE`), so that it sees the marker from the far side.
 _BESIDE, _ON_THE_WAY = (1.4, 1.6, 1.2), (0.55, 0.65)
 _HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
+# Scales in the order of their evaluation; True: with the cabinet straight to the side.
 _SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (0.95, True))
 # All lengths below are for the Franka hand; they scale with the size of the hand.
 # Distances around the middle of the table that the arm must reach in view of the camera [m]:
@@ -55,16 +57,18 @@ _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
 _DOWN = -0.3
 # Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
-# Quality from which on a layout is taken without evaluating others.
+# A layout of at least this quality is taken without evaluating others.
 _ENOUGH = 0.3
 _UNSEEN = 10.0  # loss of quality per fraction of poses without a view of the marker
-# Postures considered, at home and above the table; number of the best home postures that are
-# combined with twice as many of the best above the table.
+# `_POSTURES`: number of postures considered at home, and above the table.
+# `_TRIED`: number of the best home postures, which are combined with twice as many of the best
+# postures above the table.
 _POSTURES, _TRIED = 16, 6
 # Point where the path descends to the board, as a fraction of the way from goal to front.
 _INSIDE = 0.3
 
-# Half the hand's thickness, and what is left under it for errors of base and encoders [m].
+# `_HAND_HALF`: half the hand's thickness [m].
+# `_OVER_BOARD`: gap between hand and board, for errors of base and encoders [m].
 _HAND_HALF, _OVER_BOARD = 0.030, 0.006
 
 
@@ -84,7 +88,7 @@ class Workplace:
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     table_reach: tuple[float, float] = (0.14, 0.14)
-    """Largest distance of object edges from this middle, along x and y [m]."""
+    """Largest distance of object edges from `table_centre`, along x and y [m]."""
     hover_height: float = 0.17
     """Height of the tool centre point during visual servoing [m]."""
     hover_orientation: tuple[float, float, float, float] = tuple(gripper_down().tolist())
@@ -99,8 +103,9 @@ class Workplace:
     """Distance of the palm behind the tool centre point [m]."""
     hover_turns: tuple[float, float] = (np.deg2rad(-60.0), np.deg2rad(120.0))
     """Least and greatest turn of the end effector about the vertical above the table [rad]:
-    half a turn in which the forearm does not hide the marker. By `marker_seen`, it hides it
-    from -80 degrees on; the margin is for elbows that people have pushed aside."""
+    half a turn in which the forearm does not hide the marker. According to `marker_seen`, the
+    forearm hides the marker from -80 degrees on; the margin allows for an elbow that a person
+    has pushed aside."""
     shelf_x: float = 0.40
     """Position along the boards where objects are placed [m]."""
     shelf_depth: float = 0.10
@@ -139,7 +144,7 @@ class Workplace:
         return HAND_MARKER
 
     def home(self) -> Pose:
-        """Pose of the end effector at home; it points down if home is in front of the base."""
+        """Pose of the end effector at home, pointing down if home is in front of the base."""
         position = _vector(*self.home_position)
         return Pose(position, coarse_orientation(position, self.level_at))
 
@@ -295,7 +300,7 @@ class Workplace:
         return max(half_size[1] + self.clearance - spare, 0.0)
 
     def path_to_shelf(self, name: str, lift: float = 0.03) -> Float[Tensor, "4 3"]:
-        """Points of the end effector from home over the edge of a board to its goal [m].
+        """Points of the end effector from home over the edge of a board to the goal on it [m].
 
         Args:
             name: Name of the shelf.
@@ -418,7 +423,7 @@ def _beside(place: Workplace, home: float) -> Workplace:
 
     Args:
         place: Workplace with the cabinet to the right.
-        home: Distance of the home position, as a fraction of that of the shelves.
+        home: Distance of the home position, as a fraction of the distance of the shelves.
     """
     axis = float(place.robot.joint_origins(place.robot.ready)[0, 0])
     scene, (x, y), camera = place.scene, place.table_centre, place.scene.camera
@@ -446,7 +451,7 @@ def _placed(
     depth: float,
     far: float = 1.0,
 ) -> Workplace:
-    """The usual workplace with other distances, the cabinet's `far` times the table's."""
+    """The usual workplace with distances times `scale`; the cabinet's also times `far`."""
     place, cabinet, table = Workplace(), usual.cabinet, usual.table
     size = usual.arm.robot.hand_size
     scale, along, higher, depth = (size * x for x in (scale, along, higher, depth))

@@ -120,7 +120,7 @@ class World:
 
         Args:
             joint_position: Joints of the arm [rad].
-            objects: Poses of objects in the base frame; those not named keep their initial one.
+            objects: Poses of objects in the base frame; other objects keep their initial pose.
             gripper_width: Opening of the gripper [m].
 
         Raises:
@@ -174,7 +174,7 @@ class World:
                 monitor.pause()
 
     def hold(self, name: str, joint_position: Float[np.ndarray, " joints"]) -> None:
-        """Reset with an object between the fingers, and let the grip settle.
+        """Reset the world with an object between the fingers, and let the grip settle.
 
         Args:
             name: The object.
@@ -207,7 +207,7 @@ class World:
             _put(self.model, self.data, carried, self.arm.tcp_pose() @ in_hand)
 
     def put_in_hand(self, name: str) -> None:
-        """Put an object between the fingers at once, as `hold` does.
+        """Put an object between the fingers, where `hold` puts it, without simulating a grasp.
 
         Raises:
             KeyError: If there is no object of that name.
@@ -227,7 +227,7 @@ class World:
     def move_obstacle(
         self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]
     ) -> None:
-        """Put an obstacle, or the occluder, somewhere at once; `NOWHERE` takes it away.
+        """Put an obstacle, or the occluder, at a new position; `NOWHERE` takes it away.
 
         Args:
             name: Name of the obstacle.
@@ -239,7 +239,7 @@ class World:
     def move_worker(
         self, ends: Float[np.ndarray, "parts 2 3"], item: Float[np.ndarray, "3"] | None = None
     ) -> None:
-        """Put the worker somewhere at once.
+        """Put the worker's body at new positions.
 
         Args:
             ends: Ends of the axes of the worker's capsules, in the order of `PARTS` [m].
@@ -296,7 +296,7 @@ class World:
         return sorted(tuple(faces) for faces in pads.values()) == [(-1,), (1,)]
 
     def rests_on(self, name: str, board: str) -> bool:
-        """True if an object touches a piece of furniture and no part of the arm."""
+        """True if an object touches a piece of furniture, and nothing else but furniture."""
         partners = {self.model.geom(g).name for g in self._touched(name)}
         return board in partners and partners <= {box.name for box in self.config.boxes()}
 
