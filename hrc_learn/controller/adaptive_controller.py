@@ -357,7 +357,7 @@ class AdaptiveController(nn.Module):
         stop: Tensor | None,
         unknown: Tensor,
     ) -> tuple[Tensor, SafetyState, SafetyReport]:
-        """Step of the safety filter, which brakes where inputs are invalid."""
+        """Results of `SafetyFilter.step`; where `unknown`, the filter brakes the arm."""
         observation = given.observation
         if observation.stop is not None:
             stop = observation.stop if stop is None else stop | observation.stop
@@ -494,7 +494,7 @@ class AdaptiveController(nn.Module):
         feedback: Feedback,
         sound: Tensor,
     ) -> Any:
-        """State of the estimator after the measurement of the camera."""
+        """State of the estimator after it has learned from the camera's measurement."""
         observation, pose = given.observation, given.pose
         q = observation.image_joint_position
         if q is not None:

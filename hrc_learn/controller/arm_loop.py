@@ -223,7 +223,7 @@ class ArmLoop:
     def _track(
         self, state: ArmLoopState, reading: ArmReading, request: TrackPose
     ) -> WantedMotion:
-        """Joint velocity that tracks a pose of the end effector."""
+        """Joint velocity that tracks the requested pose of the end effector [rad/s]."""
         every, push = torch.ones_like(state.aside), state.null_velocity
         tracked = self._law.track(
             state, reading, request.pose, request.twist, push, every, slows=False
@@ -236,7 +236,7 @@ class ArmLoop:
     def _filtered(
         self, state: ArmLoopState, reading: ArmReading, wanted: WantedMotion
     ) -> tuple[Tensor, ArmLoopState, ArmReport]:
-        """Send a joint velocity through the safety filter."""
+        """Joint velocity after the safety filter [rad/s], the next state, and the report."""
         velocity = wanted.joint_velocity
         J, q, load = reading.jacobian, reading.joint_position, reading.load
         if (people := reading.people) is not None:
@@ -264,7 +264,9 @@ class ArmLoop:
     def _send(
         self, state: ArmLoopState, reading: ArmReading, command: Command
     ) -> tuple[Tensor, ArmLoopState, ArmReport]:
-        """Send a command of the adaptive controller, at the pace of the task."""
+        """Joint velocity of the adaptive controller's command, slowed to the pace of the task
+        [rad/s], the next state, and the report.
+        """
         J, q = reading.jacobian, reading.joint_position
         slowed = self._slowed_by_people(reading, command.joint_velocity, command.safety)
         left = fraction_kept(command.twist, twist_of(J, command.joint_velocity), _AT_REST)
@@ -328,6 +330,6 @@ def _distances(reading: ArmReading) -> Distances | None:
 
 
 def _scaled(velocity: Tensor, reading: ArmReading) -> Tensor:
-    """Joint values times the speed scale that people near the arm impose."""
+    """A joint vector times the speed scale that people near the arm impose."""
     people = reading.people
     return velocity if people is None else people.speed_scale.unsqueeze(-1) * velocity

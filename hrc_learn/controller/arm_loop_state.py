@@ -34,15 +34,15 @@ class ArmLoopConfig(YieldingConfig):
     dt: float = 0.01
     """Control step [s]."""
     command_delay: float = 0.01
-    """Time from a command until the arm follows it, including servo lag [s]. The default is
-    that of the simulated servos; on real arms, networks and schedulers add to it."""
+    """Time from a command until the arm follows it, including servo lag [s]. The default is the
+    lag of the simulated servos; on real arms, networks and schedulers add to it."""
     limit_margin: float = 0.1
     """Range before the joint limits that is reserved for the task and closed to pushes, in
     addition to the margin of the safety filter [rad]. Motion over this range moves the end
     effector by some centimetres."""
     speed: float = 1.0
     """Speed of the task relative to its planned speed, in (0, 1]; for example low for a first
-    run on a real arm. It does not slow down null-space motions off a path."""
+    run on a real arm. Null-space motions off a path are not slowed down."""
     longest_wait: float = 300.0
     """Longest time for which people may block or displace the arm before the task fails [s]."""
     back_after: float = 2.0

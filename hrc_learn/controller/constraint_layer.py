@@ -162,8 +162,8 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     direction = torch.where(adds, z, v)
     square = torch.where(adds, zz, (v * v).sum(-1, keepdim=True))
     scale = torch.where(acts, 1 / torch.where(acts, square, 1.0), 0.0)
-    # A rank-one update: the projector loses the direction of an added limit or gains that of a
-    # dropped one; in both cases the pseudo-inverse becomes orthogonal to that direction.
+    # A rank-one update: the projector loses the direction of an added limit, or gains the
+    # direction of a dropped limit. Either way, the pseudo-inverse becomes orthogonal to it.
     entering = torch.cat([z, lost - enters.to(c.dtype)], dim=-1)
     exiting = torch.cat([-v, _combine(v, now.operators[..., p:])], dim=-1)
     turn = scale * torch.where(adds, entering, exiting)
@@ -410,8 +410,8 @@ def _unit_cost_directions(jacobian: Tensor, task: Tensor, config: ConstraintConf
 def _limit_rows(
     basis: Tensor, gradient: Tensor | None, m: int, config: ConstraintConfig
 ) -> Tensor:
-    """Columns for `least_change` (unknowns, limits): first the limits of the joints, then those
-    of the task and of the distances. The last unknown is the common excess of the distances.
+    """Argument `rows` of `least_change` (unknowns, limits). The columns are the limits of the
+    joints, of the task and of the distances. The last unknown is the distances' common excess.
     """
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
     slower = torch.zeros_like(joints[..., :1])

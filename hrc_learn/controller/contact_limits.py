@@ -63,8 +63,8 @@ BODY_REGIONS = {name: BodyRegion(**row) for name, row in _REGIONS.items()}
 _TABLE = Constant(torch.tensor(list(BODY_REGIONS.values()), dtype=torch.float64))
 # Transient limits are this many times the quasi-static ones (table A.2).
 _TRANSIENT = 2.0
-# Cosine of 60 degrees: furniture clamps a person if, seen from the arm, it lies within this
-# angle of the person.
+# Cosine of 60 degrees: furniture clamps a person if, seen from the arm, the directions of
+# furniture and person differ by at most this angle.
 _FACING = 0.5
 # Distance of the arm from furniture below which its direction is undefined [m].
 _TOUCHING = 1e-6

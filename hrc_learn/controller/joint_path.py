@@ -31,17 +31,17 @@ FAR_ASIDE = 1.8
 joints returned to their path from 1.4 rad, with the elbow about 0.2 m off it; from 2 rad some
 did not."""
 WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
-"""Alignments (`return_alignment`): above the first, pushes are followed in full; below the
-second, the null space may lead to a posture other than the path's. The alignment is 0.7 when
-the elbow has moved a quarter of its circle, and 0 after half of the circle."""
+"""Alignments (`return_alignment`): above `WELL_ALIGNED`, pushes are followed in full; below
+`POORLY_ALIGNED`, the null space may lead to a posture other than the path's. The alignment is
+0.7 when the elbow has moved a quarter of its circle, and 0 after half of the circle."""
 NARROW = 0.07
 """Smallest singular value of the Jacobian below which the joints cannot leave a path. The
 damping of the inverse Jacobian begins at 0.05."""
 
 # Distance at which a path that has waited goes on [rad].
 _NEAR_AGAIN = 1.4
-# Distances from the path [rad]: below the first, joints return whatever their alignment; above
-# the second, the alignment counts in full.
+# Distances from the path [rad]. Below the first, joints return whatever their alignment is.
+# Above the second, the alignment counts in full.
 _NEARBY = 0.3, 0.5
 # `_ON_PATH`: tolerated distance of the end effector from its path [m], half the deviation that
 # a push may cause.
@@ -132,7 +132,7 @@ def may_not_return(
     alignment: Float[Tensor, "*batch"],
     waited: Bool[Tensor, "*batch"] | bool = False,
 ) -> Bool[Tensor, "*batch"]:
-    """True where null-space motion might end in a posture other than that of an advancing path.
+    """True where null-space motion might miss the posture of the path if the path advances.
 
     Args:
         error: Path minus joint positions [rad].
@@ -214,7 +214,7 @@ def deviation_ratio(
 
 
 def _length(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
-    """Length of a motion, with its rotation converted to metres [m]."""
+    """Length of a motion [m]: length of its translation, plus its rotation angle in metres."""
     return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)
 
 

@@ -28,9 +28,9 @@ class LimitBarrier(nn.Module):
         v_hat <= min(h(delta), v_max + A^2/(2 j)),   h(delta) = sqrt(c^2 + 2 A delta) - c,
         c = A / rate     <=>     Q(v_hat) = v_hat^2/(2 A) + v_hat/rate <= delta
 
-    To brake, a joint ramps its acceleration a down to -A. Braking *at once* with A, but from
-    v_hat instead of v, takes a distance that is longer by (a + A)^3/(6 j^2). So one curve h is
-    safe for every a.
+    To brake, a joint ramps its acceleration a down to -A. Braking with A *without a ramp*, but
+    from v_hat instead of v, takes a distance that is longer by (a + A)^3/(6 j^2). So one curve
+    h is safe for every a.
 
     The set is invariant in discrete time. Assume that step k starts with v_hat_k inside the
     set, that the joint moves by v_k dt, and that the next acceleration is max(a_k - j dt, -A).
@@ -46,8 +46,8 @@ class LimitBarrier(nn.Module):
         delta >= A^3/(8 j^2) + A^2/(2 j rate),
 
     which is 3 mrad for a Panda with rate = 5 1/s, less than the margin. The first term is the
-    distance that the joint travels while the acceleration ramps down. It matters for axes with
-    a long ramp time A/j.
+    distance that the joint travels while the acceleration ramps down. This term matters for
+    axes with a long ramp time A/j.
 
     *Starts outside.* A joint may start at rest with a smaller delta, or beyond the limit. Such
     a joint never moves outwards, and may stay at rest; the set is then
@@ -253,9 +253,9 @@ class LimitBarrier(nn.Module):
 
 
 # Velocity that ramps of the acceleration may add during gentle braking, as a fraction of the
-# velocity limits at a cap of 1 m/s. The smaller it is, the more gently the arm brakes. It falls
-# with the square of the cap, like the turning of the links that gentle braking has to allow
-# for.
+# velocity limits at a cap of 1 m/s. With a smaller fraction, the arm brakes more gently. The
+# added velocity falls with the square of the cap, like the turning of the links that gentle
+# braking has to allow for.
 _RAMP = 0.005
 
 
@@ -288,9 +288,9 @@ class SpeedBarrier(nn.Module):
     *Jerk.* While its acceleration a ramps down, a joint is faster than y v by at most
     (a + b)^2/(2 j), where b = |v|/T is its deceleration. A large kappa keeps these ramps small.
 
-    *Joint limits.* Near its position limits a joint follows its own barrier, whose velocity
-    decays at most at the rate A/c. If it brakes faster than y v, it deviates from y v by at
-    most (1 - (1 + log rho)/rho) v with rho = T A/c > 1.
+    *Joint limits.* Near its position limits, a joint follows its own barrier, where the
+    velocity decays at most at the rate A/c. A joint that brakes faster than y v deviates from
+    y v by at most (1 - (1 + log rho)/rho) v with rho = T A/c > 1.
 
     *Delay and jitter.* If positions are read a time D before the motion, the joints have since
     moved by at most D (x + A D), which turns the links further; from one reading to the next
@@ -317,7 +317,7 @@ class SpeedBarrier(nn.Module):
 
         Args:
             joints: Barrier of the joint limits.
-            cap: The usual cap [m/s]; the barrier holds for any other cap as well.
+            cap: The usual cap [m/s]; the barrier also holds for other caps.
             delay: D, time from a reading to the motion that results from it [s].
             jitter: Largest relative excess of a step over its dt.
         """
@@ -361,8 +361,8 @@ class SpeedBarrier(nn.Module):
         x, towards = velocity.abs(), torch.sign(velocity) * acceleration
         braking = x / T
         # Deviation from y v: a joint is faster while its acceleration ramps down, and slower if
-        # it brakes harder. If it cannot end the braking before zero, it reverses. Then
-        # |a| > |v|/T, as T > max(A_i/j_i)/(2 kappa).
+        # it brakes harder. A joint that cannot end the braking before zero velocity reverses.
+        # Then |a| > |v|/T, as T > max(A_i/j_i)/(2 kappa).
         hard = towards.clamp(max=0) ** 2
         ramp = torch.where(hard > 2 * self.jerk * x, hard, (towards + braking) ** 2)
         excess = ramp / (2 * self.jerk)
@@ -383,7 +383,7 @@ class SpeedBarrier(nn.Module):
         return (_peak(M, B * (T + self.fade) / 2) + aside).amax(-1, keepdim=True)
 
     def _turning(self, R: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """sum_ij R_max(i,j) x_i y_j, by sums up to each joint."""
+        """Sum over i, j of R_max(i,j) x_i y_j, computed from partial sums up to each joint."""
         up_to_x, up_to_y = ((v.unsqueeze(-2) * self.distal.mT).sum(-1) for v in (x, y))
         pairs = x * up_to_y + y * up_to_x - x * y
         return torch.linalg.vecdot(R, pairs.unsqueeze(-2))

@@ -176,7 +176,7 @@ def singularity_fade(
 
 
 def _fractions_of(velocity: Float[Tensor, "*batch n"]) -> Tensor:
-    """Fractions of a motion from none to all of it, shape (fractions, *batch, n)."""
+    """A velocity times each of `_FRACTIONS`, from zero to one, shape (fractions, *batch, n)."""
     return _FRACTIONS.to(velocity).reshape(-1, *(1 for _ in velocity.shape)) * velocity
 
 

@@ -302,7 +302,7 @@ class PathLaw:
     def _target(
         self, path: PathState, speed_override: Tensor, request: FollowPath
     ) -> PathTarget:
-        """Joint positions and velocities of the paths now."""
+        """Points of the paths to track now."""
         paths, which, config = request.paths, request.path, self.config
         rate = path.rate * speed_override
         # Velocity of the path at the time when the arm follows the command.
@@ -332,11 +332,11 @@ class PathLaw:
     def _off_path(
         self, state: ArmLoopState, reading: ArmReading, path: PathState, target: PathTarget
     ) -> OffPath:
-        """State of joints off their path: the part of the push to follow, and their return."""
+        """State of joints off their path, with the push to follow and the return velocity."""
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        # If joints on the path lag without a push, they touch something: they stay on the path.
+        # Joints on the path that lag without a push touch something: they do not go aside.
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
@@ -409,7 +409,7 @@ class PathLaw:
 
 
 def _changed_where(mask: Tensor, path: PathState, **values: Tensor | float) -> PathState:
-    """The path with other values of some fields where a mask holds."""
+    """The path, with other values of some fields where a mask is true."""
     changed = {
         name: torch.where(mask, value, getattr(path, name)) for name, value in values.items()
     }

@@ -35,8 +35,8 @@ from hrc_learn.kinematics.inverse import SINGULAR_BELOW, position_first
 from hrc_learn.pytree import pytree, zero_where
 from hrc_learn.regions import PostureRegion
 
-# Keeps the Cholesky factorisation possible at a singularity. It enters only the estimated
-# distance from a singularity, never a solution.
+# Addition to the diagonal that keeps the Cholesky factorisation possible at a singularity. The
+# addition enters only the estimated distance from a singularity, never a solution.
 _FLOOR = 1e-9
 _EYE = {rows: Constant(torch.eye(rows, dtype=torch.float64)) for rows in range(1, 7)}
 
@@ -128,7 +128,7 @@ def task_rate(
 
 
 def _damped_gram(J: Float[Tensor, "*batch rows n"]) -> Float[Tensor, "*batch rows rows"]:
-    """J J^T + lambda^2 I."""
+    """J J^T + lambda^2 I, with the damping lambda of `resolved_rate`."""
     gram = matmul(J, J.mT)
     eye = _EYE[J.shape[-2]].like(J)
     sigma_square = 1 / inverse_norm(torch.add(gram, eye, alpha=_FLOOR))
@@ -330,10 +330,10 @@ def planned_motion(
 ) -> Float[Tensor, "*batch 6"]:
     """Motion of the tool that the task plans for the coming step (linear [m], angular [rad]).
 
-    Limits may slow the motion down. That is no drift, so only the fraction that the filtered
-    joint velocity executes counts as planned. This fraction is measured on the whole twist: for
-    a slow task, the correction of measurement noise is as large as the task's own twist and
-    would hide the fraction of the task alone.
+    Limits may slow the motion down. Slowing down is no drift, so only the fraction that the
+    filtered joint velocity executes counts as planned. This fraction is measured on the whole
+    twist: for a slow task, the correction of measurement noise is as large as the task's own
+    twist and would hide the fraction of the task alone.
 
     Args:
         task_twist: Twist of the task alone.
@@ -365,7 +365,7 @@ class BlendingConfig:
     """Distance from the image border at which a new feature is first used [px]; from then on it
     is used up to the border. Without hysteresis the blending chatters there."""
     blend_time: float = 0.3
-    """Time in which vision feedback fades in and out [s]; 0: at once."""
+    """Time in which vision feedback fades in and out [s]; 0: it switches without fading."""
     max_feature_age: float = 0.25
     """Age above which a feature is not used; an arm that follows the feature then stops [s]."""
 
@@ -582,7 +582,7 @@ def regional_feedback(
 def _excess_rate(
     J_s: Tensor, xi_x: Tensor, error: Tensor, vision_rate: float
 ) -> Float[Tensor, "*batch 1"]:
-    """Divisor of vision feedback that caps the rate of the pixel error; at least 1."""
+    """Divisor of the vision feedback, at least 1, that caps the decay of the pixel error."""
     # The feature moves with J_s J_s^T xi_x, if the estimate is right.
     descent = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
     speed = torch.linalg.vecdot(J_s, descent.unsqueeze(-2))

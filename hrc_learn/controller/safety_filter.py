@@ -43,8 +43,8 @@ _REST = 1e-15
 # Step dt assumed for braking before the first valid dt [s]: the shortest step that arms use,
 # because it brakes most gently.
 _SHORTEST_STEP = 1e-3
-# Fraction of the velocity limits by which measured velocities may differ from those of the
-# initial state: encoders at 1 kHz err by some hundredths of a radian per second.
+# Fraction of the velocity limits by which measured velocities may differ from the velocities of
+# the initial state: encoders at 1 kHz err by some hundredths of a radian per second.
 _START_ERROR = 0.03
 
 
@@ -230,7 +230,7 @@ class SafetyFilter(nn.Module):
             load: Vector from the tool centre point to the far end of a load, in the base frame
                 [m]; needs all six rows of the Jacobian. Not finite: brake to rest.
             joint_velocity: Measured joint velocities [rad/s]. If they differ from the initial
-                state in the first step, the filter continues from them.
+                state in the first step, the filter continues from the measured ones.
             human_distance: Distance of the tool from the nearest person [m]; a short one slows
                 down or stops the arm. NaN (unknown): stop. None: no person is monitored.
             stop: True where the arm has to brake to rest for another reason.
@@ -406,7 +406,7 @@ class SafetyFilter(nn.Module):
             return u / excess.clamp(min=1), self.config.tcp_speed, speeding, never
         safe = self.config.separation.highest_speed(human_distance).unsqueeze(-1)
         cap = safe.clamp(max=self.config.tcp_speed)
-        # At a cap of zero all joints rest, also those that do not move the tool.
+        # At a cap of zero, all joints rest, also joints that do not move the tool.
         factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)
         return factor * u, cap, speeding, (speed > (1 + _REPORTED) * safe) | (safe == 0)
 
@@ -490,10 +490,10 @@ class SafetyFilter(nn.Module):
     ) -> tuple[Tensor, Bool[Tensor, "*batch 1"]]:
         """The velocity, reduced as far as the cap on the speed of points requires, and a flag.
 
-        It is the nearest velocity to the wanted one inside the barrier, on the line to the
-        velocity of gentle braking (`_easing`). Where gentle braking is not enough, it lies on
-        the line from there to the hardest braking (`_stopping`). A stop always brakes as hard
-        as possible.
+        The result lies inside the barrier, on the line from the wanted velocity to gentle
+        braking (`_easing`), as near to the wanted velocity as possible. Where gentle braking is
+        not enough, the result lies on the line from gentle to hardest braking (`_stopping`).
+        A stop always brakes as hard as possible.
         """
         cap = cap * (1 - 8 * torch.finfo(v.dtype).eps)
         speed = self._highest_speed(given, v)
@@ -514,7 +514,9 @@ class SafetyFilter(nn.Module):
         return kept, ~passes & ~(eases & (fraction > 1 - _REPORTED))
 
     def _highest_speed(self, given: _Inputs, v: Tensor) -> Tensor:
-        """Bound on the speed of the points at a velocity and on the way to rest [m/s]."""
+        """Bound on the speed of the capped points at a joint velocity and in the braking after
+        it [m/s].
+        """
         assert given.points is not None
         acceleration = (v - given.state.velocity) / given.dt
         return self.speed_barrier.highest_speed(given.points, v, acceleration, given.dt)
@@ -562,7 +564,7 @@ def _secant(low: Tensor, high: Tensor, cap: Tensor | float) -> Tensor:
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:
-    """Largest ratio of a component to its limit; at most 1 where all keep them."""
+    """Largest ratio of a component to its limit; at most 1 where all limits are kept."""
     return (vector / limit).abs().amax(-1, keepdim=True)
 
 

@@ -359,7 +359,9 @@ class Arm(SerialChain):
         task: TaskSpace,
         samples: int,
     ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
-        """Solutions of a path, each close to the previous one, and a mask of missing ones."""
+        """Solutions along a path, each close to the previous one, and a mask of poses without
+        a solution.
+        """
         pose = Pose(pose.position.expand(*batch, 3), pose.orientation.expand(*batch, 4))
         angles = None if q7 is None else as_tensor(q7, pose.position).expand(batch)
         before, path, missing = self.ready.to(pose.position), [], []
@@ -383,7 +385,9 @@ class Arm(SerialChain):
     def _nearest(
         self, pose: Pose, q7: ArrayLike | None, near: Tensor, task: TaskSpace, samples: int
     ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
-        """Solutions closest to a configuration, for each pose, and a mask of missing ones."""
+        """Solution closest to a configuration, for each pose, and a mask of poses without a
+        solution.
+        """
         if self._closed_form is None or task != self.task:
             solution = solve_inverse(self, pose, near, task=task)
             return solution.position, ~solution.found
@@ -482,7 +486,7 @@ def comfortable_posture(arm: Arm, pose: Pose) -> Float[Tensor, " joints"]:
 
 
 def _repeated(pose: Pose, shape: Sequence[int]) -> Pose:
-    """Each pose, once for every entry of the last dimension of `shape`, in float64."""
+    """Poses expanded to `shape`, in float64; the last dimension of `shape` is new."""
     return Pose(
         pose.position.double().unsqueeze(-2).expand(*shape, 3),
         pose.orientation.double().unsqueeze(-2).expand(*shape, 4),
@@ -492,7 +496,7 @@ def _repeated(pose: Pose, shape: Sequence[int]) -> Pose:
 def _explain(
     name: str, pose: Pose, q7: ArrayLike | None, missing: Bool[Tensor, "*batch"]
 ) -> str:
-    """Message for the first pose that was not reached."""
+    """Text of the error for the first pose that was not reached."""
     shape = missing.shape
     first = tuple(missing.nonzero()[0].tolist()) if shape else ()
     position = pose.position.expand(*shape, 3)[first].tolist()

@@ -70,7 +70,7 @@ def transform_and_jacobian(
 
 
 def _product(frame: list[_Row], constant: Sequence[Sequence[float]]) -> list[_Row]:
-    """(R | p) times a homogeneous transform."""
+    """Product of a frame (R | p) and a constant homogeneous transform."""
     return [
         [
             _combination([constant[k][j] for k in range(3)] + [float(j == 3)], row)

@@ -284,7 +284,7 @@ def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transfor
 def _meshes(
     description: Description, places: dict[str, tuple[int, Transform]], last: int
 ) -> dict[str, tuple[MeshFile, ...]]:
-    """Meshes, by the names of the links that carry them (link0, ...), without the gripper's."""
+    """Meshes of links up to number `last`, by the name of the link (link0, ...)."""
     found: dict[str, tuple[MeshFile, ...]] = {}
     for link, (number, place) in places.items():
         for shape in description.links[link].visuals:

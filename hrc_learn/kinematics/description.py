@@ -120,7 +120,7 @@ class Joint:
 
     @property
     def is_finger(self) -> bool:
-        """True if the name of the joint, or of the link that it moves, is that of a gripper."""
+        """True if the joint belongs to a gripper by its name or the name of its child link."""
         name, child = self.name.lower(), self.child.lower()
         if _ARM_JOINT.search(name):
             return False
@@ -355,19 +355,19 @@ class Description:
 
 
 def _length(joint: Joint, height: dict[str, int]) -> int:
-    """Number of joints in a row from a joint to the furthest leaf that it carries."""
+    """Number of moving joints in a row from a joint, included, to the furthest leaf."""
     return height[joint.child] + (joint.kind != "fixed")
 
 
 def _unlikely(frame: str) -> int:
-    """Rank of a link among those that may be the tool frame; 0 is the likeliest."""
+    """Rank of a link among possible tool frames, by its name; 0 is the likeliest."""
     words = _words(frame)
     ranks = [rank for rank, word in enumerate(_TOOL_FRAMES) if re.search(word, words)]
     return min(ranks, default=len(_TOOL_FRAMES))
 
 
 def _words(name: str) -> str:
-    """A name as words in lower case."""
+    """A name as words in lower case, separated by spaces."""
     return re.sub("[^a-z]+", " ", name.lower())
 
 

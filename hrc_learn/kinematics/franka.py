@@ -9,8 +9,8 @@ valid solution at the shoulder singularity (q2 = 0). Its results are checked her
 
 For the Research 3 it also misses most solutions outside the Panda's range (q6 > 3.7525 rad,
 |q7| > 2.8973, |q2| > 1.7628), unless all joints are within the range that Franka gives for
-constant velocity limits. Of configurations in the whole range with q4 < -0.467 it finds 81 %,
-of those within the Panda's range 99.8 %.
+constant velocity limits. It finds 81 % of the configurations in the whole range with
+q4 < -0.467, and 99.8 % of such configurations within the Panda's range.
 
 Franka's meshes agree to 2 mm for both arms. They protrude from the capsules by at most 30 mm at
 the links (link 2), 46 mm at the base and 9 mm at the gripper: clearances must cover this.
@@ -102,7 +102,7 @@ def franka_branches(
 def _valid_first(
     arm: SerialChain, q: Float[Tensor, "*batch 4 7"], tip: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 4 7"]:
-    """Branches, with those outside the limits or at another pose set to NaN and moved last."""
+    """Valid branches first; branches outside the limits or at another pose become NaN."""
     reached = arm.forward(q).matrix()
     error = (reached - tip[..., None, :, :]).abs().flatten(-2).amax(-1)
     good = arm.limits.contain(q) & (error < _TOLERANCE)  # False for rows of NaN
@@ -112,8 +112,11 @@ def _valid_first(
 
 
 def _craig(a: float, d: float, s: int) -> Tensor:
-    """Rx(alpha) Tx(a) Tz(d): a joint frame at zero in the frame before it, s = sin(alpha)."""
-    c = 1 - abs(s)  # multiples of a right angle
+    """Frame of a joint at zero in the previous joint's frame: Rx(alpha) Tx(a) Tz(d).
+
+    Here s = sin(alpha), and alpha is a multiple of a right angle.
+    """
+    c = 1 - abs(s)  # cos(alpha); alpha is never 180 degrees
     rows = [[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1]]
     return torch.tensor(rows, dtype=torch.float64)
 

@@ -376,7 +376,10 @@ def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
 def _drawn_nearer(
     chain: SerialChain, goal: Pose, q: Tensor, wish: Tensor, task: TaskSpace
 ) -> Tensor:
-    """Solutions moved in the null space towards a wish, where that keeps the pose and helps."""
+    """Solutions moved in the null space towards a wish.
+
+    A solution stays as it is if the motion loses the pose or does not come nearer to the wish.
+    """
     moved = q
     for _ in range(15):  # each removes most of the distance that the null space can remove
         moved, _ = _step(chain, goal, moved, task, wish)

@@ -136,9 +136,9 @@ class JointLimits(MotionLimits):
 
 
 # Defaults for limits that a description does not give. The velocity of revolute joints is lower
-# than that of the slowest joint of every registered arm except Kinova's. The velocity of
+# than the slowest joint's limit on every registered arm except Kinova's. The velocity of
 # prismatic joints is the reduced speed of ISO 10218-1:2025. We chose the times to full speed
-# and to full acceleration; those of the Panda are 0.13 to 0.29 s and 2 ms.
+# and to full acceleration; the Panda's times are 0.13 to 0.29 s and 2 ms.
 DEFAULT_VELOCITY = 1.0  # [rad/s]
 DEFAULT_SLIDING_VELOCITY = 0.25  # [m/s]
 _SECONDS_TO_FULL_SPEED = 0.2

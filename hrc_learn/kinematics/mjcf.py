@@ -53,8 +53,8 @@ def read_mjcf(path: Path) -> Description:
 
 
 def _model_without_missing_meshes(path: Path, mujoco: Any) -> Any | None:
-    """The model without the meshes whose files are missing, with a warning; None if the file
-    has another error.
+    """The model without meshes that have no file, with a warning; None if the file has another
+    error.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -210,7 +210,9 @@ class _Reader:
         return joints
 
     def _effort(self, j: int) -> float | None:
-        """Force or torque limit of a joint or of its first limited actuator; None: no limit."""
+        """Force [N] or torque [N m] limit of a joint, else of its first limited actuator; None:
+        no limit.
+        """
         model = self.model
         if model.jnt_actfrclimited[j]:
             return float(np.abs(model.jnt_actfrcrange[j]).max())
@@ -228,7 +230,9 @@ class _Reader:
         return None
 
     def _followers(self) -> dict[int, tuple[str, float, float]]:
-        """Leader, factor and offset of joints that an active equality couples or holds."""
+        """Leading joint, factor and offset of each joint that an active equality constraint
+        couples to another joint or holds in place, by the number of the joint.
+        """
         model, tied = self.model, {}
         for e in range(model.neq):
             if model.eq_type[e] == self.mujoco.mjtEq.mjEQ_JOINT and model.eq_active0[e]:

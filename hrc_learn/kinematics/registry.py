@@ -51,7 +51,7 @@ CAPSULES = Path(__file__).with_name("capsules.json")
 
 @cache
 def _sources() -> Mapping[str, Mapping[str, Any]]:
-    """Makers, other names and descriptions in installed packages, by the name of the arm."""
+    """Rows of registered_arms.toml by the name of the arm."""
     return read_toml(Path(__file__).with_name("registered_arms.toml"))
 
 
@@ -175,7 +175,7 @@ def installed_descriptions(name: str) -> list[Path]:
 
 
 def _names_of(file: Path) -> set[str]:
-    """Names under which a description is looked up."""
+    """Names by which `installed_descriptions` finds a description."""
     stem = _plain(file.stem)
     names = {stem, stem.removesuffix("robot"), stem.removesuffix("description")}
     # In robosuite, the folder has the robot's name, and each file is named robot.xml.

@@ -162,7 +162,7 @@ def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:
 
 
 def _unturned(path: Pose) -> Pose:
-    """The path, turned about the vertical so that the gripper finally closes along x."""
+    """The path, turned about the vertical so that the gripper closes along x at its end."""
     turn = turn_about_vertical(path.orientation[-1], gripper_down())
     back = quaternion.exp(torch.tensor([0.0, 0.0, -turn], dtype=torch.float64))
     return Pose(

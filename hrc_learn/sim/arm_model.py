@@ -228,7 +228,7 @@ def whole_arm(config: ArmModelConfig) -> CapsuleArm:
     half = plate.marker.plate_size / 2
     across = half / _STRIPS
     radius = float(np.hypot(across, _THICKNESS))
-    # Transform from the gripper's frame, at the flange, to that of the tool.
+    # Transform from the gripper's frame, at the flange, to the frame of the tool.
     centre = np.array(plate.position) - [0.0, 0.0, float(robot.tcp[:3, 3].norm())]
     capsules = []
     for k in range(_STRIPS):

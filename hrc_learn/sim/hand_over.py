@@ -49,7 +49,7 @@ _ASIDE, _WITHIN = (-0.22, 0.04), (0.08, 0.42)
 # `_LEANS`: largest lean of the trunk while the worker holds an object out [rad].
 # `_TRIED`: number of places tried until one is within the worker's reach.
 _LEANS, _TRIED = 0.45, 200
-# Speed of the final approach to the gripper, as a fraction of that of other movements.
+# Speed of the final approach to the gripper, as a fraction of the speed of other movements.
 _CAREFUL = 0.3
 
 

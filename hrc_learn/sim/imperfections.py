@@ -32,7 +32,7 @@ _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
-    """Sizes of the errors of a run, by default those of an ordinary laboratory.
+    """Sizes of the errors of a run; the defaults describe an ordinary laboratory.
 
     docs/concepts/experiments.md gives the sources. Standard deviations belong to normal
     distributions. A range is the largest error of a uniform distribution around zero.

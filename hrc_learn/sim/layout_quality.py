@@ -205,7 +205,7 @@ def marker_seen(
         q: Joint positions [rad].
     """
     tool = robot.forward(q)
-    # Transform from the gripper's frame, at the flange, to that of the tool.
+    # Transform from the gripper's frame, at the flange, to the frame of the tool.
     half = plate.marker.plate_size / 2
     corners = torch.tensor([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]).double() * half
     turn = torch.tensor(plate.orientation, dtype=torch.float64)

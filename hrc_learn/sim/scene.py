@@ -171,8 +171,8 @@ def _marked_arm() -> ArmModelConfig:
 class UnmarkedLook:
     """Clutter, light and prints of a scene without markers, drawn from a seed.
 
-    The physics stays that of the marked scene without its plates: clutter is visible but has no
-    contacts. Frames of markers stay as sites, as ground truth for measurements.
+    The physics stays the same, except that the marker plates are gone: clutter is visible but
+    has no contacts. Frames of markers stay as sites, as ground truth for measurements.
     """
 
     seed: int = 0
@@ -371,8 +371,8 @@ _FEELS_WORKER = 2
 
 
 def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig, ...]) -> None:
-    """Add a worker whose contacts exert no force: bodies with a prescribed motion do not yield
-    and would push with any force.
+    """Add a worker. Contacts with the worker exert no force: bodies with a prescribed motion do
+    not yield, and would push with any force.
     """
     for mover in ("link0", *(item.name for item in objects)):
         for geom in spec.body(mover).find_all(mujoco.mjtObj.mjOBJ_GEOM):

@@ -360,7 +360,7 @@ class WorkerSensor:
         return self._newest
 
     def _take(self, time: float) -> None:
-        """Take one image."""
+        """Take one image and, unless it is lost, queue the observation of the body."""
         self._taken += 1
         ends = self._ends_at(time)
         noise = self._sizes.person_noise * self._rng.standard_normal(ends.shape)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Box
 from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
 
-# Half the step of central differences for velocities [s], whose error is 0.1 mm/s at most.
+# Half the step of central differences for velocities [s]; they err by 0.1 mm/s at most.
 _HALF_STEP = 1e-4
 # Length of a walking step, as a fraction of the stature; two steps make a stride.
 STEP = 0.40
@@ -200,7 +200,9 @@ class WorkerVisit:
 def turned_about_base(
     points: Float[np.ndarray, "*points columns"], angle: float
 ) -> Float[np.ndarray, "*points columns"]:
-    """Points whose first two columns are x and y [m], turned about the vertical [rad]."""
+    """Points, with x and y in the first two columns [m], turned by an angle about the base's
+    vertical axis [rad].
+    """
     c, s = np.cos(angle), np.sin(angle)
     turned = points.copy()
     turned[..., :2] = points[..., :2] @ np.array([[c, s], [-s, c]])

@@ -265,7 +265,7 @@ class Workplace:
 
         Args:
             name: Name of the shelf.
-            half_size: Half size of the object [m]; that of the scene's first object when None.
+            half_size: Half edges of the object [m]; None: the scene's first object.
 
         Raises:
             ValueError: If there is no such shelf, or the place is not on its board.

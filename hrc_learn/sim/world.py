@@ -160,11 +160,11 @@ class World:
             self._watch.after_step()
             self._look_at_contacts()
         self._watch.check()
-        # After a step, the poses of bodies are still those before it: bring them up to date.
+        # After a step, MuJoCo's poses of bodies are still the old ones: bring them up to date.
         mujoco.mj_kinematics(self.model, self.data)
 
     def _look_at_contacts(self) -> None:
-        """Pass the contacts of one step to the monitors; mostly, none is watched."""
+        """Pass the contacts of one step to the monitors; most steps have no watched contact."""
         geoms = self.data.contact.geom
         watched = self._watched[geoms[:, 0], geoms[:, 1]].any()
         for monitor in self._monitors:
@@ -303,7 +303,7 @@ class World:
     def _touched(self, name: str) -> set[int]:
         """Numbers of the geoms that touch the geom of an object."""
         target, contact = self.model.geom(name).id, self.data.contact
-        # Excluded contacts, which exert no force, are those with the worker.
+        # Contacts with the worker are excluded: they exert no force.
         touching = (contact.dist < _TOUCHING) & (contact.exclude == 0)
         touching &= (contact.geom == target).any(axis=-1)
         return {*contact.geom[touching].ravel().tolist()} - {target}
@@ -367,7 +367,11 @@ class World:
 
 
 def _face(along: float) -> int:
-    """Face that a contact lies on, by the cosine of its normal: 1, -1, or 0 for neither."""
+    """Face on which a contact lies: 1 or -1 along an axis, or 0 for neither.
+
+    Args:
+        along: Cosine of the angle between the contact's normal and the axis.
+    """
     return 0 if abs(along) < _FLAT else int(math.copysign(1, along))
 
 

@@ -188,7 +188,7 @@ class SyntheticCamera:
         return image
 
     def _visible(self) -> list[tuple[Marker, Float[np.ndarray, "4 4"]]]:
-        """Markers whose front is in view, with their poses, farthest first."""
+        """Markers with their front in view, and their base-frame poses, farthest first."""
         hidden = self._hidden()
         eye = self.model.pose[:3, 3]
         seen = []

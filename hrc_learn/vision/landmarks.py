@@ -268,7 +268,13 @@ def _propagated(
     by_unknowns: Float[np.ndarray, "2 k"],
     error: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "2 2"]:
-    """Covariance of a pixel that depends on unknowns found by least squares."""
+    """Covariance of a pixel that depends on unknowns found by least squares [px^2].
+
+    Args:
+        slope: Derivative of the fitted pixels with respect to the unknowns.
+        by_unknowns: Derivative of the pixel with respect to the unknowns.
+        error: Errors of the fitted pixels [px].
+    """
     freedom = max(error.size - slope.shape[1], 1)
     variance = max((error**2).sum() / freedom, _LEAST_NOISE**2)
     # With columns of equal norm, the inverse is accurate enough.
