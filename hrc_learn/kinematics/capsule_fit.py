@@ -33,6 +33,7 @@ _CUTS = ((), (0.35,), (0.5,), (0.65,), (0.2, 0.8), (0.3, 0.7))
 _CORNERS = 16
 # Steps towards the smallest circle around points (Badoiu and Clarkson 2003).
 _CIRCLE_STEPS = 32
+# Seed and number of the random postures in which pairs of links are compared.
 _SEED, _POSTURES = 0, 2000
 # `_BARE_RADIUS`: radius of links of unknown shape [m], about that of a large arm's forearm.
 # `_BARE_FRACTION`: largest value of this radius, as a fraction of the arm's length.

@@ -1,6 +1,6 @@
 """Capsules of an arm: self-collision, and distances from boxes and from people.
 
-Each pair of a capsule of the arm and one of a person has a signed distance, a direction and a
+Each pair of an arm's capsule and a person's capsule has a signed distance, a direction and a
 gradient in closed form, so that a controller can keep all distances above zero:
 
     d_dot = gradient @ q_dot + direction . v
@@ -224,7 +224,7 @@ def nearest_on_segments(
     a, e = ((v * v).sum(-1).clamp(min=tiny) for v in (along, across))
     b, c, f = (along * across).sum(-1), (along * offset).sum(-1), (across * offset).sum(-1)
     determinant = (a * e - b * b).clamp(min=0)
-    # For nearly parallel segments any point of the first may be the nearest; a smaller
+    # For nearly parallel segments, any point of the first segment may be the nearest; a smaller
     # determinant is rounding.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant))

@@ -44,7 +44,7 @@ _FINGER_POSTURES = 5
 
 
 def read_description(path: Path) -> Description:
-    """Read a robot description. Its first element shows if it is URDF or MJCF.
+    """Read a robot description; the first element of the file shows if it is URDF or MJCF.
 
     Raises:
         ValueError: The file is neither URDF nor MJCF, or its links form no tree.

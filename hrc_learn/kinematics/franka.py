@@ -9,7 +9,7 @@ valid solution at the shoulder singularity (q2 = 0). Its results are checked her
 
 For the Research 3 it also misses most solutions outside the Panda's range (q6 > 3.7525 rad,
 |q7| > 2.8973, |q2| > 1.7628), unless all joints are within the range that Franka gives for
-constant velocity limits. It finds 81 % of the configurations in the whole range with
+constant velocity limits. The inverse finds 81 % of the configurations in the whole range with
 q4 < -0.467, and 99.8 % of such configurations within the Panda's range.
 
 Franka's meshes agree to 2 mm for both arms. They protrude from the capsules by at most 30 mm at

@@ -24,9 +24,10 @@ from hrc_learn.geometry.numerics import Constant, orthonormal_basis
 from hrc_learn.kinematics.chain import SerialChain
 
 type TaskSpace = Literal["pose", "nearest pose", "position+axis", "position"]
-"""Constrained part of the tool's pose: all of it, all but the rotation about its z axis, or the
-position. "nearest pose" equals "pose" for six joints or more; with fewer, it is the exact
-position with the nearest orientation that the joints can reach there.
+"""Constrained part of the tool's pose: the whole pose, the pose except for the rotation about
+the tool's z axis ("position+axis"), or the position. For arms with fewer than six joints,
+"nearest pose" is the exact position with the nearest orientation that the joints can reach
+there; for other arms, "nearest pose" equals "pose".
 """
 
 TASK_ROWS: dict[TaskSpace, int] = {
@@ -42,6 +43,7 @@ _LEVER = 0.3
 # tool lies 8 mm off the axis of the last joint, so this joint hardly moves the tool.
 _RANK, _LED = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
+# Starts per pose in each round, largest number of rounds, and iterations from each start.
 _STARTS, _ROUNDS, _ITERATIONS = 24, 6, 40
 # Largest error of a solution's position [m] and orientation [rad].
 _TOLERANCE = 1e-9

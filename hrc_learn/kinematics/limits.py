@@ -116,7 +116,8 @@ class JointLimits(MotionLimits):
     ) -> tuple[Float[Tensor, "*batch"], Int[Tensor, "*batch"]]:
         """Factor by which a path is too fast, and the limit that it breaks most.
 
-        Slowed down by this factor, the path keeps all limits; below 1, it keeps them already.
+        Slowed down by this factor, the path keeps all limits. If the factor is below 1, the
+        path keeps them already.
 
         Args:
             path: Joint positions [rad].

@@ -68,8 +68,8 @@ def maker_of(name: str) -> str:
 def arm_of_robot(robot_type: str | None) -> Arm | None:
     """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
 
-    It is also None if the package with the description is not installed. Our simulated robots,
-    such as mujoco_ur5e, carry the hand of the work cell.
+    The result is also None if the package with the description is not installed. Our simulated
+    robots, such as mujoco_ur5e, carry the hand of the work cell.
     """
     simulated = (robot_type or "").removeprefix("mujoco_")
     name = _registered_name(robot_type or "")

@@ -27,6 +27,7 @@ _SIMULATED_SERVOS = 0.01
 # `_BEYOND_CAPSULES`: distance by which person and arm may protrude from their capsules [m],
 # including the arm's calibration error.
 _RAMP, _BEYOND_CAPSULES = 0.02, 0.05
+# Fields of `Imperfections` that are fractions, and their largest value.
 _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
 

@@ -140,8 +140,8 @@ def marked_turns(
         for first in range(_HALF_TURN + 1):
             window = slice(first, first + _HALF_TURN + 1)
             seen, least = float(good[window].mean()), float(reached[window].amin())
-            # The fraction of views counts first, rounded to 1 %. Then the quality counts, less
-            # the shift of these turns from the middle ones.
+            # The fraction of poses with a view counts first, rounded to 1 %. Then the quality
+            # counts, less the distance of this half circle from the middle one.
             off_middle = abs(first - _HALF_TURN / 2) / _HALF_TURN
             score = (round(seen, 2), least - off_middle)
             if best is None or score > best[0]:

@@ -204,7 +204,7 @@ class MotionLog:
 
 _HIDDEN = 4  # geoms and sites of this group are not drawn
 _SHOWN = 1
-_SPECULAR, _SHININESS = 0.3, 0.4  # of painted metal and plastic
+_SPECULAR, _SHININESS = 0.3, 0.4  # highlights of painted metal and plastic
 
 
 class DrawnWorld:
