@@ -1,4 +1,4 @@
-"""The adaptive controller and the safety filter behind it."""
+"""Control of an arm near people: adaptive controller, arm loop, and safety filter."""
 
 from hrc_learn.controller.adaptive_controller import AdaptiveController as AdaptiveController
 from hrc_learn.controller.adaptive_controller import ControllerConfig as ControllerConfig

@@ -159,8 +159,8 @@ class Goals:
     """Posture approached in joint space before task-space feedback takes over; None: task-space
     feedback acts from the start."""
     rest: PostureRegion | None = None
-    """Posture to which the null space returns; None: it stays where task and people leave
-    it."""
+    """Posture to which the null space returns; None: the null space stays where task and people
+    leave it."""
 
     @property
     def task(self) -> TaskSpace:

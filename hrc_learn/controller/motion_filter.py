@@ -49,7 +49,7 @@ class MotionState:
         """State of a motion at a position, at rest by default.
 
         Raises:
-            ValueError: The position is not finite, from which no motion could recover.
+            ValueError: The position is not finite: no motion could recover from it.
         """
         position = np.asarray(position, dtype=np.float64)
         if not np.isfinite(position).all():

@@ -93,9 +93,9 @@ def resolved_rate(
     sigma_min where that is small.
 
     N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. At a
-    singularity the null space has more dimensions; N keeps only as many as elsewhere, and which
-    ones may change from one step to the next. The safety filter limits the resulting
-    acceleration.
+    singularity, the null space has more dimensions. N keeps only as many of them as elsewhere,
+    and the kept ones may change from one step to the next. The safety filter limits the
+    resulting acceleration.
 
     An arm with fewer joints than rows has no null space: its position follows the twist, its
     rotation as nearly as possible (`position_first`).

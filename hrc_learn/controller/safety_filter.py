@@ -443,12 +443,12 @@ class SafetyFilter(nn.Module):
         return state.velocity + wanted * dt, _acts(excess), _acts(jerky)
 
     def _stopping(self, given: _Inputs) -> Tensor:
-        """The velocity with which the arm brakes to rest, as hard as it can [rad/s]."""
+        """The velocity after one step of the hardest possible braking to rest [rad/s]."""
         still = torch.zeros_like(given.command)
         return self._limit_acceleration(given, still, given.bounds)[0]
 
     def _easing(self, given: _Inputs) -> Tensor:
-        """The velocity with which the arm brakes as the speed barrier assumes [rad/s]."""
+        """The velocity after one step of gentle braking, as in the speed barrier [rad/s]."""
         v, dt = given.state.velocity, given.dt
         T = self.speed_barrier.braking_time(v).clamp(min=dt)
         # Each joint ramps as fast as it can: a common ramp would last as long as the longest.
@@ -458,7 +458,7 @@ class SafetyFilter(nn.Module):
         return v + acceleration * dt
 
     def _keep_constraints(self, given: _Inputs, v: Tensor) -> tuple[Tensor, ConstraintReport]:
-        """The velocity nearest to a given one with which limits and distances are kept."""
+        """The velocity nearest to a given one that keeps limits and distances, and a report."""
         state, command = given.state, given.command
         assert given.jacobian is not None
         # The arm has picked up this fraction of the command so far.

@@ -126,7 +126,7 @@ class WorkerDistance:
         """The nearest of all pairs of geoms.
 
         Args:
-            held: Names of the objects that the robot holds: they count as parts of it.
+            held: Names of the objects that the robot holds; they count as parts of the robot.
         """
         model, data = self._world.model, self._world.data
         loads = [model.geom(name).id for name in held]
@@ -244,7 +244,7 @@ class DrawnWorld:
 class RecordedWorld:
     """A recorded run, which can be rendered at any of its steps.
 
-    It needs the recording only: runs of any task, simulated or not, can be shown without the
+    Only the recording is needed: runs of any task, simulated or not, can be shown without the
     world in which they took place.
 
     Attributes:

@@ -154,8 +154,8 @@ def marked_plate(size: float = 1.0, thickness: float = 0.0) -> Plate:
         size: Size of the hand relative to the Franka hand.
         thickness: Radius of the links above the hand, beyond which the plate sticks out [m].
     """
-    # The plate sticks out sideways, so that the forearm does not hide it from above. It is as
-    # wide as objects and mounted off the middle, so that it does not touch boards first.
+    # The plate sticks out sideways, so that the forearm does not hide it from above. The plate
+    # is as wide as objects and mounted off the middle, so that it does not touch boards first.
     return Plate(
         marker=Marker(HAND_MARKER, 0.048 * size),
         position=(-0.008 * size, max(0.145 * size, thickness + _BEYOND), 0.02 * size),
