@@ -244,7 +244,7 @@ def scale_null_space(
         The scaled null-space velocity [rad/s].
     """
     at_rest = null == 0
-    if everywhere(at_rest):
+    if everywhere(at_rest & ~task.isnan()):
         return null
     # A joint without null-space motion does not bound the factor: divided by the smallest
     # number, its bounds become infinite, or of the wrong sign where the task alone is too fast.

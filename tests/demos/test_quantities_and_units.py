@@ -261,7 +261,7 @@ def test_names_from_before_fractions_were_introduced_are_of_degrees():
     labels = [f"main_{name}" for name in SO101]
     decision = joint_decision(swept(80, 95, 70, 60, 90, 50), labels, robot_type="so100")
     assert (decision.unit, decision.doubt) == ("deg", None)
-    assert "before -100..100" in decision.evidence
+    assert "older than -100..100" in decision.evidence
 
 
 def test_commands_of_fewer_joints_tell_nothing_of_the_others():

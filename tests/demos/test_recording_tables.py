@@ -104,7 +104,7 @@ def test_columns_of_parquet(tmp_path):
     assert found["image"].tolist() == [b"ab", b"cd"]
     ragged = pa.table({"q": pa.array([[1.0, 2.0], [3.0], None])})
     pq.write_table(ragged, path)
-    with pytest.raises(DatasetError, match="holds vectors of 0 to 2 components: all frames"):
+    with pytest.raises(DatasetError, match="holds vectors of 0 to 2 components: all must be"):
         read_parquet_table(path)
     path.write_bytes(b"PAR1")
     with pytest.raises(DatasetError, match="cannot be read as Parquet"):

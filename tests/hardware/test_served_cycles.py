@@ -362,7 +362,7 @@ def test_only_joint_velocities_move_the_arm(robot):
     robot.joint_position_control(np.ones(7))  # as the package holds an arm without a motion
     np.testing.assert_array_equal(robot._world.velocity, np.zeros(7))
     robot._set_server(SimpleNamespace(current_motion_id=4))
-    with pytest.raises(NotImplementedError, match="joint velocities only"):
+    with pytest.raises(NotImplementedError, match="joint velocity motions only"):
         robot.joint_position_control(np.ones(7))
     robot._set_server(None)
     robot.joint_position_control(np.ones(7))

@@ -97,7 +97,7 @@ def test_a_pose_is_reached_from_nearby():
 
 
 def test_targets_too_far_apart_are_refused():
-    with pytest.raises(ValueError, match="raise the rate"):
+    with pytest.raises(ValueError, match="raise the frame rate"):
         PositionServo(panda, Joints(READY), 0.5)
 
 
