@@ -164,13 +164,13 @@ def uncoupled_step(
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
 ) -> DMPState | None:
-    """`step` for one motion without coupling, in NumPy and a third of the time.
+    """`step` for one motion without coupling, computed with NumPy in a third of the time.
 
     For so few numbers, dispatch in PyTorch takes far longer than the arithmetic.
 
     Returns:
         State after the step. None where NumPy does not apply: the motion is differentiated,
-        mapped or traced, is a batch, is on another device or is not in float64.
+        mapped or traced, is a batch, is not on the CPU or is not in float64.
     """
     tensors = (
         *(weights, state.position, state.rate, state.target, state.forced),
@@ -211,7 +211,7 @@ def uncoupled_step(
 def numpy_approach(
     s: float, fraction: float, displacement: Float64[np.ndarray, "D"]
 ) -> Float64[np.ndarray, "2 D"]:
-    """`approach_state` of one motion, times its displacement."""
+    """`approach_state` of one motion at `s`, times the displacement from start to goal."""
     m, slope = minimum_jerk(s / fraction)
     return np.multiply.outer([m - 1.0, slope / fraction], displacement)
 

@@ -1,7 +1,7 @@
 """Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
-`step` takes the terms as `phase_stopping` or as `coupling`. Each obstacle is given by the
-nearest point on its surface, so the terms need no shapes.
+`step` of a primitive takes the terms as `phase_stopping` or as `coupling`. Each obstacle is
+given by the nearest point on its surface, so the terms need no shapes.
 
 Errors of force, and of the distance to a second arm, act on the velocity (Gams et al. 2014,
 "Coupling movement primitives: interaction with the environment and bimanual tasks"). The spring
@@ -28,7 +28,7 @@ from torch import Tensor
 from hrc_learn.dmp.dynamics import SpringDamper
 
 TOUCH = 1e-3
-"""Distance [m] below which repulsion stops growing; it would have no bound at contact."""
+"""Distance [m] below which repulsion stops growing, so that it stays finite at contact."""
 
 
 def phase_stopping(
@@ -36,7 +36,7 @@ def phase_stopping(
 ) -> Float[Tensor, "*batch"]:
     """Slow-down for a robot that is held back: gain |planned - measured|^2.
 
-    (Ijspeert et al. 2013, "Dynamical movement primitives", section 2.5; here it slows the
+    (Ijspeert et al. 2013, "Dynamical movement primitives", section 2.5; here the gain slows the
     whole system instead of the phase alone, so that the motion waits on its path.)
 
     Args:
@@ -122,8 +122,9 @@ def velocity_coupling(
 ) -> Float[Tensor, "*batch D"]:
     """Coupling for `step` that acts as a term C added to the velocity.
 
-    The result is alpha / tau V + (1 + lead) V_dot with V = C / tau, from the equations at the
-    top of this module without z: a proportional and a derivative term of the error.
+    The result is alpha / tau V + (1 + lead) V_dot with V = C / tau, a proportional and a
+    derivative term of the error. It follows from the equations at the top of this module by
+    elimination of z.
 
     Args:
         velocity: V, such as gain * (wanted - measured force) [m/s].

@@ -213,8 +213,8 @@ class GaussianBasis:
         """Normalised time after which the forcing is lost in float64 rounding."""
         if self.domain == "phase":
             return self.phase.horizon
-        # At x spacings past the end, the last Gaussian is exp((1/2 - x) / width^2) times the
-        # one without a weight; exp(-39) = 1e-17.
+        # At x spacings past the end, the last Gaussian that has a weight is the one without a
+        # weight times exp((1/2 - x) / width^2); exp(-39) = 1e-17.
         end = 1 + (0.5 + 39 * self.width**2) / (self.count - 1)
         return min(end, self.phase.horizon)
 
@@ -222,9 +222,9 @@ class GaussianBasis:
     def smooth_interval(self) -> float:
         """Normalised time over which the forcing is nearly a polynomial of low degree.
 
-        Between two neighbours, a normalised Gaussian is a logistic function of s, whose scale
-        is width^2 times the spacing. Its nearest pole, in the complex plane, is pi times this
-        scale away.
+        Between two neighbours, a normalised Gaussian is a logistic function of s with the scale
+        width^2 times the spacing. The nearest pole of this function, in the complex plane, is
+        pi times the scale away.
         """
         # 1.4 width^2 is 0.45 of the distance to the nearest pole, pi width^2.
         handover = min(0.5, 1.4 * self.width**2) / (self.count - 1)
@@ -361,7 +361,7 @@ class SplineBasis:
 
 def cubic_spline(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Cubic B-spline on the knots -2, -1, 0, 1, 2; exactly zero beyond them."""
-    # Truncated powers of the distance to the nearer end, near which no digits cancel.
+    # Truncated powers of the distance to the nearer end, so that no digits cancel there.
     inwards = 2 - x.abs()
     outer, inner = inwards.clamp_min(0), (inwards - 1).clamp_min(0)
     return (outer**DEGREE - 4 * inner**DEGREE) / math.factorial(DEGREE)

@@ -38,7 +38,7 @@ TRACED_BATCH = 3
 ROUNDINGS = 8
 """Angles up to this many machine epsilons count as zero: quaternion products round 7 times."""
 TRACED_STEP = 1e-3
-"""Step [s] with which a program is traced; it accepts any other when it runs."""
+"""Step [s] with which a program is traced; the program then accepts any step."""
 
 type Tensors = dict[str, Tensor]
 

@@ -51,7 +51,7 @@ class Demonstrated:
 class Scaling:
     """Linear map of the forcing term, determined by start and goal.
 
-    It accepts tensors, or arrays with `xp=numpy`, so that fits, rollouts, steps and the
+    `scale` accepts tensors, or arrays with `xp=numpy`, so that fits, rollouts, steps and the
     `Stepper` use one definition.
     """
 
@@ -73,8 +73,8 @@ class Scaling:
 
     @property
     def turns(self) -> bool:
-        """True if the map rotates: weights are in the frame of the demonstration, and the start
-        velocity is scaled too.
+        """True if the map rotates. Weights are then in the frame of the demonstration, and the
+        start velocity is scaled too.
         """
         return self.name == "rotation"
 
@@ -171,7 +171,7 @@ def _rotated(values: Any, displacement: Any, reference: Demonstrated, xp: Module
 
 
 def _bisector(a: Any, b: Any, xp: ModuleType) -> Any:
-    """Unit vector along a + b, or orthogonal to a where the sum vanishes."""
+    """Unit vector along a + b, or orthogonal to a where this sum nearly vanishes."""
     axis = xp.arange(a.shape[-1], device=a.device) == abs(a).argmin(-1)[..., None]
     orthogonal = -a * (a * axis).sum(-1)[..., None] + axis
     middle = a + b

@@ -124,7 +124,7 @@ class FramedDMP:
 
     @classmethod
     def of(cls, dmps: JointDMP, frames: Frames, tolerance: float | None = None) -> "FramedDMP":
-        """Learn from primitives (n) of demonstrations; arguments as for `fit`."""
+        """Learn from a batch of n primitives, one per demonstration; arguments as for `fit`."""
         x = dmps.coordinates().detach().double()
         if x.ndim != 3 or len(x) < 2:
             raise ValueError("frames need a batch of 2 demonstrations or more")

@@ -32,7 +32,7 @@ LIMIT_SAMPLES = 2001
 """Number of times at which limits are checked: 40 for each of 50 basis functions. A peak
 between two of these times is higher by less than 1e-3 of its height."""
 TOLERANCE = 1.05
-"""Ratio to the smallest held-out error up to which an error counts as equal to it."""
+"""Held-out errors up to this multiple of the smallest error count as equal to the smallest."""
 DEFAULT_COUNT = 50
 """Default number of basis functions. 50 functions follow recordings of arms to 5e-5 of the
 range; fewer would not make a motion without noise smoother."""
@@ -106,7 +106,7 @@ def _unscaled(
     scaling: Scaling,
     names: Sequence[str] | None,
 ) -> Float[Tensor, "B D N"]:
-    """Weights for the given scaling.
+    """Weights for the given scaling, from weights of the unscaled forcing term.
 
     Raises:
         ValueError: A motion for which the scaling is singular.
@@ -370,7 +370,7 @@ def fit_shared(
 def _accumulate(
     demonstrations: Sequence[tuple[Times, Points]], response: Response
 ) -> tuple[Float[Tensor, "1 m m"], Float[Tensor, "4 D"], int]:
-    """Over all processes: products, sums of start, goal, range and duration, sample count."""
+    """Sums over all processes: products, rows (start, goal, range, duration), sample count."""
     D, rows, products, sums = 0, 0, None, None
     for i, (time, position) in distributed.local_items(demonstrations):
         samples = _checked(i, time, position)

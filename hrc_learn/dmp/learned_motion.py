@@ -1,6 +1,6 @@
 """Learning of a motion with the model that predicts each demonstration best from the others.
 
-A primitive is fitted to each of n demonstrations; a motion is linear in its coordinates x_j.
+A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n.
 All models except frames compute the coordinates for a context c (known before the motion) as
 x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest demonstration, means
 weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge regression on
@@ -207,7 +207,7 @@ class LearnedMotion:
     """Motion as a function of start, goal, and a context or frames, predicted by one model."""
 
     each: MotionPrimitive
-    """Primitives (n) of the demonstrations, with a common reference for orientations."""
+    """Batch of n primitives, one per demonstration; orientations have a common reference."""
     context: Float[Tensor, "n C"]
     by_ends: bool
     """True if the context consists of start and goal, in columns."""
@@ -445,7 +445,7 @@ def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor
 
 
 def _from_frames(each: JointDMP, frames: Frames) -> Float[Tensor, "n D M"]:
-    """Coordinates of each demonstration, predicted from its frames and all other ones."""
+    """Coordinates of each demonstration, predicted from its frames and the other n - 1."""
     n, made = len(each), []
     for i in range(n):
         rest = torch.arange(n) != i

@@ -64,8 +64,7 @@ class LinearPrimitive(nn.Module):
 
     (paper eqs. (eq_tf), (eq_cs)); primes are derivatives with respect to s. Without coupling,
     the motion is a linear map of weights, start, start velocity and goal, computed exactly; see
-    `Response`.
-    Leading batch dimensions hold one primitive each.
+    `Response`. Each element of the leading batch dimensions is one primitive.
     """
 
     weights: Tensor
@@ -391,8 +390,8 @@ class LinearPrimitive(nn.Module):
     ) -> DMPState:
         """Advance by `dt` [s], exactly for terms that are constant over the step.
 
-        Arguments are those of `MotionPrimitive.step`, in columns; `external_acceleration`
-        [1/s^2], (*batch, D), is its `coupling`.
+        Arguments are as in `MotionPrimitive.step`, but in columns; `external_acceleration`
+        [1/s^2], (*batch, D), takes the place of `coupling`.
         """
         if not isinstance(dt, float):
             dt = to_tensor(dt, torch.float64, state.duration.device)

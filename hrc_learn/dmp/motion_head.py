@@ -137,8 +137,8 @@ class MotionHead(nn.Module):
         """Motion from a given state.
 
         To plan again during a motion, call the head with new parameters and the current state;
-        a new motion then begins. With `since` as well, the motion continues from this state at
-        its current phase, and ends when the first motion would have ended.
+        a new motion then begins. If `since` is given too, the motion continues from this state
+        at its current phase, and ends when the first motion would have ended.
 
         Args:
             parameters: Parameters from a network.
@@ -146,7 +146,7 @@ class MotionHead(nn.Module):
                 rests at its start.
             start: Start, or current position, (*batch, D).
             start_velocity: Velocity at the start [1/s], (*batch, D); zero by default.
-            since: Time [s] of the current state, (*batch); no time may be before it.
+            since: Time [s] of the current state, (*batch); `time` must not be earlier.
             origin: Start of the path to the goal, (*batch, D), only with `since`; `start` by
                 default.
 
@@ -318,7 +318,7 @@ class MotionHead(nn.Module):
         return fixed[0] if duration is None else duration, fixed[1] if delay is None else delay
 
     def _normalised(self, time: Times, plan: "_Plan") -> tuple[Tensor, Tensor | None]:
-        """Normalised times since the end of the delay, and a mask of times before it."""
+        """Normalised times since the end of the delay, and a mask of times during the delay."""
         time = seconds(time, plan.duration.device)
         s = (time - plan.delay.double()[..., None]) / plan.duration.double()[..., None]
         waiting = s < 0 if self.latest > 0 else None

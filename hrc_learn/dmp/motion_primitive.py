@@ -347,7 +347,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
         An orientation becomes its error on the branch nearest to the motion, so both signs of
         a quaternion mean the same. An angular velocity becomes the rate of the error at the
-        given orientation or, without one, at that of the motion.
+        given orientation, or at the orientation of the motion if none is given.
 
         Args:
             time: [s], (*batch, n).

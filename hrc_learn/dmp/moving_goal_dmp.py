@@ -73,7 +73,7 @@ torch.export.register_dataclass(
 class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]):
     """Joint primitive that passes its goal with a given velocity.
 
-    Values are (*batch, D) in the units of the demonstration, velocities the same per second.
+    Values are (*batch, D) in the units of the demonstration; velocities are per second.
     `rollout` and `initial_state` meet the `end_velocity` exactly at the end of the duration;
     without it, the goal does not move. The value of `goal` is where the moving goal is at the
     end of the duration.

@@ -45,7 +45,7 @@ from hrc_learn.model_files import SavedModel
 
 
 class ErrorColumns:
-    """Error of an orientation among the columns of a motion, over time or in one state."""
+    """Access to the orientation error in the columns of a trajectory or of a state."""
 
     error_columns: ClassVar[slice] = slice(0, 3)
     motion: Any

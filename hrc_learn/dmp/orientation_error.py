@@ -24,7 +24,7 @@ MEAN_ITERATIONS = 10
 """Number of iterations that compute a mean. Each reduces the distance to the mean to a small
 fraction of it, or of its cube if all orientations are close together."""
 NORM_TOLERANCE = 1e-2
-"""Deviation from one up to which the norm of a recorded quaternion is corrected."""
+"""Deviation from 1 up to which the norm of a recorded quaternion is corrected."""
 
 
 def to_error(

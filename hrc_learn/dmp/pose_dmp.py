@@ -24,7 +24,7 @@ POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
 
 
 class PoseColumns:
-    """Pose and body among the columns of a motion, over time or in one state."""
+    """Access to pose and body in the columns of a trajectory or of a state."""
 
     motion: Any
 

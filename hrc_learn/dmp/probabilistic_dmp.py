@@ -135,8 +135,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     """Gaussian over the coordinates x = (weights, start velocity, start, goal) of a primitive.
 
     A motion is linear in its coordinates, y(s) = H(s) x, and therefore Gaussian too: means,
-    likelihoods and conditioning on via points are closed form. The Gaussian is joint over all
-    columns, in float64. Any kind of primitive is accepted; for orientations and poses, the
+    likelihoods and conditioning on via points have a closed form. The Gaussian is joint over
+    all columns, in float64. Any kind of primitive is accepted; for orientations and poses, the
     error to one reference is Gaussian.
     """
 
@@ -355,7 +355,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         E, k = spread[:, -2:].flatten(0, 1), self.dependence
         back = torch.linalg.pinv(E, rtol=SINGULAR)
         z = k * (back @ (ends - self.mean[:, -2:]).flatten())
-        # A root of I - k^2 P, where P projects onto what start and goal determine.
+        # Square root of I - k^2 P, where P projects onto what start and goal determine.
         left = torch.eye(len(z)).to(E) - (1 - (1 - k**2) ** 0.5) * (back @ E)
         mean = torch.cat([(self.mean + spread @ z)[:, :-2], ends], dim=1)
         remaining = torch.nn.functional.pad(spread[:, :-2] @ left, (0, 0, 0, 2))

@@ -70,8 +70,8 @@ def motion(
 class CoefficientTable:
     """Map from coordinates to the coefficients of a motion, or of one of its derivatives.
 
-    Each piece has K coefficients: those of 1, u, u^2 ... with u from -1 to 1 along the piece,
-    and those of functions of time that are not polynomial. One more piece covers all times
+    Each piece has K coefficients: of the powers 1, u, u^2 ... with u from -1 to 1 along the
+    piece, and of functions of time that are not polynomial. One more piece covers all times
     after the forcing. The state at the end of the forcing, relative to the goal, decays there
     as the unforced spring does.
     """
@@ -120,7 +120,7 @@ class CoefficientTable:
 
 
 def spring_rows(response: Response, s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:
-    """Row of exp(A s) A^order that maps (y - g, y') at s = 0 to the derivative of y at `s`."""
+    """First row of exp(A s) A^order: maps (y - g, y') at 0 to the derivative of y at `s`."""
     spring = response.spring
     C, S = spring.modes(s, torch)
     first, second = C + S * (spring.alpha / 2), S
@@ -213,7 +213,7 @@ def _rows(
 def _flat_pieces(piece: Int[Tensor, "B T"]) -> tuple[Int[Tensor, "BT"], int]:
     """Piece numbers over the whole batch, and the number of pieces per motion.
 
-    Pieces after the latest time are left out: often they are a quarter of all.
+    Pieces after the latest time are left out; these are often a quarter of all pieces.
     """
     pieces = int(piece.max()) + 1
     first = torch.arange(len(piece), dtype=piece.dtype, device=piece.device)
@@ -223,7 +223,7 @@ def _flat_pieces(piece: Int[Tensor, "B T"]) -> tuple[Int[Tensor, "BT"], int]:
 def power_by_power(
     rows: Float[Tensor, "B pieces K D"], flat: Int[Tensor, "BT"], powers: Float[Tensor, "B T K"]
 ) -> Float[Tensor, "B T D"]:
-    """Sum of rows weighted by powers: 2.6 times as fast as `embedding_bag` on a GPU (H200).
+    """Sum of rows weighted by powers, 2.6 times as fast as `embedding_bag` on a GPU (H200).
 
     Args:
         rows: Coefficients of each motion.

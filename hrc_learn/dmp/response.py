@@ -38,8 +38,8 @@ GRIDS_KEPT = 16
 take 10 MB in float32 with 50 functions."""
 
 SMALL_MATRIX_CORES = {"SkylakeX", "Cooperlake", "SapphireRapids"}
-"""OpenBLAS core types (version 0.3.29) with kernels for small matrices, which skip packing: all
-processors with AVX-512, including AMD's."""
+"""OpenBLAS core types (version 0.3.29) with kernels for small matrices, which skip packing.
+These are all processors with AVX-512, including AMD's."""
 MINIMUM_ROWS = 4
 """Number of rows from which these kernels are faster than one flat product of all motions."""
 
@@ -201,7 +201,7 @@ class Response:
         self._latest: TimeGrid | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A copy or an unpickled response is the shared one of the same parts.
+        # Copies and unpickled responses are the one cached response with these parts.
         return response_of, (self.spring, self.basis, self.approach)
 
     def matrices(
@@ -300,8 +300,8 @@ class Response:
         knots = interval * torch.arange(n_pieces + 1, dtype=torch.float64)
         points = interval * chebyshev_points()
         increments = torch.stack([self._impulse(knots[:-1], point) for point in points], dim=1)
-        # States at the knots, from rest at the first: a parallel prefix sum (Hillis and Steele
-        # 1986) with log2(K) steps.
+        # States at the knots, starting from rest at the first knot, by a parallel prefix sum
+        # (Hillis and Steele 1986) with log2(K) steps.
         state, stride = torch.nn.functional.pad(increments[:, -1], (0, 0, 0, 0, 1, 0)), 1
         while stride < len(knots):
             E = propagate(knots[stride:] - knots[:-stride])

@@ -33,8 +33,8 @@ LIKELIHOOD_MARGIN = 1.0
 """Twice the logarithm of the largest likelihood ratio that is not significant. A margin of two
 standard deviations would be 4."""
 CLEAN = 2e-5
-"""Noise relative to the range below which samples stay as they are: the accuracy of a fit with
-fifty functions."""
+"""Samples with less noise than this, relative to the range, stay unchanged. It is the accuracy
+of a fit with fifty functions."""
 ORDER = 3
 """Order of the penalised differences; third differences are zero for motions without jerk."""
 SAMPLES_EACH = 1.5
@@ -452,7 +452,7 @@ class _Spline:
         c = self.projected(y) @ self.V
         e, r = self.data, 1 - self.data
         strengths = torch.logspace(*STRENGTHS)[:, None].to(y)
-        # The prior precision of coordinate k is lambda r_k, that of the samples e_k.
+        # Precisions of coordinate k: strength * r_k from the prior, e_k from the samples.
         total = e + strengths * r
         free = r < 1e-9
         n = T - int(free.sum())

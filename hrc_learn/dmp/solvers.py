@@ -310,7 +310,7 @@ def fit_ridge(
         targets: Targets of the samples.
         regularization: Positive; 1 gives penalty and data equal weight.
         standardize: True to divide features by their standard deviation. False suits
-            features on one scale, where those that hardly vary should have little effect.
+            features in one unit; features that hardly vary then have little effect.
 
     Raises:
         ValueError: Fewer than 2 samples, or a regularization that is not positive.

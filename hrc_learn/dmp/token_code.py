@@ -4,8 +4,8 @@ Each token answers a series of questions about the integers, in order: is the fi
 is it positive, is its magnitude above a threshold, is the next one zero, ... The questions of a
 token form a binary tree with one leaf for each token of the vocabulary. Splitting the most
 probable leaf until the vocabulary is used up makes all tokens about equally probable (Tunstall
-1967, "Synthesis of noiseless compression codes"), so that each carries nearly the most
-information it can. Every leaf stands for possible integers: no sequence is invalid, and a
+1967, "Synthesis of noiseless compression codes"), so that each carries nearly as much
+information as possible. Every leaf stands for possible integers: no sequence is invalid, and a
 prefix determines the first integers.
 
 Encoder and decoder build equal trees on every machine, because the trees depend only on sums,
@@ -26,7 +26,7 @@ from torch import Tensor
 END = 0
 """Token after which all integers are zero; it also pads."""
 PRIOR = 20.0
-"""Number of vectors as which the Laplace prior counts, when added to the counted integers."""
+"""Weight of the prior (a Laplace distribution) of each integer, as a number of vectors."""
 LEAST = 0.02
 """Mean magnitude assumed for an integer that was always zero."""
 HEADROOM = 2.0
@@ -133,7 +133,7 @@ class TokenCode:
         return Interval(index, 0, 0, self._largest[index] if index < self.size else 0)
 
     def _split(self, state: Interval) -> tuple[int, float, Interval, Interval]:
-        """Threshold of the next question, probability of its first branch, then both states."""
+        """Next question: threshold, probability of the first branch, and both new states."""
         index, sign, low, high = state
         if low and not sign:
             return -1, 0.5, state._replace(sign=1), state._replace(sign=-1)

@@ -55,8 +55,8 @@ class MotionTokenizer(nn.Module):
     """Map between motions of D columns and tokens 0 ... vocabulary_size - 1.
 
     Token 0 ends and pads sequences. Every sequence decodes to a motion within the demonstrated
-    range, extended by a tenth to either side; the first tokens of a
-    sequence decode to a coarser motion.
+    range, extended by a tenth to either side. The first tokens of a sequence decode to a
+    coarser motion.
     """
 
     end = END
@@ -120,7 +120,7 @@ class MotionTokenizer(nn.Module):
             motions: (N, T, D) or a list of (T_i, D); the first sample is the start.
             vocabulary_size: Number of tokens.
             start_velocity: Velocity at the start [1/s], (N, D), if it will be known whenever a
-                motion is encoded or decoded: it saves about 7 % of the tokens.
+                motion is encoded or decoded; this saves about 7 % of the tokens.
             start_known: True if the start will be known; False: tokens determine it.
             tolerance: Root mean square error of decoded motions, relative to the range of each
                 column between its quantiles of 1 and 99 %.
@@ -227,8 +227,8 @@ class MotionTokenizer(nn.Module):
 
         Args:
             ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.
-            time: Time since the start [s], (T,) or (*batch, T), at any rate. After its end, a
-                motion rests.
+            time: Time since the start [s], (T,) or (*batch, T), at any sampling rate. After
+                its end, a motion rests.
             start: (*batch, D); by default the mean start, or the encoded one.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
                 tokenizer was fitted with velocities, otherwise the encoded one.
@@ -256,7 +256,7 @@ class MotionTokenizer(nn.Module):
         return whole
 
     def length(self, ids: Sequence[int]) -> int:
-        """Number of tokens that a network has to predict: more would not change the motion."""
+        """Number of tokens that a network has to predict; more would not change the motion."""
         for i in range(1, len(ids) + 1):
             if ids[i - 1] == END or self._code.decode(ids[:i])[1]:
                 return i
@@ -352,8 +352,7 @@ class MotionTokenizer(nn.Module):
 class ActionProcessor:
     """Tokens of action chunks with the interface of FAST's processor, which LeRobot calls.
 
-    The tokens encode the start of a chunk too, because the interface does not pass
-    the start.
+    The tokens encode the start of a chunk too, because the interface does not pass the start.
     """
 
     pad_token_id = eos_token_id = END

@@ -33,9 +33,9 @@ QUINTIC = torch.tensor(
 """Coefficients of Hermite's quintics without second derivatives at the ends of [0, 1]: for the
 change of the value, and for the rates at the start and the end."""
 DEPENDENT = 1e-12
-"""Relative singular value below which a constraint follows from the others."""
+"""Relative singular value below which a constraint counts as implied by the others."""
 OVERSHOOT = 1.5
-"""Largest change of a motion relative to that of the curve through its via points."""
+"""Largest allowed change of a motion, relative to the curve of changes that is asked for."""
 CLOSEST, CLOSEST_TO_WINDOW = 2, 6
 """Smallest distances at which motions do not overshoot, in units of the distance between basis
 functions. `CLOSEST`: between via points, and to start and end. `CLOSEST_TO_WINDOW`: to the ends

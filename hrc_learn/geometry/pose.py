@@ -88,7 +88,7 @@ class Pose:
         """Motion to `other` as (linear [m], angular [rad]) in the parent frame.
 
         The angular part is the rotation vector of R_other R_self^T. So for close poses this is
-        the geometric Jacobian times the joint motion, which a difference of `vector()` is not.
+        the geometric Jacobian times the joint motion, unlike the difference of `vector()`s.
         """
         turn = quaternion.multiply(other.orientation, quaternion.conjugate(self.orientation))
         move = other.position - self.position

@@ -180,7 +180,7 @@ def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
 
 
 def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
-    """Meshes in a file [m], at their positions in its scene, with their colours."""
+    """Meshes in a file [m], each placed in the scene of the file, and with its colour."""
     try:
         import collada  # noqa: F401  # needed by trimesh for COLLADA
         import trimesh

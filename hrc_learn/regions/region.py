@@ -269,7 +269,7 @@ class VisionRegion(Region):
         target: Float[Tensor, "*batch rows"],
         image_size: tuple[int, int],
     ) -> VisionRegion:
-        """Largest ellipse about the target that stays inside the image.
+        """Largest ellipse around the target that stays inside the image.
 
         Args:
             target: Desired feature position (u, v) [px].
@@ -345,7 +345,7 @@ class JointRegion(Region):
     margin: float = static(0.1)
     """Distance from the limit at which the steep repulsion starts [rad]."""
     reference_margin: float = static(0.3)
-    """Distance at which the weak repulsion of the reference region starts [rad]."""
+    """Distance from the limit at which the weak repulsion (reference region) starts [rad]."""
     stiffness: float = static(10.0)
     """k_q."""
     reference_stiffness: float = static(1.0)
@@ -356,7 +356,7 @@ class JointRegion(Region):
     def from_limits(
         cls, lower: Float[Tensor, "*batch n"], upper: Float[Tensor, "*batch n"], **options
     ) -> JointRegion:
-        """Region of the joint limits [rad]; `options` are the remaining fields."""
+        """Region between joint limits [rad]; `options` are the remaining fields."""
         return cls(centre=(lower + upper) / 2, half_range=(upper - lower) / 2, **options)
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both n"]:
