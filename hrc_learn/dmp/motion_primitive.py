@@ -288,9 +288,10 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         goal_body: Vectors | None = None,
         filtered: bool = True,
     ) -> State:
-        """State with a new goal, and the same value, velocity and acceleration.
+        """State with a new goal, and the same value and velocity.
 
-        The acceleration is continuous in the next steps if they have a `goal_filter`.
+        With `filtered`, the acceleration is the same too. It is then continuous in the next
+        steps if they have a `goal_filter`.
 
         Args:
             state: Current state.

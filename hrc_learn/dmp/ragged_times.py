@@ -37,7 +37,7 @@ CHUNK = {"cpu": 2**16, "cuda": 2**22}
 the time for a million samples; on a GPU, they occupy the device and take under a gigabyte."""
 LONG = 2**14
 """Number of samples of a grid above which the matrices of the grid would take more memory and
-time than the motion."""
+time than motions with few columns."""
 
 
 def motion(

@@ -62,7 +62,7 @@ class PositionRegion(Region):
 
     Far from a small box this pull grows with the cube of the distance. The axis with the
     largest offset then dominates, and a cap on the twist leaves almost nothing for rotation.
-    `formulation="saturated"` is equal up to twice the half size, f = 3. Farther out, its pull
+    `formulation="saturated"` is the same up to twice the half size, f = 3. Beyond, its pull
     grows linearly, so the tool moves straight to the box:
 
     P = sum_i k_c 3 (f_i - 3/2),   f_i > 3
