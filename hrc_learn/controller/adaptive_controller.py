@@ -87,7 +87,10 @@ class ControllerConfig:
 
     @classmethod
     def paper(cls) -> ControllerConfig:
-        """Settings of the law as printed in the paper: no extensions but the safety filter."""
+        """Settings of the law as printed in the paper, without our extensions of the law.
+
+        The safety filter stays.
+        """
         return cls(
             linear_speed=math.inf,
             angular_speed=math.inf,

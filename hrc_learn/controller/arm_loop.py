@@ -52,7 +52,7 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# The constraint layer slows the task down by at least this fraction; less is rounding.
+# If the constraint layer slows the task down by less than this fraction, that is rounding.
 _SLOWED = 1e-3
 # Norm of the whole twist below which the task counts as at rest [m/s and rad/s mixed].
 _AT_REST = 1e-3
@@ -73,8 +73,8 @@ class ArmLoop:
         Args:
             chain: Kinematics and limits of the arm.
             config: Settings of the loop.
-            clearance: Function for the distance of the arm from itself and its surroundings;
-                None: a push can move the arm anywhere within its limits.
+            clearance: Function that returns the distance of the arm from itself and its
+                surroundings; None: a push can move the arm anywhere within its limits.
         """
         self.chain, self.clearance = chain, clearance
         config = config or ArmLoopConfig()

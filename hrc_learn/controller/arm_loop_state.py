@@ -100,8 +100,8 @@ class ArmReading:
     """Far end of a load in the frame of the end effector [m]. The cap on the tool's speed also
     holds there. None: no load."""
     people: WatchedPeople | None = None
-    """People near the arm: they slow it down, and the safety filter keeps its distance from
-    them. None: people are not tracked."""
+    """People near the arm: they slow the arm down, and the safety filter keeps the arm at a
+    distance. None: people are not tracked."""
     stop: Bool[Tensor, "*batch"] | None = None
     """True where the arm must come to rest because of people; None: nowhere."""
     explain: bool = static(False)

@@ -35,9 +35,9 @@ from hrc_learn.pytree import pytree, zero_where
 
 # Violations of a limit up to this are rounding.
 _TOLERANCE = 1e-10
-# The row of a limit counts as linearly dependent on the active rows if this fraction of it, or
-# less, lies in their null space. Rounding leaves 1e-16; with weights of 1e7, a fraction of 1e-7
-# of a row is significant.
+# The row of a limit counts as linearly dependent on the active rows if its part in their null
+# space is shorter than this fraction of the row. Rounding leaves 1e-16; with weights of 1e7, a
+# fraction of 1e-7 of a row is significant.
 _DEPENDENT = 1e-12
 
 

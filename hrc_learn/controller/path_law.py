@@ -336,12 +336,14 @@ class PathLaw:
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        # Joints on the path that lag without a push touch something: they do not go aside.
+        # Joints on the path that lag without a push have touched something: they do not count
+        # as aside.
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
         lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)
-        # Joints return while the path waits for them and, with "return", after the push.
+        # Joints return while the path waits for them and, if `after_push` is "return", also
+        # after the push.
         returns = path.rate <= 0
         if config.after_push == "return":
             alignment = joint_path.return_alignment(null_error, error)

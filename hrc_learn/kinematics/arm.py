@@ -83,7 +83,7 @@ class FingerJoint:
     carrier: str | None = None
     """Joint of the gripper that carries this joint; None: the hand carries it."""
     mount: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    """Frame of the joint at zero, in the frame of the carrier; in that of the tool if None."""
+    """Frame of the joint at zero, in the frame of the carrier or, without one, of the tool."""
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector of the axis in the joint's frame."""
     meshes: tuple[MeshFile, ...] = ()

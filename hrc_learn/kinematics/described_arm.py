@@ -326,7 +326,7 @@ def _inertias(
         if link.inertia is not None:
             more, before = pose @ link.inertia @ pose.T, inertia[number]
             inertia[number] = more if before is None else before + more
-    # The frame of the flange carries no bodies. Without a gripper, nor does the tool's frame.
+    # The frame of the flange carries no bodies, and without a gripper the tool's frame neither.
     for number in {last + 1, last + 2} - {number for number, _ in bodies.values()}:
         masses[number], inertia[number] = 0.0, np.zeros((4, 4))
     return {"masses": tuple(masses), "inertia": tuple(inertia)}
