@@ -118,12 +118,12 @@ def differentiable_sum(tensor: Tensor) -> Tensor:
 
 
 def data_parallel(module: nn.Module) -> nn.Module:
-    """Module with its gradients averaged over processes."""
+    """Wrap a module so that its gradients are averaged over processes."""
     return module if count() == 1 else nn.parallel.DistributedDataParallel(module)
 
 
 class LazyMap[S, T](Sequence[T]):
-    """Map of a sequence whose items are computed on access, such as episodes of a dataset."""
+    """Function applied to the items of a sequence, such as episodes of a dataset, on access."""
 
     def __init__(self, items: Sequence[S], function: Callable[[S], T]):
         self._items, self._function = items, function

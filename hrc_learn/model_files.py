@@ -27,7 +27,7 @@ def write_model(
     Args:
         folder: Folder of the model.
         kind: Class of the model, checked when the folder is read.
-        config: Contents besides the tensors, as JSON values.
+        config: Contents other than tensors, as JSON values.
         tensors: Tensors by name.
 
     Raises:

@@ -65,7 +65,7 @@ class Touch:
     """Two objects in contact, from `start` until `end`."""
 
     first: str
-    """Geom of the moving side (arm, hand or carried object)."""
+    """Collision geometry (MuJoCo's geom) of the moving side: arm, hand or carried object."""
     second: str
     """Geom that the moving side touched."""
     start: float
@@ -194,7 +194,7 @@ class Reason:
     text: str
     """Text for the person, such as "joint 4 is at its limit"."""
     kept: float = 1.0
-    """Fraction of the motion that this reason leaves, 0 to 1; 1 if it is only mentioned."""
+    """Fraction of the motion that this reason leaves, 0 to 1; 1 for a mere remark."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,8 +22,8 @@ def pytree[T](cls: type[T]) -> type[T]:
     """Register a dataclass as a pytree: `static` fields are structure, other fields children.
 
     A field that is None has no child, so an optional tensor may be absent. Unlike
-    `torch.export.register_dataclass`, this supports static fields for floats, because `vmap`
-    refuses floats as leaves.
+    `torch.export.register_dataclass`, this function supports static fields, which floats need:
+    `vmap` refuses floats as leaves.
     """
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     children = [f.name for f in fields if not f.metadata.get("static")]

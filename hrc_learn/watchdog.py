@@ -83,7 +83,8 @@ class Watchdog:
         """Set up the watchdog; silence counts from the first `feed`, or from entering `with`.
 
         Args:
-            timeout: Longest silence [s]; noticed at most a quarter of this time late.
+            timeout: Longest silence [s]. A longer one is noticed at most a quarter of this time
+                late.
             stop: Brings the arm to rest. Called once for every silence, and again if it fails.
             clock: Current time [s].
 

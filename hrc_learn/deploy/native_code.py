@@ -350,7 +350,7 @@ class NativeStep:
             self._rest(vectors, whole)
 
     def _rest(self, vectors: Sequence[Tensor], begin: int) -> None:
-        """Take the step for the last arms of a batch, which are fewer than the lanes."""
+        """Take the step for the last arms of a batch, from `begin` on: fewer than `lanes`."""
         rows = [x.view(len(x), -1)[:, begin:] for x in vectors]
         copies = [row.new_zeros(len(row), self._lanes) for row in rows]
         for copy, row in zip(copies, rows, strict=True):

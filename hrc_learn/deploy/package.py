@@ -1,4 +1,4 @@
-"""The control step as a function of vectors, and the file format of its compiled form.
+"""Pack a control step into a function of vectors, and define the files of its compiled form.
 
 A compiled step reads and writes three vectors of numbers instead of dataclasses: any language
 can fill them, and a step allocates nothing. The metadata (`step.json`) lists the rows that each
@@ -236,7 +236,8 @@ _LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtyp
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
 LANES, WORKSPACE = "hrc_learn.lanes", "hrc_learn.workspace"
-"""Keys of the machine code: number of arms at once, and size of its workspace in numbers."""
+"""Keys of the machine code: number of arms computed at once, and size of the workspace in
+numbers."""
 
 CODE, DESCRIPTION = "step.o", "step.json"
 """Files of a compiled step: machine code, and the metadata as one JSON object."""

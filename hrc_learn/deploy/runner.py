@@ -127,7 +127,7 @@ class EagerRunner(StepRunner):
     """A control step without compilation."""
 
     def __init__(self, controller: Steppable, observation: StepObservation):
-        """Prepare the step; later observations must have the fields of this one."""
+        """Prepare the step; later observations must have the same fields as `observation`."""
         self._packed = PackedStep(controller, observation)
         super().__init__(self._run_eagerly, self._packed.layouts, self._packed.first_state)
         self.observe(observation)

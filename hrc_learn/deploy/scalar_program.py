@@ -218,7 +218,7 @@ def scalar_program(program: ExportedProgram, dtype: torch.dtype) -> ScalarProgra
     Args:
         program: Trace of a step on vectors of shape (rows, *batch), without a batch or with a
             small one.
-        dtype: Type of its numbers.
+        dtype: Floating-point type of the numbers.
 
     Raises:
         UnknownOperationError: An operation is not known here, or an arm of the batch depends

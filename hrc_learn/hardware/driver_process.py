@@ -106,8 +106,8 @@ class DriverProcess:
         """Start the process and wait until its driver is connected.
 
         Args:
-            serve: Runs in the process, given its end of the connection and the arguments; must
-                be picklable. See `opened` and `answer_calls`.
+            serve: Function that runs in the process, with the process's end of the connection
+                and `arguments`; must be picklable. See `opened` and `answer_calls`.
             arguments: Further arguments of `serve`.
             name: Name of the device.
 

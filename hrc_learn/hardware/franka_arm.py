@@ -102,7 +102,7 @@ class FrankaArm(Connected):
         self._names, limits = chain.joint_names, chain.limits
         self._rest = config.rest_timeout(limits.velocity, limits.acceleration, limits.jerk)
         self._shared, self._orders = Shared(), Orders()
-        # Held by threads of this process that command; the loop never waits for it.
+        # Lock among the threads of this process that command. The loop never waits for it.
         self._writing = threading.Lock()
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
@@ -265,8 +265,8 @@ class FrankaArm(Connected):
 
     def _end(self) -> None:
         if self._process.is_alive():
-            # It hangs or is suspended. Once its connection is lost, the control box ends the
-            # motion.
+            # The process hangs or is suspended. Once its connection is lost, the control box
+            # ends the motion.
             self._process.kill()
         self._process.join()
         if self.gripper is not None:
@@ -321,7 +321,7 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         dt=CYCLE,
     )
     if config.load is not None and config.load.far_end is not None:
-        # Converted from the flange's frame to that of the tool centre point.
+        # Converted from the flange's frame to the frame of the tool centre point.
         offset = chain.tcp.new_tensor(config.load.far_end) - chain.tcp[:3, 3]
         example = replace(example, load=chain.tcp[:3, :3].T @ offset)
     open_runner = partial(EagerRunner, step, example)

@@ -77,7 +77,8 @@ def import_pylibfranka() -> Any:
     """Import Franka's Python binding.
 
     Raises:
-        ImportError: It is not installed, or conflicts with another driver in this process.
+        ImportError: The binding is not installed, or conflicts with another driver in this
+            process.
     """
     return imported(
         "pylibfranka",
@@ -90,7 +91,7 @@ def _take_priority(needed: bool) -> None:
     """Set real-time priority, if this is allowed.
 
     Raises:
-        RealtimeError: It is needed, but not allowed.
+        RealtimeError: The priority is needed, but not allowed.
     """
     highest = os.sched_get_priority_max(os.SCHED_FIFO)
     try:
@@ -197,7 +198,7 @@ class ControlLoop:
         """Connect to the arm.
 
         Args:
-            shared: Memory in common with the commanding process.
+            shared: Memory through which the commanding process sends orders and reads reports.
             ip: Address of the control box.
             config: Settings of the loop.
             runner: Exported step with the period `CYCLE`.

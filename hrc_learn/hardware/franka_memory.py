@@ -101,11 +101,11 @@ class Orders(Numbers):
     stamp: float = -np.inf
     """Time at which the velocity was set, on `time.monotonic` [s]."""
     stop: bool = False
-    """True brakes to rest, whatever the velocity."""
+    """True: brake to rest, whatever the velocity."""
     recoveries: int = 0
     """Number of recoveries requested."""
     end: bool = False
-    """True brings the arm to rest and ends the loop."""
+    """True: bring the arm to rest and end the loop."""
     joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
     """Wanted joint velocity [rad/s]."""
 

@@ -209,7 +209,7 @@ class FrankyArm(Connected):
         self._fastest, self._rest = np.array(limits[0], float), config.rest_timeout(*limits)
 
     def _recover(self) -> None:
-        with suppress(Exception):  # the error of the last motion, which is recovered from
+        with suppress(Exception):  # the last motion's error, cleared below
             self._robot.poll_motion()
         if not self._robot.recover_from_errors():
             raise self._stopped(self._robot.state, "its error recovery failed")
@@ -218,8 +218,8 @@ class FrankyArm(Connected):
     def _move(self, motion: Any) -> None:
         """Begin a motion.
 
-        The driver then starts the thread that communicates with the control box; it inherits
-        the priority of the calling thread.
+        The driver then starts the thread that communicates with the control box. This thread
+        inherits the priority of the calling thread.
         """
         before = _scheduling()
         os.sched_setscheduler(0, *self._scheduling)

@@ -63,7 +63,7 @@ class GripperThread(Connected):
     """A `Gripper` that neither blocks nor raises within an arm's control loop.
 
         with GripperThread(open_driver) as gripper:
-            gripper.move(0.0)  # returns at once; 0 squeezes
+            gripper.move(0.0)  # does not wait; 0 squeezes
             gripper.width  # newest reading
             gripper.check()  # raises what has failed since `move`
 

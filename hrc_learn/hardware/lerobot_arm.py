@@ -62,7 +62,7 @@ class LeRobotConfig:
     zeros: dict[str, float] = field(default_factory=dict)
     """Joint positions, in the arm's description, at which LeRobot's values are 0 [rad]."""
     reversed: tuple[str, ...] = ()
-    """Joints whose direction is opposite to that in the description."""
+    """Joints whose direction in LeRobot is opposite to the direction in the description."""
 
 
 class LeRobotArm(Connected):

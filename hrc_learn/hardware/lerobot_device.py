@@ -26,7 +26,7 @@ def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -
 
     Args:
         kind: Robot or teleoperator.
-        settings: LeRobot's settings, such as type, port and id, without the prefix of the kind.
+        settings: LeRobot's settings, such as type, port and id, without "robot." or "teleop.".
 
     Raises:
         ValueError: There is no such type or setting, or one is missing.
@@ -102,7 +102,7 @@ def _config(kind: str, settings: Mapping[str, Any]) -> Any:
     values = {k: str(v) if k == "id" else v for k, v in settings.items()}
     try:
         return draccus.decode(base, values)
-    except Exception as error:  # draccus raises several kinds for the same mistake
+    except Exception as error:  # draccus raises several kinds of errors for the same mistake
         raise ValueError(f"--{kind}.*: {in_words(error)}") from error
 
 
@@ -142,7 +142,8 @@ class JointUnits:
             joint_names: Joints of the arm: either with the device's names or in its order.
             unit: Unit of values without a calibration, "deg" or "rad".
             zeros: Joint positions at which LeRobot's values are 0 [rad].
-            reversed_joints: Joints whose direction is opposite to that in the description.
+            reversed_joints: Joints whose direction in LeRobot is opposite to the direction in
+                the arm's description.
 
         Raises:
             ValueError: The joints of arm and device differ, or their unit is unknown.

@@ -240,7 +240,8 @@ _SLOWEST, _FASTEST = 0.4, 1.0
 _SPEED = 0.15
 # `_DT`: period of the readings of arm and camera [s]. `_LONGEST`: longest delay searched [s].
 _DT, _LONGEST = 0.01, 0.5
-# Degree of the polynomial that is fitted to the pixels: perspective makes it nonlinear.
+# Degree of the polynomial that is fitted to the pixels: perspective makes them nonlinear in the
+# joint position.
 _POWERS = 3
 # Step between the delays tried [s]; the minimum is interpolated between them.
 _STEP = 2e-3

@@ -99,7 +99,7 @@ class ArmServer:
         return self.world.time - (self._sent - 1) * CYCLE
 
     def begin(self) -> None:
-        """Restart the time of `advance` here, so that connecting does not count."""
+        """Count the time of `advance` from now on, so that connecting does not count."""
         self._due = self.world.time
 
     def advance(self, duration: float) -> None:
@@ -177,8 +177,8 @@ class ArmServer:
                 time.sleep(max(0.0, CYCLE - (time.monotonic() - started)))
 
     def _cycle(self) -> None:
-        """Send the state to the driver and step the physics; the answer counts in the next
-        cycle.
+        """Step the physics, and send the new state to the driver. The driver's answer counts in
+        the next cycle.
         """
         robot = self.robot
         robot.step()
@@ -259,8 +259,8 @@ def serve_world(world: World) -> Iterator[ArmServer]:
     """Serve a world's arm until the block ends.
 
     Args:
-        world: The world, at rest; it must not be reset within the block. There, its physics
-            runs in steps of 1 ms.
+        world: The world, at rest; it must not be reset within the block. Within the block, its
+            physics runs in steps of 1 ms.
 
     Raises:
         ImportError: The package franky-sim is not installed.

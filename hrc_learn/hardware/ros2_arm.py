@@ -247,7 +247,7 @@ class Ros2Arm(Connected):
             coast = np.clip(elapsed - self._step, 0, rest)
             moved = min(elapsed, self._step) + coast * (1 - 0.5 * coast / rest)
         else:
-            # The arm has waited at the last position: catching up at once would be a jump.
+            # The arm has waited at the last position: a sudden catch-up would be a jump.
             held = min(now, self._commanded_at + rest) - self._moved_at
             moved = np.clip(held, 0, rest / 3)
         here, limits = state.joint_position, self._chain.limits

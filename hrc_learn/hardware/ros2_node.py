@@ -34,7 +34,7 @@ from hrc_learn.store import read_toml
 PARAMETERS: dict[str, list] = read_toml(Path(__file__).with_name("ros2_parameters.toml"))
 """Parameters of the node, read at `configure`: default, range and meaning."""
 _REPORTS = 0.1
-"""Period of the markers [s]; that of the diagnostics is ten times as long."""
+"""Period of the markers [s]. The period of the diagnostics is ten times as long."""
 _RECENT = 500
 """Number of newest commands whose latency the diagnostics report."""
 _HISTORY = 500
@@ -116,7 +116,7 @@ class ControllerNode:
         return self.node.get_parameter(name).value
 
     def _connect(self) -> None:
-        """Subscribe to the topics of tasks and people; create those of monitors."""
+        """Subscribe to the topics of tasks and people, and publish topics for monitors."""
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PointStamped, PoseStamped
         from sensor_msgs.msg import CompressedImage, Image

@@ -85,8 +85,8 @@ def quality(*, reliable: bool = False, latched: bool = False) -> Any:
     """Quality of service that keeps the newest message only.
 
     Args:
-        reliable: True resends lost messages, for commands. States use best effort, which
-            accepts both kinds of publishers: a resent state would be outdated.
+        reliable: True resends lost messages, for commands. False (best effort) is for states,
+            because a resent state would be outdated; it accepts both kinds of publishers.
         latched: True keeps the last message for later subscribers, for descriptions.
     """
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

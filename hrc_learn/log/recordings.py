@@ -132,7 +132,7 @@ class StepLog(LoggedSteps):
         """Add a row.
 
         Raises:
-            ValueError: The row lacks a column, has a new one, or has one of another shape.
+            ValueError: The row lacks a column, has a new column, or a value of another shape.
         """
         if self._dtype is None:
             self._open(values)
@@ -264,7 +264,7 @@ class RunRecording:
     region: Box | None = None
     """Cartesian region in which visual servoing takes over."""
     active_region: Float[np.ndarray, "time 6"] | None = None
-    """Centre and half edges of the position region of the controller at each step [m]; NaN
+    """Centre and half edge lengths of the controller's position region at each step [m]; NaN
     without a controller in the loop."""
     drawn: Bool[np.ndarray, " time"] | None = None
     """True while the region was drawn by a person."""

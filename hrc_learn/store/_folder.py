@@ -176,7 +176,7 @@ def delete_files(folder: Path, patterns: Iterable[str]) -> bool:
 
     Args:
         folder: The folder.
-        patterns: Patterns of the temporary files' relative paths; * matches / too.
+        patterns: Patterns of the temporary files' relative paths; "*" also matches "/".
 
     Returns:
         True if the folder is gone.
@@ -199,7 +199,8 @@ class Kind:
 
     name: str
     files: tuple[str, ...] = ()
-    """Patterns of the package's files, for a folder that users may extend; * matches / too.
+    """Patterns of the package's files, for a folder that users may extend; "*" also matches
+    "/".
 
     Such a folder may lack a manifest, and its foreign files are carried over. Without patterns,
     a folder that holds foreign files is not replaced.
@@ -224,7 +225,7 @@ DATASET = Kind(
 
 
 def owned_entries(folder: Path, kind: Kind) -> set[str] | None:
-    """Entries of a folder that its writer made, and that may be deleted with it.
+    """Entries of a folder that this package wrote, and that may be deleted with the folder.
 
     Args:
         folder: The folder.

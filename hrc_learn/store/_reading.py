@@ -38,7 +38,7 @@ def read_json[T](
 
     Args:
         path: File to read.
-        schema: Dataclass of its content, or `dict` for any object.
+        schema: Dataclass of the file's content, or `dict` for any object.
         advice: Remedy for a damaged file, the end of the error message.
 
     Raises:
@@ -66,8 +66,8 @@ def parse_json[T](
     """Parse JSON from anywhere.
 
     Args:
-        data: Text in UTF-8. The caller bounds its size.
-        schema: Dataclass of its content, or `dict` for any object.
+        data: Text in UTF-8, whose size the caller must bound.
+        schema: Dataclass of the content, or `dict` for any object.
         source: Name of the origin, the beginning of the error message.
         advice: Remedy, the end of the error message.
 

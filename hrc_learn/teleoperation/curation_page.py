@@ -125,7 +125,7 @@ class CurationPage:
         for episode in episodes:
             cameras = self._images.available(episode["episode"])
             episode["cameras"] = [self._images.cameras.index(key) for key in cameras]
-        # The most typical episode is shown next to every other.
+        # The most typical episode is shown next to every other episode.
         known = [q for q in self.ranking.episodes if "distance" in q.measures and not q.broken]
         usual = min(known, key=lambda q: q.measures["distance"], default=None)
         return {

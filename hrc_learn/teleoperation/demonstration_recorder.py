@@ -30,8 +30,8 @@ to reach the goal."""
 _SHORTEST = 0.5
 """Shortest demonstration [s]: a mouse click on a link moves the arm for a shorter time."""
 _MOST_LOST, _LONGEST_GAP = 0.05, 0.2
-"""Fraction of lost frames, and gap [s], above which a demonstration is doubted. During such a
-gap, the end effector moves by 10 cm at 0.5 m/s.
+"""A demonstration is doubted above these values. `_MOST_LOST`: fraction of lost frames.
+`_LONGEST_GAP`: gap [s]; at 0.5 m/s, the end effector moves by 10 cm in such a gap.
 """
 _AT_LIMIT = 0.03
 """Distance from its limit up to which a joint counts as being at the limit [rad]. The safety
@@ -100,7 +100,7 @@ class RecordingQuality:
 
     @property
     def pace(self) -> float:
-        """Elapsed time of the arm's clock divided by that of the person's clock.
+        """Elapsed time of the arm's clock divided by elapsed time of the person's clock.
 
         A simulation slower than real time makes the recorded motion faster than the
         demonstrated one.
@@ -185,13 +185,13 @@ RecorderState = Literal["ready", "recording", "stopped"]
 """State of a recorder. "stopped": a demonstration waits to be saved or discarded."""
 
 _LATE, _MOST_LATE = 2.0, 0.2
-"""Delay in control periods after which a frame counts as late, and the fraction of late frames
-above which a demonstration is doubted. One in five, so that a briefly busy machine raises no
-warning.
+"""`_LATE`: gap before a frame above which the frame counts as late [frame periods].
+`_MOST_LATE`: fraction of late frames above which a demonstration is doubted; one in five, so
+that a briefly busy machine raises no warning.
 """
 _SLOWEST = 0.8
-"""Pace of a simulated arm below which a demonstration is doubted: in the dataset, the motion is
-a quarter faster than demonstrated, and even faster reproductions would meet limits."""
+"""Pace of a simulated arm below which a demonstration is doubted. At this pace, the motion in
+the dataset is a quarter faster than demonstrated; even faster ones would meet limits."""
 _DRAFT_EVERY = 2.0
 """Shortest period of drafts of the open demonstration [s]."""
 
@@ -214,7 +214,7 @@ class RecorderStatus:
 
 
 class DemonstrationRecorder:
-    """Records one demonstration at a time, and writes those that are worth saving.
+    """Records one demonstration at a time, and writes each demonstration worth saving.
 
     A person needs seconds from the button to the arm, and back: the recorder leaves out most of
     this rest before and after the motion.

@@ -96,9 +96,9 @@ class Gamepad(Human):
     """Moves the end effector by sticks: the left one horizontally, the right one vertically.
 
     Shoulder buttons open and close the gripper, the others send the requests of `BUTTONS`. The
-    end effector turns by the coarse orientation rule. An unplugged gamepad requests nothing.
-    The gamepad rumbles when the arm touches something, slows down for people or does not
-    follow.
+    end effector turns to the orientation that `coarse_orientation` gives for its position. An
+    unplugged gamepad requests nothing. The gamepad rumbles when the arm touches something,
+    slows down for people or does not follow.
     """
 
     def __init__(
@@ -247,8 +247,8 @@ _GRIPPER = {"[": OPEN, "]": 0.0}
 class TerminalKeyboard(Human):
     """Moves the end effector by keys: i, k away and back; j, l left, right; u, o up, down.
 
-    [ opens the gripper, ] closes it; `KEYS` has the requests. The end effector turns by the
-    coarse orientation rule.
+    [ opens the gripper, ] closes it; `KEYS` has the requests. The end effector turns to the
+    orientation that `coarse_orientation` gives for its position.
     """
 
     def __init__(
@@ -258,7 +258,7 @@ class TerminalKeyboard(Human):
 
         Args:
             chain: The arm that is guided.
-            typed: Returns the characters typed since its last call, without waiting.
+            typed: Returns the characters typed since the last call, without waiting.
             keys: State of the keys.
         """
         self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
@@ -294,7 +294,7 @@ class TerminalKeyboard(Human):
 
 
 def _take_terminal() -> None:
-    """Receive characters at once and without echo; restore the terminal at exit."""
+    """Receive each character immediately and without echo; restore the terminal at exit."""
     import atexit
     import termios
     import tty
@@ -330,15 +330,15 @@ _HAPTIC_PERIOD = 0.001
 _HAPTIC_STALE = 0.1
 """Time without feedback from the control loop after which the force vanishes [s]."""
 _HAPTIC_CLUTCH = 0
-"""Button that closes the clutch while it is held."""
+"""Button that closes the clutch while it is pressed."""
 
 
 class HapticDevice(Human):
     """Guides the end effector while the clutch is held, and renders the tracking error as a
     force.
 
-    When the clutch closes, a virtual pointer starts at the end effector. It moves with the
-    device, scaled by 2.5, and the end effector follows it like a gizmo. The person feels how
+    When the clutch closes, a virtual pointer starts at the end effector. The pointer moves with
+    the device, scaled by 2.5, and the end effector follows the pointer. The person feels how
     far the arm is behind:
 
         f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force

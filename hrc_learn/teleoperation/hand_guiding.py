@@ -168,7 +168,10 @@ def guiding_twist(
     config: InteractionForceConfig,
     turn: Float[torch.Tensor, "4"] | None = None,
 ) -> Float[np.ndarray, "6"]:
-    """Twist of a hand-guided end effector, which turns by the coarse orientation rule.
+    """Twist of a hand-guided end effector, in the base frame.
+
+    The end effector turns to the orientation that a rule (`coarse_orientation`) gives for its
+    position.
 
     Args:
         pose: Pose of the end effector.
@@ -457,8 +460,8 @@ class InputFilterConfig:
 class InputFilter(Human):
     """Bounds the acceleration of the end effector in human input.
 
-    A pressed key requests full speed at once, and a released gizmo none: without the filter,
-    the arm would jerk, and so would motions learned from it.
+    A pressed key requests full speed immediately, and a released gizmo requests rest. Without
+    the filter, the arm would jerk, and so would motions learned from it.
     """
 
     def __init__(self, human: Human, config: InputFilterConfig | None = None):

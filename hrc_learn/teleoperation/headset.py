@@ -33,8 +33,8 @@ PEDESTAL = Box(
 """Pedestal of the arm."""
 
 _TRIANGLES = 1500
-"""Largest number of triangles per colour of a body. The Panda then has 29,000 rather than
-135,000, and a browser without a graphics processor draws it in half the time.
+"""Largest number of triangles per colour of a body. The Panda then has 29,000 triangles rather
+than 135,000, and a browser without a graphics processor draws the arm in half the time.
 """
 _AGGRESSION = 5
 """Parameter `aggression` of fast-simplification, 0 to 10. With this value and `_TRIANGLES`,
@@ -169,7 +169,7 @@ def box_mesh(box: Box) -> Trimesh:
 
 def body_meshes(body: Body) -> dict[Colour, Trimesh]:
     """Meshes that show a body, one per colour: its own meshes, simplified, and its named boxes.
-    A body without meshes is shown by its capsules and boxes, in the colour of the first.
+    A body without meshes is shown by its capsules and boxes, in the colour of its first shape.
     """
     import trimesh
 

@@ -44,7 +44,7 @@ class HeldGizmo:
 
 
 Key = tuple[Hashable, str]
-"""Holder, which distinguishes clients, and name of the held gizmo."""
+"""Holder (identifier of a client), and name of the held gizmo."""
 
 
 class HeldGizmos:
@@ -156,7 +156,7 @@ class HeldGizmos:
 
     @property
     def turning(self) -> bool:
-        """True while somebody holds the rings."""
+        """True while a person holds the rings."""
         return self._turning is not None
 
     def clear_turn(self) -> None:
@@ -321,7 +321,7 @@ def gizmo_command(
     direction: Float[np.ndarray, "3"] = _NOWHERE,
     turn: Float[torch.Tensor, "4"] | None = None,
 ) -> GizmoCommand:
-    """Command of held gizmos and keys. Their inputs add up, with the bounds of a single one.
+    """Command of held gizmos and keys. All inputs add up, with the bounds of a single gizmo.
 
     Args:
         chain: Kinematics of the arm.
@@ -330,7 +330,8 @@ def gizmo_command(
         config: Gains and bounds of gizmos.
         direction: Direction in which keys move the end effector, as a fraction of the largest
             speed; zero: no key is pressed.
-        turn: Rotation added to the coarse orientation rule (wxyz); None: no rotation.
+        turn: Rotation added to the orientation that `coarse_orientation` gives (wxyz); None: no
+            rotation.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
     d, velocity = np.zeros(len(chain.joint_names)), config.speed * direction

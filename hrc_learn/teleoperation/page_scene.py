@@ -1,5 +1,5 @@
-"""The page's 3D scene: meshes of the arm, its virtual twin and the furniture, and the
-dragging of links, knobs and the end effector's gizmo by the mouse.
+"""Draw the page's 3D scene (arm, its virtual twin, furniture), and react to the mouse, which
+drags links, knobs and the end effector's gizmo.
 """
 
 from __future__ import annotations

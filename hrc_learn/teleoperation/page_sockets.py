@@ -35,7 +35,7 @@ from hrc_learn.teleoperation.gate.gate import (
 )
 from hrc_learn.teleoperation.page_scene import ViserServer
 
-_STATUS_EVERY = 0.1  # [s]
+_STATUS_EVERY = 0.1  # period of the status [s]
 _SCENE_EVERY = {"leads": 1 / 60, "watches": 1 / 20}
 """Period of scenes for the controlling client, and for each of many that watch [s]."""
 _SECRET_HEADER = "X-Page-Secret"
@@ -50,20 +50,20 @@ _REMEMBERED = 3.0
 class _Client:
     may_lead: bool
     heard: float
-    """Time of its last sign of life [s]."""
+    """Time of the client's last sign of life [s]."""
     lag: float = 0.0
-    """Time since its page last responded [s]."""
+    """Time since the client's page last responded [s]."""
     asked: float = math.inf
-    """Time at which it requested control [s]; infinite: it has not."""
+    """Time at which the client requested control [s]; infinite: it has not."""
     slowed: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
-    """Time at which it was last slow, its silence and its lag then [s]."""
+    """Time at which the client was last slow, and its silence and lag at that time [s]."""
 
 
 class Control:
     """Gives control to one of several clients; the others watch and may request control.
 
-    The first client to join has control and keeps it until it hands over or leaves. A client
-    that requests control also gets it when the controlling client has been idle for 10 s.
+    The first client to join has control, and keeps control until it hands over or leaves. If
+    the controlling client is idle for 10 s, the client that has waited longest gets control.
     Control is never taken away during a drag. Safe to use from several threads.
     """
 
@@ -100,7 +100,7 @@ class Control:
         self._lock = RLock()
 
     def join(self, client: str, *, may_lead: bool = True) -> None:
-        """Add a client. It gets control if no other client has it and it may lead."""
+        """Add a client. With `may_lead`, it gets control if no other client has control."""
         with self._lock:
             self._clients[client] = _Client(may_lead, self._clock())
             if may_lead and self._leader is None:
@@ -180,7 +180,9 @@ class Control:
 
     @property
     def gone(self) -> bool:
-        """True if the controlling client has been silent for longer than `timeout`."""
+        """True if no client has control, or the controlling client has been silent, or its page
+        unresponsive, for longer than `timeout`.
+        """
         return not self._within(self._timeout)
 
     @property
@@ -204,8 +206,8 @@ class Control:
 
         Returns:
             `role` ("leads" or "watches"), `taken` (true if any client has control), `asked`
-            (for the leader: true if another client requests control; for the others: true if
-            they have) and `may_lead` (false for a client that may only watch).
+            (for the leader: true if another client has requested control; for another client:
+            true if it has requested control) and `may_lead` (false: it may only watch).
         """
         with self._lock:
             self._pass_on()
@@ -332,7 +334,7 @@ class PageSockets:
                     self._heard(message)
 
     async def view(self, connection: ServerConnection, visitor: Visitor) -> None:
-        """Relay messages between viser and its page, after checking those of the page."""
+        """Relay messages between viser and its page, and check all messages of the page."""
         from websockets.asyncio.client import connect
         from websockets.typing import Subprotocol
 

@@ -151,7 +151,7 @@ class RegionEditor:
 
         Args:
             region: The region.
-            active: True if it attracts the end effector; None: as before.
+            active: True if the region attracts the end effector; None: as before.
         """
         if active is not None:
             self._in_force.value = active

@@ -188,8 +188,8 @@ class ScenarioRun:
             scenario: Task to perform.
             fps: Commands per second of the world's time.
             seed: Seed of the first initial configuration.
-            imperfections: Imperfections of arm, calibration and workplace, drawn for each seed
-                again; None: no imperfections.
+            imperfections: Imperfections of arm, calibration and workplace, drawn again for each
+                seed; None: no imperfections.
             worker: Reaction of the arm to a worker at the table; None: no worker. Each seed
                 draws another worker.
         """
@@ -380,7 +380,7 @@ class ScenarioView:
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Present image, RGB."""
-        if self._world is not self._run.world:  # it was rebuilt with other imperfections
+        if self._world is not self._run.world:  # rebuilt with other imperfections
             self._open()
         return self._camera.read()
 

@@ -58,7 +58,7 @@ _PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
 """Ranges of the pause between two pulls and of the duration of a pull [s]. The paper's drags of
 joint 4 last 4 to 7 s."""
 _FAR_AWAY = 10.0
-"""Distance of the point that a pull is directed to [m]: far, so that its direction stays."""
+"""Distance of the point that a pull is directed to [m]: so far that the direction stays."""
 _SLOPE = math.radians(30.0)
 """Largest angle of a pull to the horizontal [rad]: people pull an elbow aside."""
 _FORCE = 60.0
@@ -181,7 +181,7 @@ class Tremor:
         """Draw the phases.
 
         Args:
-            amplitude: Amplitude of the tremor [m]; that of the drift is three times as large.
+            amplitude: Amplitude of the tremor [m]. The drift's amplitude is three times that.
             rng: Source of the phases.
         """
         # Two frequencies of tremor (Elble and Koller 1990: 8 to 12 Hz) and two of drift.

@@ -84,12 +84,12 @@ class TorqueBias:
     with the direction of motion. A Kalman filter estimates w, o and F, each a random walk.
     """
 
-    # Initial standard deviations of w [N], o and F [N m]: for a load of 0.5 kg, and for the
-    # friction of 0.3 to 1.3 N m that Gaz et al. (2019) identified.
+    # `_FIRST`: initial standard deviations of w [N], o and F [N m], for a load of 0.5 kg.
+    # `_FRICTION`: initial F [N m]; Gaz et al. (2019) identified 0.3 to 1.3 N m.
     _FIRST = (5.0, 1.0, 0.5)
     _FRICTION = 0.8
-    # Standard deviations of their change within a second [N, N m]: loads are picked up, and the
-    # error of the gravity model changes with the posture.
+    # Standard deviations of the changes of w [N], o and F [N m] within a second: loads are
+    # picked up, and the error of the gravity model changes with the posture.
     _DRIFT = (0.3, 0.1, 0.03)
     # Standard deviation of the friction of a joint at rest, relative to F: friction may then
     # take any value up to F, in either direction.
@@ -209,13 +209,13 @@ def log_density(
 # Standard deviations of a person's force and of its moment about the tool centre point: a hand
 # may push the gripper up to 10 cm off its centre [N, N m].
 _PUSHES, _MOMENTS = 25.0, 2.5
-# Margin of the log evidence above which a push counts as one at the end effector: a wrong guess
-# would pause the task for nothing.
+# Margin of the log evidence above which a push counts as a push at the end effector: a wrong
+# guess would pause the task for nothing.
 _SURE = 2.0
 # Margin of the log evidence at which a push changes its place: while a force rises, friction
-# hides where it acts. In simulation, the evidence for the end effector exceeds that for the
-# elbow by at most 2 during a push at the elbow, and soon by 10 to 400 during one at the end
-# effector.
+# hides where the force acts. In simulation, the evidence for the end effector minus the
+# evidence for the elbow is at most 2 during a push at the elbow, and soon 10 to 400 during a
+# push at the end effector.
 _CHANGES = 8.0
 # Standard deviations of the loads in contacts of the task: force and moment [N, N m].
 _MET = np.array([60.0] * 3 + [10.0] * 3)
