@@ -182,6 +182,17 @@ def test_a_leader_calibrated_differently_is_reported(tmp_path, offset):
     assert [issue.episode for issue in found] == [2]
 
 
+def test_a_joint_that_never_moves_shows_no_calibration(tmp_path):
+    episodes = []
+    for seed in range(6):
+        state = resting(seed)
+        state[:, 2] = 0.0
+        command = state + np.array([0.0, 0.0, 1e-6 * seed])
+        episodes.append({"observation.state": state, "action": command})
+    root = write_folder(tmp_path / "set", episodes, dict.fromkeys(episodes[0], JOINTS))
+    assert not [text for text in map(str, check_dataset(root).warnings) if "calibra" in text]
+
+
 def test_a_loop_that_is_late_now_and_then_has_another_rate(tmp_path):
     rng = np.random.default_rng(0)
     steps = np.where(rng.uniform(size=119) < 0.3, 0.065, 0.05)

@@ -345,7 +345,7 @@ def command_offsets(
                 + (f", by {usual * degrees:+.1f} deg?" if degrees else "?")
             )
             yield warning(message=text, **place)
-        for number in found[off > least] if len(found) >= FEWEST else ():
+        for number in found[off > least] if least > 0 and len(found) >= FEWEST else ():
             text = (
                 f"{name} rests {own[number]:.4g} from its command, in the other episodes "
                 f"{usual:.4g}: its calibration changed?"
