@@ -1,16 +1,18 @@
 """Online estimate of a camera that may have been moved, and of the residual image Jacobian.
 
-The state holds a window of key frames. Unknown are the camera c, thirteen numbers, and the
-weights W of the residual network. Along the path of the key frames, the pixel of the marker is
+The state holds a window of key frames. The camera c (thirteen numbers) and the weights W of the
+residual network are unknown. In key frame i, with the tool at pose r_i, the marker's pixel is
 
     x_i = pixel(c, r_i) + W Phi_i + noise,    Phi_i = sum of dr (x) theta since the first frame
 
-W enters linearly with a Gaussian prior, so it is integrated out: the errors of frames i and j
-have the covariance Phi_i^T P Phi_j, and the camera follows from Gauss-Newton steps of
-generalised least squares, from several rotations about the optical axis at once. Given the
-camera, W has a closed form. Camera and W together are the maximum a posteriori estimate.
+Here dr is the motion of the tool between two key frames, and theta are the activations of the
+neurons. W enters linearly and has a Gaussian prior with covariance P, so it is integrated out:
+the errors of frames i and j have the covariance Phi_i^T P Phi_j. The camera follows from
+Gauss-Newton steps of generalised least squares. The search starts from several hypotheses,
+which differ in the rotation about the optical axis. Given the camera, W has a closed form.
+Camera and W together are the maximum a posteriori estimate.
 
-The prior of optics and marker is their posterior from the demonstrations; the prior of the
+The prior of optics and marker is their posterior from the demonstrations. The prior of the
 camera's position and orientation is wide. If several images in a row show the marker far from
 its predicted pixel, the camera was moved: the window is emptied and the search begins again.
 """
@@ -47,7 +49,7 @@ _KNOWN = [0, 1, 2, 3, 10, 11, 12]
 # Largest rotation [rad] and translation [m] of a Gauss-Newton step: beyond these the
 # linearisation does not hold.
 _LONGEST_TURN, _LONGEST_MOVE = 0.4, 0.15
-# Error beyond which a frame counts less, as a multiple of the median error of the window.
+# A frame counts less if its error exceeds this multiple of the median error of the window.
 _OUTLIER = 3.0
 # Variance of frames of the window that hold no image [px^2].
 _UNKNOWN = 1e6
@@ -64,7 +66,7 @@ class CameraConfig:
     max_step: float = 0.1
     """Largest motion between key frames over which the residual Jacobian is integrated [m]."""
     rotation_scale: float = 0.15
-    """Metres per radian, a typical lever arm [m/rad]."""
+    """Length by which rotations are converted to motions, a typical lever arm [m/rad]."""
     pixel_noise: float = 0.25
     """Standard deviation of a pixel coordinate [px]: 0.1 px from the detector in blurred
     images, the rest from the noise of the encoders."""
@@ -95,7 +97,7 @@ class CameraState:
     """Hypotheses of the camera, weights of the residual, and the window of key frames."""
 
     weight: Float[Tensor, "*batch entries K"]
-    """W, given the most probable camera [px/m, px/rad]."""
+    """Weights W, given the most probable camera [px/m, px/rad]."""
     cameras: Float[Tensor, "*batch hypotheses 13"]
     """Hypotheses of the camera."""
     cost: Float[Tensor, "*batch hypotheses"]
@@ -109,7 +111,7 @@ class CameraState:
     pixel: Float[Tensor, "*batch frames 2"]
     """Pixels of the marker [px]."""
     path: Float[Tensor, "*batch frames P"]
-    """Regressors of the residual along the path, up to each frame [m]."""
+    """Regressors of the residual, summed along the path up to each frame [m]."""
     known: Bool[Tensor, "*batch frames"]
     """True for frames of the window that hold an image."""
     surprises: Float[Tensor, "*batch"]
@@ -129,7 +131,9 @@ class CameraState:
         return torch.softmax(-self.cost, dim=-1)
 
     def spread(self) -> CameraSpread:
-        """Uncertainty: steps of one standard deviation, and the other hypotheses."""
+        """Uncertainty of the camera, as samples: steps of one standard deviation from the most
+        probable camera, and all hypotheses.
+        """
         best = self.best
         covariance = self.covariance / 2 + self.covariance.mT / 2
         values, vectors = torch.linalg.eigh(covariance)
@@ -145,13 +149,14 @@ class CameraState:
 class CameraSpread:
     """Sample cameras that represent the uncertainty of an estimate.
 
-    The variance of any function of the camera is a weighted sum over the samples: of the
-    squared differences between its values and its value for the first camera. It combines the
-    linearised variance about the most probable camera with the spread of the hypotheses.
+    Let a function have the value y_0 for the first camera and y_k for sample k. The variance of
+    the function is the sum of weight_k (y_k - y_0)^2 over the other samples. The variance
+    combines the linearised variance about the most probable camera with the spread of the
+    hypotheses.
     """
 
     samples: Float[Tensor, "*batch samples 13"]
-    """The most probable camera, then the others."""
+    """The most probable camera, then the other sample cameras."""
     weights: Float[Tensor, "*batch others"]
     """Weight of each sample after the first."""
 
@@ -207,7 +212,7 @@ class CameraEstimator(ImageJacobianEstimator):
     """Initial rotations of the hypotheses about the optical axis, (hypotheses, 4)."""
 
     def initial_state(self, *batch: int) -> CameraState:
-        """The camera of the demonstrations, rotated by each hypothesis, and an empty window."""
+        """State with the demonstrations' camera, rotated for each hypothesis, and no frames."""
         config, like = self.config, self.reference
         frames = (*batch, config.frames)
         upright = like.new_tensor([1.0, 0, 0, 0])
@@ -229,7 +234,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def jacobian(
         self, state: CameraState, r: Pose | Float[Tensor, "*batch 6"]
     ) -> Float[Tensor, "*batch rows 6"]:
-        """J_s_hat at a pose: the most probable camera's image Jacobian plus the residual."""
+        """Estimated image Jacobian J_s_hat at a pose: that of the camera, plus the residual."""
         pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
         first = camera_jacobian(state.best, pose[..., None]).squeeze(-3)
         return first + evaluate(state.weight, self.network.basis(pose))
@@ -246,7 +251,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def _rolled(
         self, camera: Float[Tensor, "*batch 13"]
     ) -> Float[Tensor, "*batch hypotheses 13"]:
-        """Copies of a camera, rotated about its optical axis by each hypothesis."""
+        """Copies of a camera, each rotated about its optical axis by a hypothesis' angle."""
         turn = quaternion.multiply(
             self.rolls, quaternion.exp(camera[..., ROTATION]).unsqueeze(-2)
         )
@@ -256,11 +261,12 @@ class CameraEstimator(ImageJacobianEstimator):
         return torch.cat(parts, dim=-1)
 
     def _roll_cost(self, cameras: Float[Tensor, "*batch hypotheses 13"]) -> Tensor:
-        """Small cost of rotation since the demonstrations; decides only before any motion."""
+        """Small cost of rotations since the demonstrations, which decides before any motion."""
         turn = quaternion.exp(cameras[..., ROTATION])
         return 0.05 * quaternion.angle(turn, quaternion.exp(self.reference[ROTATION]))
 
     def _prior_covariance(self, *batch: int) -> Float[Tensor, "*batch 13 13"]:
+        """Covariance of a step from the demonstrations' camera before any frame."""
         _, slope = self._prior_error(self.reference)
         gram = slope.mT @ slope + self.precision
         gram = gram + torch.eye(SIZE).to(gram) * 1e-2
@@ -269,12 +275,13 @@ class CameraEstimator(ImageJacobianEstimator):
     def _prior_error(
         self, cameras: Float[Tensor, "*batch 13"]
     ) -> tuple[Float[Tensor, "*batch 5"], Float[Tensor, "*batch 5 13"]]:
-        """Tilt and translation in prior deviations, and their derivatives by a step."""
+        """Tilt and translation over their prior deviations, and derivatives by a step."""
         config = self.config
         home = quaternion.to_matrix(quaternion.exp(self.reference[ROTATION]))
         R = quaternion.to_matrix(quaternion.exp(cameras[..., ROTATION]))
         zero = torch.zeros_like(R[..., 0])
-        # Optical axis in the frame of the demonstrations' camera, whose own axis is (0, 0, 1).
+        # Optical axis in the frame of the demonstrations' camera, whose optical axis is
+        # (0, 0, 1).
         tilt = (R[..., 2, :] @ home.mT)[..., :2] / config.tilt
         by_turn = torch.stack([R[..., 1, :], -R[..., 0, :], zero], dim=-1)
         by_turn = (home @ by_turn)[..., :2, :] / config.tilt
@@ -287,7 +294,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def _watched(
         self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
     ) -> CameraState:
-        """State with an empty window in those elements of the batch whose camera was moved."""
+        """State in which the window is empty for elements of the batch with a moved camera."""
         config = self.config
         expected, slope = marker_pixels(state.best, now.pose[..., None])
         error = now.feature - expected.squeeze(-2)
@@ -312,8 +319,11 @@ class CameraEstimator(ImageJacobianEstimator):
     def _with_key_frame(
         self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
     ) -> tuple[CameraState, Bool[Tensor, "*batch"]]:
-        """State with this image in the window if the tool has moved, and True unless recent
-        images indicate a moved camera: nothing is learned from such images.
+        """Add the image to the window if the tool has moved since the last key frame.
+
+        Returns:
+            The state, and False if recent images indicate a moved camera. Nothing is learned
+            from such images.
         """
         config = self.config
         last = Pose(state.position[..., -1, :], state.orientation[..., -1, :])
@@ -382,7 +392,7 @@ class CameraEstimator(ImageJacobianEstimator):
         pixel: Float[Tensor, "*batch frames 2"],
         kernel: Float[Tensor, "*batch frames frames"],
     ) -> Float[Tensor, "*batch frames frames"]:
-        """Inverse covariance of the frames; outliers of the most probable camera count less."""
+        """Inverse covariance of the frames' errors; outliers of the best camera count less."""
         seen, _ = marker_pixels(state.best, Pose(state.position, state.orientation))
         size = torch.where(state.known, (pixel - seen).norm(dim=-1), 0.0)
         # The median over known frames: unknown frames have size zero and are sorted first.
@@ -402,11 +412,11 @@ class CameraEstimator(ImageJacobianEstimator):
         known: Bool[Tensor, "*batch frames"],
         inverse: Float[Tensor, "*batch frames frames"],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Matrix, right-hand side and cost of each hypothesis."""
+        """Matrix and right-hand side of a Gauss-Newton step, and cost, of each hypothesis."""
         seen, slope = marker_pixels(cameras, poses)
         use = known[..., None, :, None]
         error = torch.where(use, pixel.unsqueeze(-3) - seen, 0.0)
-        # Row u of all frames, then row v: one information matrix applies to both.
+        # Separate row u of all frames from row v: the same information matrix applies to both.
         slope = torch.where(use[..., None], slope, 0.0).transpose(-3, -2)
         error = error.mT
         information = inverse[..., None, None, :, :]
@@ -420,13 +430,14 @@ class CameraEstimator(ImageJacobianEstimator):
         pull = away @ self.precision
         towards = towards - (by_step.mT @ prior.unsqueeze(-1)).squeeze(-1) - pull
         cost = cost + prior.square().sum(-1) + (away * pull).sum(-1)
-        # Limit steps along nearly flat directions, such as the roll before any motion.
+        # Limit steps along directions that hardly change the cost, such as the roll before any
+        # motion.
         gram = gram + 1e-2 * torch.eye(SIZE).to(gram)
         return gram, towards, cost / 2 + self._roll_cost(cameras)
 
 
 def _shortened(step: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 13"]:
-    """A step shortened to where its linearisation holds."""
+    """A step, shortened to at most `_LONGEST_TURN` and `_LONGEST_MOVE`."""
     turn, move = step[..., ROTATION].norm(dim=-1), step[..., SHIFT].norm(dim=-1)
     factor = torch.maximum(turn / _LONGEST_TURN, move / _LONGEST_MOVE).clamp_min(1.0)
     return step / factor[..., None]

@@ -1,17 +1,17 @@
-"""Detection of camera motion from the tool's marker, and correction of pixels for it.
+"""Detect that a camera was moved, from the tool's marker, and correct pixels for the motion.
 
 A camera fitted to demonstrations (`perspective`) predicts the pixel of the tool's marker
 at any tool pose. If the camera turns by w and moves by v, the seen pixel differs from the
-prediction by e = L (w, v), to first order, where L is the interaction matrix: the derivative of
-the pixel by the camera twist. One such motion is fitted to e over the last second. The
-displacement L (w, v) that it explains, as root mean square over the frames, is compared with a
-threshold: 2.5 times the largest one in demonstrations that were held out of the camera's fit.
-The threshold covers errors of calibration, lens and time stamps. Outside the region of the
+prediction by e = L (w, v), to first order. L is the interaction matrix: the derivative of the
+pixel by the camera twist. One motion (w, v) is fitted to the differences e of the last second.
+The displacement L (w, v), as root mean square over the frames, is compared with a threshold:
+2.5 times the largest displacement in demonstrations that were held out of the camera's fit. The
+threshold covers errors of calibration, lens and time stamps. Outside the region of the
 demonstrations these errors are unknown, so frames there are ignored.
 
-`CameraCorrection` maps pixels of the moved camera to those of the camera before its motion: the
-marker's pixel by means of the tool pose, an object's pixel by means of the plane on which the
-objects of the demonstrations lay. All frames since the motion refine the estimate.
+`CameraCorrection` maps pixels of the moved camera to pixels of the camera before its motion.
+For the marker it uses the tool pose; for an object, the plane on which the objects of the
+demonstrations lay. All frames since the motion refine the estimate.
 """
 
 from __future__ import annotations
@@ -39,34 +39,36 @@ from hrc_learn.jacobian.perspective import (
     pixels_and_depth,
 )
 
-# Prior standard deviation of each component of a motion [rad, m], for a knocked tripod. It
-# decides between rotations and translations that look alike in the image.
+# Prior standard deviation of each component of a motion [rad, m], for a tripod that was hit.
+# The prior decides between rotations and translations that look alike in the image.
 _PLAUSIBLE = 0.1
-# Largest motion in these standard deviations: after a larger one, the camera would not see the
-# table.
+# Largest motion, as a multiple of `_PLAUSIBLE`: after a larger motion, the camera would not see
+# the table.
 _FARTHEST = 5.0
 FEWEST_FRAMES = 10
 """Number of frames with a visible marker needed to report a motion."""
-# Errors are clipped at this multiple of their median: a half-covered marker is off by pixels in
-# one or two frames, but after a camera motion the pixels of all frames are off.
+# Errors are clipped at this multiple of their median. A half-covered marker is off by some
+# pixels in one or two frames, but after a camera motion the pixels of all frames are off.
 _OUTLIER = 3.0
 # Time window for the fit of a motion [s].
 _WINDOW = 1.0
 # Threshold relative to the largest displacement in held-out demonstrations.
 _MARGIN = 2.5
-# Least difference between camera placements, in median differences of neighbouring episodes.
+# Episodes count as recorded with different camera placements if they differ by more than this
+# multiple of the median difference between neighbouring episodes.
 _APART = 6.0
 # Gauss-Newton steps: three are enough for ten degrees.
 _REFINEMENTS = 5
 # Frames of the marker used for the motion estimate: half a minute at 20 Hz.
 _KEPT_FRAMES = 600
-# Number of frames that `CameraCorrection` needs to detect a motion. One, because wrong pixels
-# soon guide the arm out of the region of the demonstrations, where no motion can be detected.
+# Number of frames that `CameraCorrection` needs to detect a motion. It is one, because wrong
+# pixels soon guide the arm out of the region of the demonstrations, where detection ends.
 _FEWEST = 1
 # Largest root mean square error between object pixels and the positions of grasps [px]: people
 # grasp an object some millimetres from its marker.
 _AGREEMENT = 10.0
-# Gauss-Newton steps, enough for an offset of decimetres seen from a distance of one metre.
+# Gauss-Newton steps for the offset of objects from the tool. They are enough for an offset of
+# decimetres seen from a distance of one metre.
 _PLANE_STEPS = 20
 
 
@@ -78,7 +80,7 @@ class CameraMotion:
     """Rotation vector about the camera's axes (x right, y down, z along the view) [rad], and
     translation along them [m], as for `perspective.moved`."""
     displacement: float
-    """Explained displacement in the image, root mean square over the frames [px]."""
+    """Displacement in the image due to this motion, root mean square over the frames [px]."""
 
     @staticmethod
     def of(
@@ -86,7 +88,7 @@ class CameraMotion:
         twist: Float[Tensor, "6"],
         points: Float[Tensor, "frames 3"],
     ) -> CameraMotion:
-        """Motion by a twist, with the displacement of points in the camera frame [m]."""
+        """Camera motion by a twist, with the displacement of points in the camera frame [m]."""
         displacement = _root_mean_square(motion_jacobian(camera, points) @ twist)
         return CameraMotion(twist=twist, displacement=displacement)
 
@@ -114,11 +116,11 @@ class CameraReference:
     camera: tuple[float, ...]
     """Vector of the camera and its marker (see `perspective`), fitted to all demonstrations."""
     threshold: float
-    """Explained displacement above which the camera counts as moved [px]."""
+    """Displacement above which the camera counts as moved [px]."""
     lower: tuple[float, float, float]
     """Lower corner of the box of demonstrated marker positions, in the camera frame [m]."""
     upper: tuple[float, float, float]
-    """Upper corner of that box [m]."""
+    """Upper corner of the box [m]."""
 
     def __post_init__(self) -> None:
         if len(self.camera) != SIZE:
@@ -192,7 +194,7 @@ type _Frames = deque[tuple[float, Tensor, Tensor]]
 
 
 def _columns(frames: _Frames) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 2"]]:
-    """Points and pixels of frames."""
+    """Markers in the camera frame [m] and pixels [px] of frames."""
     points, pixels = zip(*((frame[1], frame[2]) for frame in frames), strict=True)
     return torch.stack(points), torch.stack(pixels)
 
@@ -202,7 +204,8 @@ class CameraWatch:
 
     Attributes:
         reference: Camera of the demonstrations.
-        displacement: Explained displacement over the last second [px]; 0 with too few frames.
+        displacement: Displacement of the motion fitted to the last second [px]; 0 with too few
+            frames.
     """
 
     def __init__(self, reference: CameraReference, fewest: int = FEWEST_FRAMES):
@@ -230,7 +233,7 @@ class CameraWatch:
 
         Args:
             time: Time of the image [s], later than that of the last frame.
-            pose: Pose of the tool at that time, unbatched.
+            pose: Pose of the tool when the image was taken, unbatched.
             pixel: Pixel of the marker [px].
 
         Returns:
@@ -293,7 +296,7 @@ def camera_placements(
 
     Returns:
         The placements: one if the camera never moved, none if fewer than two episodes show the
-        marker in ten frames. Episodes that show it less belong to no placement.
+        marker in ten frames. Episodes with fewer such frames belong to no placement.
     """
     seen = {
         index: frames
@@ -338,7 +341,7 @@ def camera_placements(
 def _camera_of_episodes(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> tuple[Float[Tensor, "13"], Float[Tensor, "episodes 6"]]:
-    """Camera of the median episode, and its motion from that pose in each episode."""
+    """Camera of the median episode, and motion of the camera from there to each episode."""
     camera, twists = fit_camera(demonstrations, image_size).camera, torch.zeros(0)
     still = torch.zeros(6, dtype=torch.float64)
     for _ in range(_REFINEMENTS):
@@ -360,7 +363,7 @@ def _camera_of_episodes(
 
 
 def _median(twists: Float[Tensor, "episodes 6"]) -> Float[Tensor, "6"]:
-    """Median of each component; of an even number, the mean of the two middle values."""
+    """Median of each component; for an even number, the mean of the two middle values."""
     return twists.quantile(0.5, dim=0)
 
 
@@ -370,13 +373,14 @@ def _explained(
     pixels: Float[Tensor, "frames 2"],
     already: Float[Tensor, "6"] | None = None,
 ) -> tuple[Float[Tensor, "6"], float]:
-    """Most probable motion given the pixels of points, and its displacement, rms [px].
+    """Most probable camera motion, given the pixels of points, and its rms displacement [px].
 
-    `already` is the motion applied so far; the prior applies to the sum of both.
+    `already` is the motion applied to the points so far. The prior applies to the sum of both
+    motions.
     """
     errors = pixels - pixels_and_depth(camera, points)[0]
     size = errors.norm(dim=-1)
-    # At least a tenth of a pixel: otherwise all frames of exact images would be outliers.
+    # Clip at a tenth of a pixel or more: else all frames of exact images would be outliers.
     most = (_OUTLIER * size.quantile(0.5)).clamp(min=0.1)
     errors = errors * (most / size.clamp(min=most)).unsqueeze(-1)
     slope = motion_jacobian(camera, points)
@@ -399,11 +403,11 @@ def refined_twist(
     """Refine a camera motion [rad, m] by Gauss-Newton steps; also valid for large motions."""
     for _ in range(steps):
         step, _ = _explained(camera, from_moved(points, twist), pixels, twist)
-        # The step is in the frame of the camera as moved so far.
+        # The step is given in the frame of the camera after the motion found so far.
         turn = quaternion.exp(twist[:3])
         both = quaternion.log(quaternion.multiply(turn, quaternion.exp(step[:3])))
         twist = torch.cat([both, twist[3:] + quaternion.rotate(turn, step[3:])])
-        # Two contradictory frames would drive the camera beyond both points.
+        # Without a limit, two contradictory frames would drive the camera beyond both points.
         twist = twist * (_FARTHEST * _PLAUSIBLE / twist.norm()).clamp(max=1.0)
     return twist
 
@@ -442,8 +446,9 @@ def object_height(
 
     The base frame of a fitted camera is shifted from the robot's by the part of the marker's
     position on the tool that the demonstrations do not determine. The returned height is in the
-    camera's base frame, so it differs from a height measured in the robot's. All objects have
-    the same offset from the tool when grasped; it is found by least squares on the pixels.
+    camera's base frame, so it differs from a height in the robot's base frame. All objects have
+    the same offset from the tool when grasped. This offset is found by least squares on the
+    pixels.
 
     Args:
         reference: Camera of the demonstrations.
@@ -464,7 +469,7 @@ def object_height(
     for _ in range(_PLANE_STEPS):
         pixel, by_point = pixels_and_depth(camera, from_base(camera, places + offset))
         errors, jacobian = pixels - pixel, (by_point @ turn).flatten(0, 1)
-        # The pseudo-inverse: parallel views do not determine one direction of the offset.
+        # Use the pseudo-inverse: parallel views do not determine one direction of the offset.
         offset = offset + torch.linalg.pinv(jacobian) @ errors.flatten()
     off = _root_mean_square(errors)
     if not off <= _AGREEMENT:
@@ -493,14 +498,14 @@ class CameraCorrection:
         """Prepare for another episode: time may restart, the camera motion is kept."""
         self._watch.clear()
         known = () if self.motion is None else self._frames
-        # Frames of earlier episodes are older than any window.
+        # The time -inf marks frames of earlier episodes as older than any window.
         self._frames = deque(((-np.inf, f[1], f[2]) for f in known), maxlen=_KEPT_FRAMES)
 
     def update(self, time: float, pose: Pose, pixel: Float[Tensor, "2"]) -> CameraMotion | None:
         """Add one frame in which the marker was found; arguments as for `CameraWatch.update`.
 
         Returns:
-            The camera motion if this frame reveals one, the first or a further one; else None.
+            The camera motion if this frame reveals a first or a further motion; else None.
         """
         point, pixel = _marker_point(self._camera, pose), pixel.double()
         corrected = self.marker(pose, pixel)
@@ -541,7 +546,7 @@ class CameraCorrection:
         """Pixel of a point on a horizontal plane corrected for the camera motion [px].
 
         Args:
-            height: Height of the plane, by `object_height` [m].
+            height: Height of the plane, from `object_height` [m].
             pixel: Pixel of the point [px].
         """
         if self.motion is None:

@@ -1,9 +1,14 @@
-"""Online estimators of the image Jacobian.
+"""Estimators that adapt the image Jacobian J_s online, while the robot moves.
 
-`FixedEstimator` never changes the Jacobian; `PaperEstimator` follows the paper's law. The other
-estimators compare key frames: frames far enough apart to distinguish motion from noise, which
-`KeyFrameEstimator` selects online. The composite law and Broyden's update follow gradients. The
-Kalman filter keeps one covariance for both image rows, since they have the same regressors.
+`FixedEstimator` never changes the Jacobian. `PaperEstimator` follows the paper's law. The other
+estimators compare key frames: frames far enough apart to distinguish motion from noise.
+`KeyFrameEstimator` selects them online. The composite law and Broyden's update follow
+gradients. The Kalman filter keeps one covariance for both image rows, since both rows have the
+same regressors.
+
+Below, W are the weights of the network, theta the activations of its neurons, J_s_hat the
+estimate of J_s, dr the motion of the tool and dx the motion of the image feature between two
+key frames.
 """
 
 from __future__ import annotations
@@ -51,7 +56,7 @@ class WeightState:
     """Estimator state that consists of the weights only."""
 
     weight: Float[Tensor, "*batch entries K"]
-    """W [px/m, px/rad], one matrix for each element of the batch."""
+    """Weights W [px/m, px/rad], one matrix for each element of the batch."""
 
 
 class ImageJacobianEstimator(nn.Module, ABC):
@@ -119,7 +124,7 @@ class ImageJacobianEstimator(nn.Module, ABC):
 def evaluate(
     weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
 ) -> Float[Tensor, "*batch rows 6"]:
-    """J_s_hat from  vec(J_s_hat^T) = W theta."""
+    """Image Jacobian J_s_hat of weights W and activations theta: vec(J_s_hat^T) = W theta."""
     return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))
 
 
@@ -134,12 +139,12 @@ class FixedEstimator(ImageJacobianEstimator):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class KeyFrame:
-    """Frame with which the next one is compared."""
+    """Frame with which later frames are compared."""
 
     pose: Pose
     """Pose of the tool."""
     feature: Float[Tensor, "*batch rows"]
-    """Feature at that pose [px]."""
+    """Image feature at the pose [px]."""
     theta: Float[Tensor, "*batch K"]
     """Activations of the neurons at the pose."""
     present: Bool[Tensor, "*batch"]
@@ -164,7 +169,7 @@ class KeyFrameState:
     """Weights, and the key frame with which the next frame is compared."""
 
     weight: Float[Tensor, "*batch entries K"]
-    """W [px/m, px/rad]."""
+    """Weights W [px/m, px/rad]."""
     key: KeyFrame
     """Last key frame."""
 
@@ -180,14 +185,14 @@ class LearningConfig(KeyFrameConfig):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class MotionSample:
-    """Motion from the key frame to the present one; zero without a valid pair."""
+    """Motion from the key frame to the present frame; zero without a valid pair."""
 
     twist: Float[Tensor, "*batch 6"]
     """Motion of the tool, linear [m] and angular [rad]."""
     dr: Float[Tensor, "*batch 6"]
     """Motion of the tool with rotation scaled to metres [m]."""
     dx: Float[Tensor, "*batch rows"]
-    """Motion of the feature, less that predicted by the network's camera, if any [px]."""
+    """Motion of the feature minus the motion predicted by the network's camera, if any [px]."""
     theta: Float[Tensor, "*batch K"]
     """Mean of the neurons' activations at both frames."""
     valid: Bool[Tensor, "*batch"]
@@ -258,13 +263,13 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         key, pair = self.advance(state.key, measurement, theta)
         learned = self.learned(state, measurement, theta, pair)
         # Clamping projects on a convex set: it never moves the estimate away from a true value
-        # inside.
+        # inside the set.
         return replace(learned, weight=learned.weight.clamp(-self.bound, self.bound), key=key)
 
     def along(
         self, step: Float[Tensor, "*batch rows"], pair: MotionSample
     ) -> Float[Tensor, "*batch entries 1"]:
-        """Change of a neuron's weights, step dr^T, along the motion dr of a pair.
+        """Change of a neuron's weights along the motion dr of a pair: step dr^T, flattened.
 
         Args:
             step: Correction of the feature's motion, divided by a squared motion [px/m^2].
@@ -290,6 +295,9 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
             key: Last key frame.
             measurement: Present measurement.
             theta: Activations of the neurons at the measured pose.
+
+        Returns:
+            The key frame for the next step, and the motion from the last key frame.
         """
         config = self.config
         twist = key.pose.twist_to(measurement.pose)
@@ -325,9 +333,10 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
 class PaperEstimator(ImageJacobianEstimator):
     """The paper's law,  W_dot = -[L theta s^T xi_x']^T,  s = J_s_hat^T xi_x + xi_r  (update).
 
-    L is a multiple of the identity. The law reduces the energy |s|^2 that the command puts
-    into the task. It uses no measured image motion, so it cannot correct a wrong Jacobian. With
-    Table I's L = 0.25 I, weights of 1e3 px/m change by parts in 1e9.
+    xi_x and xi_r are the controller's vision and Cartesian feedback. L is a multiple of the
+    identity. The law reduces the energy |s|^2 that the command puts into the task. It uses no
+    measured image motion, so it cannot correct a wrong Jacobian. With L = 0.25 I (Table I),
+    weights of 1e3 px/m change by parts in 1e9.
     """
 
     def __init__(self, network: RBFImageJacobian, gain: float = 0.25):
@@ -386,9 +395,9 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
 
         W <- W + gamma e (x) dr theta^T / (|theta|^2 (|dr|^2 + floor^2))
 
-    so e is multiplied by 1 - gamma |dr|^2 / (|dr|^2 + floor^2): |e| never grows for
-    0 < gamma < 2, and pairs with little motion, which are mostly noise, count little. The
-    entries of the weights are bounded.
+    Here gamma is `prediction_gain`, and floor is `noise_floor`. An update multiplies e by
+    1 - gamma |dr|^2 / (|dr|^2 + floor^2). Therefore |e| never grows for 0 < gamma < 2, and
+    pairs with little motion, which are mostly noise, count little. The weights are bounded.
     """
 
     def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
@@ -397,7 +406,7 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
     def learned(
         self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KeyFrameState:
-        """State after a step dt of the paper's term and the correction by a new pair."""
+        """State after the paper's term acted for dt, and after the correction by a new pair."""
         J = self.jacobian(state, now.pose)
         rate = paper_rate(J, theta, now, self.config.task_gain)
         change = now.dt * rate + self._correction(state.weight, pair)
@@ -407,8 +416,8 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
         """Normalised gradient step on the prediction error; zero without a new pair."""
         config = self.config
         motion = pair.dr.square().sum(-1) + config.noise_floor**2
-        # The sum of normalised neurons is one everywhere. Other neurons fade between and beyond
-        # the centres: division by their small activity would change the weights far too much.
+        # Normalised neurons sum to one everywhere. Other neurons fade between and beyond the
+        # centres: division by their small activity would change the weights far too much.
         least = 0.0 if self.network.normalized else 1.0
         activity = pair.theta.square().sum(-1).clamp_min(least)
         size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
@@ -441,7 +450,7 @@ class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     def learned(
         self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KeyFrameState:
-        """State after an update with a new pair, if there is one."""
+        """State after an update with a new pair, if there is a pair."""
         # dr is zero without a pair; the floor avoids 0 / 0.
         size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
@@ -453,7 +462,7 @@ class KalmanConfig(LearningConfig):
     """Prior, noise and drift of the Kalman filter."""
 
     pixel_noise: float = 0.5
-    """Standard deviation of the measured feature [px]; each pair contains it twice."""
+    """Standard deviation of the measured feature [px]; a pair has two measurements."""
     bias_std: float = 1500.0
     """Prior standard deviation of the mean Jacobian [px/m]."""
     weight_std: float = 500.0
@@ -474,8 +483,9 @@ class KalmanState(KeyFrameState):
 class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
     """Kalman filter of the weights and a drifting bias Jacobian, observed through dx = J_s dr.
 
-    With normalised neurons, a bias is an equal change of all weights: it needs no state, only a
-    covariance. Both image rows have the same regressors and therefore the same covariance.
+    With normalised neurons, a bias is an equal change of all weights. Therefore the bias needs
+    no state of its own, only a covariance. Both image rows have the same regressors and
+    therefore the same covariance.
     """
 
     constant = True
@@ -494,7 +504,7 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             config: Prior, noise and drift.
         """
         super().__init__(network, config or KalmanConfig())
-        # The posterior of an offline fit, or the prior.
+        # Start from the posterior of an offline fit, or else from the prior.
         covariance = network.covariance
         if covariance is None:
             bias, weight = self.config.bias_std, self.config.weight_std
@@ -524,7 +534,7 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
     def learned(
         self, state: KalmanState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KalmanState:
-        """State after a drift for dt, conditioned on a new pair, if there is one.
+        """State after a drift for dt, conditioned on a new pair, if there is a pair.
 
         With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
         """

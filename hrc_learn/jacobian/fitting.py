@@ -1,10 +1,11 @@
 """Radial basis functions of the image Jacobian, and the regression of their weights.
 
-The paper calls each basis function a neuron. The weights follow from Bayesian ridge regression
-on pairs of key frames: each image row is dx = w . phi + noise with phi = dr (x) theta, a
-Gaussian prior on w and Gaussian noise. Mean and covariance of w then have a closed form in
-statistics that are summed over pairs, demonstrations and processes, so only one demonstration
-is in memory at a time.
+The paper calls each basis function a neuron. The weights w follow from Bayesian ridge
+regression on pairs of key frames. For a pair, dr is the motion of the tool, dx the motion of
+the image feature, and theta are the activations of the neurons. Each image row is
+dx = w . phi + noise with phi = dr (x) theta, a Gaussian prior on w and Gaussian noise. Mean and
+covariance of w then have a closed form in statistics that are summed over pairs, demonstrations
+and processes, so only one demonstration is in memory at a time.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.pytree import pytree
 
-# Least distance of outer neurons from the middle [m, rad]: along a component with hardly any
-# demonstrated motion, neurons would otherwise be too close to be distinguished.
+# Least distance of the outer neurons from the middle neuron [m, rad]. Along a component with
+# hardly any demonstrated motion, neurons would otherwise be too close to be distinguished.
 _LEAST_REACH = 0.05
-# Width of the neurons relative to the largest distance from the middle: wide enough to blend
-# over the whole workspace, narrow enough to distinguish its ends.
+# Width of the neurons relative to the largest distance of a neuron from the middle: wide enough
+# to blend over the whole workspace, narrow enough to distinguish its ends.
 _WIDTH_OVER_REACH = 1.5
 # Number of folds of the data; each is held out in turn to measure the error on unseen data.
 FOLDS = 5
@@ -41,17 +42,18 @@ class KeyFrameConfig:
     min_step: float = 2e-4
     """Least motion between key frames [m], rotation scaled with `rotation_scale`. Choose at
     least ten times the noise of measured poses: pose noise shrinks the Jacobian towards zero
-    (regression dilution), by 2 % at ten times."""
+    (regression dilution). At ten times the noise, the Jacobian shrinks by 2 %."""
     max_step: float = 0.05
-    """Largest motion of a pair [m]; a larger one spans a gap in visibility and is left out."""
+    """Largest motion of a pair of key frames [m]. A larger motion spans a gap in visibility,
+    and is left out."""
     rotation_scale: float = 0.15
-    """Metres per radian, a typical lever arm [m/rad]."""
+    """Length by which rotations are converted to motions, a typical lever arm [m/rad]."""
 
 
 @pytree
 @dataclass(frozen=True, eq=False)
 class RegressionStatistics:
-    """Sufficient statistics of a linear fit: sums over samples, in any order."""
+    """Sufficient statistics of the linear fit dx = w . phi: sums over pairs of key frames."""
 
     gram: Float[Tensor, "P P"]
     """Sum of phi phi^T [m^2]."""
@@ -173,7 +175,7 @@ def component_scale(like: Tensor, rotation_scale: float) -> Float[Tensor, "6"]:
 
 
 def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: KeyFrameConfig) -> Tensor:
-    """Indices of visible frames, each at least `min_step` away from the one before."""
+    """Indices of visible frames, each at least `min_step` away from the previous key frame."""
     # For close orientations, the distance in R^4 is half the angle between them.
     turn = 2 * config.rotation_scale * quaternion.continuous(pose.orientation)
     place = torch.cat([pose.position, turn], dim=-1).detach().cpu().numpy()
@@ -191,7 +193,7 @@ class ImageDemonstration:
     pose: Pose
     """Poses of the tool, (time,)."""
     feature: Float[Tensor, "time 2"]
-    """Image feature [px]; any value where it is not visible."""
+    """Image feature [px]; any value where the feature is not visible."""
     visible: Bool[Tensor, " time"]
     """True where the feature was found."""
 
@@ -206,7 +208,7 @@ class ImageDemonstration:
         return known.pose[self.visible], known.feature[self.visible]
 
     def motion(self, config: KeyFrameConfig) -> MotionSamples:
-        """Motion between its key frames, in float64."""
+        """Motion between the key frames of the demonstration, in float64."""
         known = self.double()
         return MotionSamples.of(known.pose, known.feature, self.visible, config)
 
@@ -220,7 +222,7 @@ def statistics_by_fold(
     """Statistics of each fold of the data, so that each fold can be held out in turn.
 
     In a distributed run, each process reads a part of the demonstrations, and all processes get
-    the statistics of all.
+    the statistics of all demonstrations.
 
     Args:
         basis: Function from poses to activations of the neurons, (time, neurons) float64.
@@ -245,7 +247,7 @@ def statistics_by_fold(
 def recorded_parts(
     demonstrations: Sequence[ImageDemonstration],
 ) -> Sequence[ImageDemonstration]:
-    """The demonstrations, or consecutive fifths of a single one."""
+    """The demonstrations; a single demonstration is cut into five consecutive parts."""
     if len(demonstrations) != 1:
         return demonstrations
     (whole,) = demonstrations
@@ -265,7 +267,7 @@ def radial_basis(
     *,
     normalized: bool,
 ) -> Float[Tensor, "*batch K"]:
-    """Gaussian neurons theta_k = exp(-|x - c_k|^2 / (2 width^2)), the paper's (eq_rbf).
+    """Gaussian neurons theta_k = exp(-|x - c_k|^2 / (2 width^2)), as in the paper (eq_rbf).
 
     Args:
         inputs: Points of evaluation.
@@ -291,7 +293,7 @@ def grid(*axes: tuple[float, float, int]) -> Float[Tensor, "K n"]:
 
 
 def paper_grid() -> Float[Tensor, "9 2"]:
-    """Table I: (0.05, 0.35) + (0.15 i, 0.15 j) for i, j = 0, 1, 2, in x and y [m]."""
+    """The paper's centres (Table I): (0.05, 0.35) + (0.15 i, 0.15 j) [m] for i, j = 0, 1, 2."""
     return grid((0.05, 0.35, 3), (0.35, 0.65, 3))
 
 
@@ -306,7 +308,7 @@ class RBFCenters:
     input_indices: tuple[int, ...] = (0, 1)
     """Components of (x, y, z, rotation vector) that are inputs of the neurons."""
     reference: Float[Tensor, "4"] | None = None
-    """Orientation to which the rotation vector is relative; None: that of the base."""
+    """Orientation to which the rotation vector is relative; None: orientation of the base."""
 
     @staticmethod
     def paper() -> RBFCenters:
@@ -318,8 +320,8 @@ class RBFCenters:
         """Thirteen neurons: one in the middle of the demonstrated poses, one at each end of the
         six axes.
 
-        In a small workspace the image Jacobian is nearly linear in position and rotation, which
-        these neurons can represent; a grid over six inputs would need hundreds.
+        In a small workspace the image Jacobian is nearly linear in position and rotation. These
+        neurons can represent that; a grid over six inputs would need hundreds of neurons.
 
         Args:
             demonstrations: Demonstrations, read twice, one by one. In a distributed run, each
@@ -338,7 +340,7 @@ class RBFCenters:
     def basis(self) -> Callable[[Pose], Tensor]:
         """Function from poses (time,) to activations (time, K).
 
-        It is differentiable in the centres and the width.
+        The function is differentiable in the centres and the width.
         """
 
         def activation(pose: Pose) -> Tensor:
@@ -376,7 +378,7 @@ def _mean_orientation(demonstrations: Sequence[ImageDemonstration]) -> Float[Ten
 def _range(
     demonstrations: Sequence[ImageDemonstration], reference: Float[Tensor, "4"]
 ) -> tuple[Float[Tensor, "6"], Float[Tensor, "6"]]:
-    """Smallest and largest value of every input."""
+    """Smallest and largest value of each component of the demonstrated poses [m, rad]."""
     low = torch.full((6,), torch.inf, dtype=torch.float64)
     high = -low
     for _, demonstration in distributed.local_items(demonstrations):
@@ -392,8 +394,8 @@ class ImageJacobianFitConfig(KeyFrameConfig):
     """Choice of key frames, noise and prior of a fit."""
 
     pixel_noise: float = 0.5
-    """Standard deviation of the measured feature [px]; each difference contains it twice. The
-    held-out error replaces it if it is larger, since the network is then too coarse."""
+    """Standard deviation of the measured feature [px]; dx is a difference of two measurements.
+    A larger held-out error replaces this noise, since the network is then too coarse."""
     bias_std: float = 1500.0
     """Prior standard deviation of the mean Jacobian of the workspace [px/m]."""
     weight_std: float = 500.0
@@ -419,12 +421,12 @@ class ImageJacobianFitReport:
     pairs: int
     """Number of pairs of key frames."""
     motion: float
-    """Motion of the feature, which is also the error of predicting no motion [px]."""
+    """Motion of the feature [px]; this is also the error of a prediction of no motion."""
     error: float
     """Error over the fitted pairs [px]."""
     held_out_error: float
-    """Cross-validation error over folds of demonstrations, or over fifths of a single one [px].
-    NaN if all pairs belong to one fold."""
+    """Cross-validation error over folds of the demonstrations, or over the five parts of a
+    single demonstration [px]. NaN if all pairs belong to one fold."""
     noise: float
     """Standard deviation of each coordinate of dx, as assumed by the posterior [px]."""
 
@@ -436,9 +438,9 @@ def weight_covariance(
 ) -> Float[Tensor, "K K"]:
     """Prior covariance between neurons for a single entry of the Jacobian.
 
-    Each weight is a bias, common to all neurons, plus a deviation of its own. With normalised
-    neurons, which sum to one, this is a constant Jacobian plus a network: an observation at one
-    place applies everywhere until other places are observed.
+    Each weight is the sum of a bias, common to all neurons, and a deviation of its own.
+    Normalised neurons sum to one, so the bias adds a constant Jacobian to the network: an
+    observation at one pose applies everywhere until other poses are observed.
 
     Args:
         centers: Centres of the neurons; only their number, dtype and device matter.
@@ -463,12 +465,15 @@ def fit_weights(
     precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
 ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P P"], ImageJacobianFitReport]:
-    """Fit to all folds; hold out each in turn to measure the error on unseen data.
+    """Fit the weights to all folds; hold out each fold in turn to measure the held-out error.
 
     Args:
         folds: Statistics of the folds of the data.
         precision: Prior precision (see `prior_precision`).
         config: Noise of the feature.
+
+    Returns:
+        Posterior mean and covariance of the weights, and the prediction errors.
 
     Raises:
         ValueError: There is no pair of key frames.
@@ -482,8 +487,9 @@ def fit_weights(
     total = reduce(add, folds)
     noise = 2 * config.pixel_noise**2  # variance of a difference of two measurements
     held_out = _held_out_square(folds, precision, noise)
-    # The error of a network that is too coarse for the data acts as noise on the weights.
-    # The squared error sums two coordinates, hence the half. NaN (one fold) keeps the noise.
+    # The error of a network that is too coarse for the data acts as noise on the weights. The
+    # squared error sums two coordinates, so half of it counts. With NaN (one fold), `max` keeps
+    # the noise.
     noise = max(noise, held_out / 2)
     mean, covariance = solve(total, precision, noise)
     report = ImageJacobianFitReport(

@@ -1,9 +1,10 @@
-"""Held-out prediction of image motion, and evidence maximisation over neurons, noise and prior.
+"""Learn neurons, noise and prior of an image Jacobian, and measure its held-out errors.
 
-For given neurons, the weights have a closed form. So has the evidence: the probability of the
-demonstrated image motion with the weights integrated out (type-II maximum likelihood; MacKay
-1992, "Bayesian interpolation"). L-BFGS maximises it over neurons, noise and prior; the error on
-held-out demonstrations decides when to stop.
+For given neurons, the weights have a closed form. The evidence has one, too: the probability of
+the demonstrated image motion with the weights integrated out (type-II maximum likelihood;
+MacKay 1992, "Bayesian interpolation"). L-BFGS maximises the evidence over neurons, noise and
+prior. The error on held-out demonstrations decides when to stop. A pair below is a pair of
+successive key frames, between which image motion is compared.
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ class EvidenceConfig:
     iterations: int = 5
     """Iterations of L-BFGS in a round."""
     patience: int = 3
-    """Rounds without a better held-out error after which to stop."""
+    """Number of rounds without a better held-out error after which the learning stops."""
     min_improvement: float = 1e-3
     """Fraction by which the held-out error must fall to count as better."""
     hold_out: int = 4
     """Every n-th demonstration is held out to decide when to stop."""
     max_samples: int = 20_000
-    """Largest number of pairs per process, evenly chosen."""
+    """Largest number of pairs used by a process; they are evenly chosen."""
     learn_centers: bool = True
     """True if the centres are learned; width, noise and prior are always learned."""
 
@@ -65,7 +66,7 @@ class EvidenceRound:
     """Neurons, noise and prior after a round, and their errors."""
 
     evidence: float
-    """Negative log probability of the training pairs' image motion, per pair."""
+    """Negative log probability of the image motion in the training pairs, per pair."""
     held_out_error: float
     """Root mean square error over the pairs of held-out demonstrations [px]."""
     neurons: RBFCenters
@@ -175,7 +176,7 @@ class NegativeLogEvidence(nn.Module):
         factor = torch.linalg.cholesky(root.mT @ total.gram @ root / noise + eye)
         mean = torch.cholesky_solve(cross, factor)
         misfit = (total.energy / noise - (cross * mean).sum()) / 2
-        # Two image rows: each has one determinant, and each pair two coordinates.
+        # There are two image rows with one determinant each, and two coordinates in each pair.
         volume = 2 * factor.diagonal().log().sum() + total.count * (2 * math.pi * noise).log()
         return (misfit + volume) / total.count
 
@@ -234,7 +235,7 @@ def _motions(
         )
     sets: tuple[list[MotionSamples], list[MotionSamples]] = ([], [])
     for i, demonstration in distributed.local_items(demonstrations):
-        # Counted over all demonstrations, so that the choice does not depend on the processes.
+        # i counts all demonstrations, so the choice does not depend on the number of processes.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))
     for motions in sets:
@@ -253,7 +254,7 @@ def _motions(
 @pytree
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOutSamples:
-    """Pairs of key frames, each predicted from the other folds of the data."""
+    """Pairs of key frames; each pair's motion is predicted from other folds of the data."""
 
     position: Float[Tensor, "pairs 3"]
     """Position of the tool half-way between the two frames [m]."""
@@ -301,13 +302,13 @@ def cross_validate(
     config: ImageJacobianFitConfig,
     image_size: tuple[int, int] | None = None,
 ) -> HeldOutSamples:
-    """Predict every pair with camera and weights fitted to the other folds of the data.
+    """Predict the motion of every pair by a camera and weights fitted to the other folds.
 
     In a distributed run, each process predicts the pairs of its own demonstrations.
 
     Args:
-        demonstrations: Demonstrations that the network was fitted to.
-        network: Network as returned by `fit`, not loaded from a file.
+        demonstrations: Demonstrations to which the network was fitted.
+        network: Network as returned by `RBFImageJacobian.fit`, not loaded from a file.
         config: Settings of that fit.
         image_size: Width and height of the image [px]; needed for a network with a camera.
 
@@ -347,7 +348,15 @@ def _predicted(
     weights: Float[Tensor, "P 2"],
     config: ImageJacobianFitConfig,
 ) -> HeldOutSamples:
-    """Pairs of a demonstration; `left` is the same one with the camera's residual feature."""
+    """Predicted pairs of one demonstration.
+
+    Args:
+        part: The demonstration.
+        left: The same demonstration; its feature is the pixel minus the camera's prediction.
+        basis: Function from poses to activations of the neurons.
+        weights: Weights fitted to the other folds.
+        config: Choice of key frames.
+    """
     motion = left.motion(config)
     return HeldOutSamples(
         position=(motion.before.position + motion.after.position) / 2,

@@ -51,9 +51,9 @@ class RBFImageJacobian(nn.Module):
     a camera, the first term is zero and the second is the paper's (approxNN_vec).
 
     r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear, angular)
-    in the base frame, *not* the derivative of the rotation vector, so J_s J is the Jacobian
-    from joint velocities to pixels per second. vec stacks columns: those of J_s^T are the rows
-    of J_s.
+    in the base frame, *not* the derivative of the rotation vector. Therefore J_s J, with the
+    geometric Jacobian J of the arm, maps joint velocities to pixels per second. vec stacks the
+    columns of J_s^T, which are the rows of J_s.
     """
 
     weight: nn.Parameter
@@ -63,14 +63,14 @@ class RBFImageJacobian(nn.Module):
     width: Tensor
     """Standard deviation of the neurons, one number in the same units."""
     reference: Tensor | None
-    """Orientation (w, x, y, z) to which the rotation vector is relative; None: the base's."""
+    """Orientation (w, x, y, z) to which the rotation vector is relative; None: the base."""
     covariance: Tensor | None
     """Posterior covariance of the weights of one image row, (6 K, 6 K) in (component, neuron)
     order, with rotation scaled to metres (`rotation_scale`); None if not fitted."""
     camera: Tensor | None
     """Vector of the camera and its marker (see `perspective`), (13,); None: no camera."""
     camera_covariance: Tensor | None
-    """Covariance of a step from that camera, (13, 13)."""
+    """Covariance of a step from the camera (see `perspective.stepped`), (13, 13)."""
 
     def __init__(
         self,
@@ -91,8 +91,8 @@ class RBFImageJacobian(nn.Module):
             weight: W; None: zero.
             input_indices: Components of r = (x, y, z, rotation vector) that are inputs. A
                 rotation vector jumps at half turns; prefer positions, or give a reference.
-            reference: Orientation in the middle of the expected ones: the rotation vector of r
-                is then relative to it (see `pose_inputs`).
+            reference: Orientation in the middle of the expected orientations. The rotation
+                vector of r is relative to it (see `pose_inputs`). None: relative to the base.
             normalized: Divide the neurons by their sum (see `radial_basis`).
             camera: Camera whose image Jacobian is the first term; None: no camera.
 
@@ -150,7 +150,7 @@ class RBFImageJacobian(nn.Module):
     ) -> RBFImageJacobian:
         """Fit a network to demonstrations, which are read one by one.
 
-        In a distributed run, each process reads a part of them.
+        In a distributed run, each process reads a part of the demonstrations.
 
         Args:
             demonstrations: Demonstrations in memory, or a sequence that reads them on access.
@@ -240,7 +240,7 @@ class RBFImageJacobian(nn.Module):
     def uncertainty(
         self, r: Pose | Float[Tensor, "*batch 6"], rotation_scale: float = 0.15
     ) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of each column of J_s_hat, the larger of its two rows.
+        """Posterior standard deviation of each column of J_s_hat, larger value of both rows.
 
         Args:
             r: Pose, as for `forward`.
@@ -337,7 +337,7 @@ def _frames(r: Pose | Float[Tensor, "*batch 6"]) -> tuple[Pose, tuple[int, ...]]
 
 
 def _components(vector: Tensor, indices: tuple[int, ...]) -> Tensor:
-    """Some components of a vector; adjacent ones as a slice, far faster than indexing."""
+    """Some components of a vector; a slice if they are adjacent, which is far faster."""
     first, after = indices[0], indices[0] + len(indices)
     if indices == tuple(range(first, after)):
         return vector[..., first:after]

@@ -4,9 +4,11 @@ A vector c of thirteen numbers describes camera and marker:
 
     log f, (u0, v0), k1, rotation vector w and shift t from base to camera, marker m on the tool
 
-If the tool is at position p with rotation T, its marker is at x = exp(w) (p + T m) + t in the
-camera frame, and its pixel is  f xi (1 + k1 |xi|^2) + (u0, v0)  with xi = (x, y) / z. Camera
-and marker are fitted together, so they absorb errors of the tool centre point and of the base.
+Here f is the focal length [px], (u0, v0) the principal point [px], and k1 the radial
+coefficient. If the tool is at position p with rotation T, the marker is at the point
+exp(w) (p + T m) + t = (x, y, z) in the camera frame. With xi = (x, y) / z, its pixel is
+f xi (1 + k1 |xi|^2) + (u0, v0). Camera and marker are fitted together, so they absorb errors of
+the tool centre point and of the base.
 
 Most functions of c take any leading batch axes, and poses or points with one further axis of
 frames.
@@ -35,32 +37,35 @@ ROTATION, SHIFT, MARKER = slice(4, 7), slice(7, 10), slice(10, 13)
 SIZE = 13
 """Length of the vector c."""
 
-# Prior standard deviation of the logarithm of the focal length; its mean is the image width.
-# Fields of view of 34 to 79 degrees are within one standard deviation.
+# Prior standard deviation of the logarithm of the focal length; the prior mean of the focal
+# length is the image width. One standard deviation covers fields of view of 34 to 79 degrees.
 _FOCAL_SPREAD = 0.5
 # Prior standard deviation of the principal point from the image centre, relative to the image
-# width: in assembled cameras of two thousand pixels it is off by some tens of pixels.
+# width: in real cameras with images 2000 px wide, it is off by some tens of pixels.
 _CENTER_SPREAD = 0.02
 # Prior standard deviation of the radial coefficient: all lenses except fisheyes are within it.
 _RADIAL_SPREAD = 0.2
-# Prior standard deviations of the camera's rotation [rad] and shift [m], so wide that any value
-# is possible, and of the marker's offset from the tool centre point [m].
+# Prior standard deviations. `_ANY_TURN`, `_ANY_PLACE`: of the camera's rotation [rad] and shift
+# [m], so wide that any value is possible. `_MARKER_SPREAD`: of the marker's offset from the
+# tool centre point [m].
 _ANY_TURN, _ANY_PLACE, _MARKER_SPREAD = 10.0, 10.0, 0.2
 # Initial focal lengths of the search, relative to the image width.
 _FOCAL_STARTS = (0.6, 1.0, 1.7)
-# Lower bound of the pixel noise [px]: without it, all frames of exact images would be outliers.
+# Lower bound of the pixel noise [px]. Without a bound, all frames of exact images would count
+# as outliers.
 _LEAST_NOISE = 0.02
-# Least depth of a point [m].
+# Least depth of a point in the projection [m].
 _NEAREST = 1e-3
 _TINY = 1e-12
 # Steps of the fixed-point iteration that removes lens distortion. Each step multiplies the
 # error by about 2 |k1| |xi|^2: by 0.3 at the edge of a 79-degree image with k1 = 0.2.
 _LENS_STEPS = 20
-# Approximate number of frames used: fewer already average out the noise.
+# Approximate number of frames that are used; they suffice to average out the noise.
 _FRAMES = 2000
 # Rounds of robust reweighting, and Levenberg-Marquardt steps in each round.
 _ROUNDS, _STEPS = 8, 6
-# Initial search: number of frames, number of rounds, and number of best cameras refined after.
+# Initial search. `_FEW_FRAMES`: number of frames. `_SEARCHES`: number of rounds. `_FINALISTS`:
+# number of best cameras that are then refined.
 _FEW_FRAMES, _SEARCHES, _FINALISTS = 100, 5, 3
 # Least depth of the marker in any frame, for the initial cameras of the search [m].
 _CLEAR = 0.2
@@ -68,7 +73,8 @@ _CLEAR = 0.2
 _OUTLIER = 2.5
 # Steps of a bundle adjustment; twenty are enough to converge.
 _ADJUSTMENTS = 30
-# Length of the blocks of consecutive frames whose summed errors reveal their correlation.
+# Number of frames in a block. The summed errors of blocks of consecutive frames reveal the
+# correlation of the errors.
 _BLOCK = 25
 
 
@@ -76,7 +82,7 @@ def pixels_and_depth(
     camera: Float[Tensor, "*batch 13"], points: Float[Tensor, "*batch frames 3"]
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 3"]]:
     """Pixels of points in the camera frame [px], and their derivatives by the points [px/m]."""
-    # Points behind the camera are wrong: their pixels get far off, yet finite.
+    # Points behind the camera are treated as very near: their pixels are wrong, but finite.
     z = points[..., 2:].clamp_min(_NEAREST)
     xi = points[..., :2] / z
     focal, radial = camera[..., None, FOCAL].exp(), camera[..., None, RADIAL]
@@ -220,7 +226,7 @@ class CameraFit:
     """Robust standard deviation of a pixel coordinate [px]."""
 
     def deviation(self, part: slice) -> float:
-        """Largest standard deviation of the step among some components, such as `FOCAL`."""
+        """Largest standard deviation of a step among some components of c, such as `FOCAL`."""
         return float(self.covariance.diagonal()[part].max().clamp_min(0).sqrt())
 
     @property
@@ -253,8 +259,8 @@ def fit_camera(
     """Fit camera and marker by robust maximum a posteriori estimation.
 
     A Levenberg-Marquardt search starts from several orientations and focal lengths.
-    Errors of neighbouring frames are correlated, so each frame counts less than an independent
-    one.
+    Errors of neighbouring frames are correlated, so a frame counts less than an independent
+    observation.
 
     Args:
         demonstrations: Demonstrations in which the tool moved, read one by one.
@@ -330,7 +336,7 @@ def adjust_bundle(
     complement of the points leaves ten equations for the camera (Triggs et al. 2000).
 
     Args:
-        cameras: Copies of one camera, each with another of the points as its marker.
+        cameras: Copies of one camera, one for each point, with the point as the marker.
         pose: Poses of the link, (frames,).
         pixel: Pixels of the points [px]; NaN where a point is not seen.
         image_size: Width and height of the image [px].
@@ -438,7 +444,7 @@ def _from_prior(camera: Float[Tensor, "*batch 13"], prior: Float[Tensor, "13"]) 
 def _inflation(
     error: Float[Tensor, "starts frames 2"], noise: Float[Tensor, " starts"]
 ) -> Float[Tensor, " starts"]:
-    """Variance of error sums over blocks of frames, relative to that of independent errors."""
+    """Variance of errors summed over blocks of frames, relative to independent errors."""
     whole = error[:, : error.shape[1] // _BLOCK * _BLOCK]
     if not whole.shape[1]:
         return torch.ones_like(noise)
@@ -449,8 +455,9 @@ def _inflation(
 def _starts(
     pose: Pose, pixel: Float[Tensor, "frames 2"], prior: Float[Tensor, "13"], width: int
 ) -> Float[Tensor, "starts 13"]:
-    """Initial cameras in 24 orientations at three focal lengths, each with the best shift for a
-    marker at the tool centre point.
+    """Initial cameras in 24 orientations at three focal lengths.
+
+    Each camera has the shift that best explains a marker at the tool centre point.
     """
     rotations = _cube_rotations().to(pixel)
     turned, marker = quaternion.log(quaternion.from_matrix(rotations)), pixel.new_zeros(24, 3)
@@ -466,12 +473,19 @@ def _starts(
 def _shifts(
     point: Float[Tensor, "starts frames 3"], xi: Float[Tensor, "frames 2"]
 ) -> Float[Tensor, "starts 3"]:
-    """Least-squares shifts t of (x + t)_12 = xi (x + t)_3; all points are before the camera."""
+    """Shifts t of initial cameras [m], by least squares, with all points before the camera.
+
+    A point x, rotated to the camera frame, is seen in direction xi = (x + t)_12 / (x + t)_3.
+
+    Args:
+        point: Points x for each start [m].
+        xi: Directions of the pixels, without lens distortion.
+    """
     eye = torch.eye(2, dtype=xi.dtype).expand(len(xi), 2, 2)
     rows = torch.cat([eye, -xi[..., None]], dim=-1).reshape(-1, 3)
     right = (xi * point[..., 2:] - point[..., :2]).flatten(1)
-    # Without perspective the depth is undetermined: a weak prior puts it at one metre, with a
-    # millionth of the weight of the pixels.
+    # If the pixels do not determine the depth, a weak prior sets it to one metre. The prior has
+    # a millionth of the weight of the pixels.
     depth = 1.0 - point[..., 2].mean(1)
     ridge = 1e-6 * len(xi) * torch.diag(xi.new_tensor([0.0, 0.0, 1.0]))
     towards = right @ rows + ridge.diagonal() * depth[:, None]
@@ -493,7 +507,7 @@ def _cube_rotations() -> Float[Tensor, "24 3 3"]:
 def motion_jacobian(
     camera: Float[Tensor, "13"], points: Float[Tensor, "frames 3"]
 ) -> Float[Tensor, "frames 2 6"]:
-    """Derivative of pixels by a twist of one camera in its own frame [px/rad, px/m].
+    """Derivative of pixels by a twist of the camera in the camera frame [px/rad, px/m].
 
     This is the interaction matrix of points of Espiau, Chaumette and Rives (1992), times the
     derivative of the lens; three columns for rotation, then three for translation.
@@ -503,7 +517,7 @@ def motion_jacobian(
         points: Points in the camera frame [m].
     """
     _, by_point = pixels_and_depth(camera, points)
-    # If the camera turns by w and moves by v, a point p moves by p x w - v in its frame.
+    # If the camera turns by w and moves by v, a point p moves by p x w - v in the camera frame.
     turned = torch.linalg.cross(by_point, points[:, None].expand(by_point.shape))
     return torch.cat([turned, -by_point], dim=-1)
 
@@ -519,7 +533,7 @@ def moved(camera: Float[Tensor, "13"], twist: Float[Tensor, "6"]) -> Float[Tenso
 def _sampled(
     demonstrations: Sequence[ImageDemonstration],
 ) -> tuple[Pose, Float[Tensor, "frames 2"]]:
-    """Poses and pixels of frames with a visible marker, evenly from all demonstrations."""
+    """Poses and pixels of about `_FRAMES` frames with a visible marker, evenly chosen."""
     every = -(-len(demonstrations) // _FRAMES)
     each = -(-_FRAMES // len(demonstrations))
     positions, orientations, pixels = [], [], []
