@@ -1,4 +1,4 @@
-"""Arms as LeRobot robots: their base class, and the warnings about recordings of them."""
+"""Base class of arms as LeRobot robots, and warnings about poor recordings of an arm."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LATE = 1.5
-"""Action periods after which an action counts as late: it is then nearer to the next frame."""
+"""Action periods after which an action counts as late: its time is then nearer to the next
+frame."""
 PAUSE = 2.0
 """Time without an action above which there is a pause instead of a late action [s], for example
 between two episodes."""
 TOLERATED = 0.02
 """Fraction of late actions that raises no warning."""
 EPISODE = 1.0
-"""Shortest episode [s]; a shorter sequence of actions need not show any motion."""
+"""Shortest sequence of actions that must show motion, as an episode does [s]."""
 
 
 class Device:
@@ -68,7 +69,7 @@ class Device:
         """Open the device.
 
         Raises:
-            DeviceAlreadyConnectedError: It is open already.
+            DeviceAlreadyConnectedError: The device is open already.
         """
         self._open()
         self._connected = True
@@ -78,7 +79,7 @@ class Device:
         """Close the device.
 
         Raises:
-            DeviceNotConnectedError: It is not open.
+            DeviceNotConnectedError: The device is not open.
         """
         self._connected = False
         self._close()
@@ -95,10 +96,10 @@ class Device:
 class LoopWatch:
     """Checks recordings of an arm, and warns at the end of each sequence of actions.
 
-    LeRobot stamps each frame with its number divided by the rate, not with the time of its
+    LeRobot stamps each frame with its number divided by the rate, not with the time of the
     recording: if actions came late, the arm seems to have moved faster than it did. LeRobot
-    does not report when it records, nor when an episode ends. So a sequence ends with a pause,
-    with the next reset of the scene, or when the robot is disconnected.
+    does not report when it records, nor when an episode ends. Therefore a sequence of actions
+    ends with a pause, with the next reset of the scene, or when the robot is disconnected.
     """
 
     def __init__(
@@ -170,11 +171,11 @@ def connected_robots() -> list[ArmRobot]:
 def the_robot() -> ArmRobot:
     """The only connected robot, for its teleoperator.
 
-    LeRobot gives a teleoperator no reference to the robot. One that guides the end effector
-    needs the state of the arm.
+    LeRobot gives a teleoperator no reference to the robot. But a teleoperator that guides the
+    end effector needs the state of the arm.
 
     Raises:
-        DeviceNotConnectedError: There is none, or several.
+        DeviceNotConnectedError: No robot or several robots are connected.
     """
     robots = connected_robots()
     if len(robots) != 1:
@@ -210,12 +211,12 @@ class ArmRobotConfig(ValuesConfig, RobotConfig):
 class ArmRobot(Device, Robot):
     """Arm commanded by joint positions or by the pose of its end effector.
 
-    Actions of either space are accepted, and the gripper's opening may be omitted. So
-    lerobot-rollout can also return the arm to its first position. Motions keep the limits of
-    the joints and of the tool speed, but do not avoid obstacles; `send_action` returns the
-    commanded values.
+    Actions of both spaces are accepted, and the gripper's opening may be omitted. This lets
+    lerobot-rollout return the arm to its first position. Motions keep the limits of the joints
+    and of the tool speed, but do not avoid obstacles. `send_action` returns the commanded
+    values.
 
-    With a person (`ArmRobotConfig.person`) actions command the end effector only, while the
+    With a person (`ArmRobotConfig.person`), actions command only the end effector, and the
     person guides the body (`ComplementaryMotion`).
 
     Attributes:
@@ -226,7 +227,7 @@ class ArmRobot(Device, Robot):
         initial_configurations: Number of resets of the scene; only a simulation can be reset.
         complement: Combination with the person's input, while connected; None: there is no
             person.
-        judged: True if its motion may be recorded, so that quality warnings are given.
+        judged: True if the arm's motion may be recorded: warnings of poor quality are given.
     """
 
     complement: ComplementaryMotion | None = None
@@ -314,7 +315,7 @@ class ArmRobot(Device, Robot):
         return self.values.action_of(self.space, sent, width, self._rotation)
 
     def _judge(self) -> None:
-        """Pass the reading that is recorded with this action to the watch."""
+        """Pass the reading of the arm that is recorded with this action to the loop watch."""
         if not self.judged:
             return
         state, self._state = self._state, None
@@ -399,7 +400,7 @@ class ArmRobot(Device, Robot):
         return joints, width
 
     def _seen(self, state: ArmState) -> ArmState:
-        """Observed part of a reading; the policy's own posture if that is configured."""
+        """The reading as observed: with the policy's own posture if `observed` is "posture"."""
         if self.complement is None or self._person_config.observed == "joints":
             return state
         return replace(

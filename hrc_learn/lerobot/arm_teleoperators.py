@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from hrc_learn.teleoperation.page import Page
 
 
-# Largest lead of commanded positions over the arm [rad]: prevents windup of a blocked arm.
+# Largest lead of commanded positions over the arm [rad]; it prevents windup while the arm is
+# blocked.
 _SLACK = 0.05
 
 
@@ -62,7 +63,7 @@ class GuidedRobot:
         self._velocity = joint_velocity
 
     def next(self) -> tuple[dict[str, float], HumanInput]:
-        """Next action, and the input of the person."""
+        """Next action, and the input of the person that led to it."""
         with torch.inference_mode():
             step = self._guided.step()
         here = step.state.joint_position
@@ -142,7 +143,7 @@ class ArmPageConfig(TeleoperatorConfig):
     """Person that guides an arm in a browser; `--teleop.type=arm_page`."""
 
     host: str = "127.0.0.1"
-    """Address of the page. Anyone that can reach it can move the arm."""
+    """Address of the page. Anyone that can reach this address can move the arm."""
     port: int | None = None
     """Port of the page; None: the first free one from 8080 on."""
 
@@ -150,8 +151,8 @@ class ArmPageConfig(TeleoperatorConfig):
 class ArmPage(ArmTeleoperator):
     """Browser page on which a person guides the end effector, the elbow and the gripper.
 
-    It shows the simulated or real arm as the robot reports it. "Home" restarts the scenario of
-    a `mujoco_arm`; LeRobot controls the recording.
+    The page shows the simulated or real arm as the robot reports it. "Home" restarts the
+    scenario of a `mujoco_arm`. LeRobot controls the recording.
 
     Attributes:
         page: The page, while connected.

@@ -1,4 +1,4 @@
-"""Values of an arm as LeRobot names them, in actions and observations.
+"""Names and conversions of an arm's values in LeRobot's actions and observations.
 
 Units are radians, metres and pixels; poses are in the base frame, as position and rotation
 vector. Names end in `.pos` or `.vel` because lerobot-rollout passes on no others.
@@ -27,8 +27,8 @@ ActionSpace = Literal["joint", "ee"]
 """Joint positions, or pose of the end effector; each with the gripper's opening."""
 
 DOWN = quaternion.log(gripper_down()).numpy()
-"""Rotation vector of a gripper that points down, the default reference for the signs of others
-[rad].
+"""Rotation vector of a gripper that points down [rad]. By default, the rotation vector nearest
+to this one is chosen among those that describe the same orientation.
 """
 
 
@@ -38,7 +38,7 @@ class ArmValues:
     Attributes:
         chain: Kinematics of the arm.
         joints: Names of the joints' positions [rad].
-        velocities: Names of their velocities [rad/s].
+        velocities: Names of the joints' velocities [rad/s].
     """
 
     def __init__(self, chain: SerialChain):
@@ -48,7 +48,7 @@ class ArmValues:
         self.velocities = tuple(f"{name}.vel" for name in chain.joint_names)
 
     def action_names(self, space: ActionSpace) -> tuple[str, ...]:
-        """Names of an action's values, in order."""
+        """Names of an action's values, in the order of the action."""
         return (*(self.joints if space == "joint" else HAND), GRIPPER)
 
     def action_of(
@@ -62,9 +62,9 @@ class ArmValues:
 
         Args:
             space: Action space.
-            joints: Positions [rad].
-            width: Opening [m].
-            near: Previous rotation vector, which picks the sign of the new one [rad].
+            joints: Joint positions [rad].
+            width: Opening of the gripper [m].
+            near: Previous rotation vector; the new one is chosen near it [rad].
         """
         values = joints if space == "joint" else self.hand_vector(joints, near)
         names = self.action_names(space)
@@ -75,8 +75,8 @@ class ArmValues:
     ) -> Float[np.ndarray, "6"]:
         """Position [m] and rotation vector [rad] of the end effector.
 
-        A gripper that points down is half a turn from the base, where the shortest rotation
-        vector jumps from one side to the other; `near` picks the side.
+        A gripper that points down is turned by half a turn from the base. There the shortest
+        rotation vector jumps from one side to the other; `near` [rad] picks the side.
         """
         pose = self.chain.forward(torch.from_numpy(np.asarray(joints, dtype=float)))
         vector = pose.vector()

@@ -1,9 +1,9 @@
-"""Detection of a camera that was moved since the demonstrations, in rollouts of any policy.
+"""Detect in rollouts of any policy that the camera was moved since the demonstrations.
 
-A step of the policy's preprocessor compares the pixel of the tool's marker with the one that
-the demonstrations predict (`CameraWatch`), and warns if the camera has moved. On request, it
-also corrects the pixels that the policy receives to those that the camera would see from its
-old pose (`CameraCorrection`). Actions are not changed.
+A step of the policy's preprocessor compares the pixel of the tool's marker with the pixel that
+the demonstrations predict (`CameraWatch`), and warns if the camera has moved. On request, the
+step also replaces the pixels that the policy receives by those that the camera would see from
+its old pose (`CameraCorrection`). Actions are not changed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CAMERA_WATCH = "hrc_learn_camera_watch"
 class CameraWatchStep(ProcessorStep):
     """Warns once per episode if the camera has moved since the demonstrations.
 
-    Belongs at the beginning of the preprocessor, where state and pixel have their units.
+    This step belongs at the beginning of the preprocessor, where state and pixels have units.
     """
 
     reference: dict[str, Any]
@@ -53,13 +53,13 @@ class CameraWatchStep(ProcessorStep):
     fps: float
     """Calls a second [1/s]."""
     pose_columns: list[int]
-    """Indices of `HAND` in the state, in that order."""
+    """Indices of the values `HAND` in the state, in the order of `HAND`."""
     marker_columns: list[int]
-    """Indices of `MARKER` in the state, in that order."""
+    """Indices of the values `MARKER` in the state, in the order of `MARKER`."""
     correct: bool = False
-    """Correct pixels to those that the camera would see at its original pose."""
+    """Replace pixels by those that the camera would see from its original pose."""
     object_columns: list[int] | None = None
-    """Indices of `PIXELS` in the state, which are corrected too; None: there are none."""
+    """Indices of the values `PIXELS` in the state, which are corrected, too; None: none."""
     object_height: float = 0.0
     """Height of the plane on which the object lies, from `jacobian.object_height` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
@@ -100,7 +100,7 @@ class CameraWatchStep(ProcessorStep):
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
     def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
-        """Pose of the tool if its marker is visible; the watch is updated with the marker."""
+        """Update the watch with the marker; return the tool's pose, or None if it is hidden."""
         vector = state[self.pose_columns]
         if marker[2] < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
             return None

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 
 # Time from reading the joints until the arm follows [s], as in `Imperfections.nominal()`. With
-# franky and simulators, a command took 2 ms to the servos; the rest allows for the network, the
-# scheduling and the computation of a step, which simulators do not include.
+# franky and simulators, a command took 2 ms to the servos. The rest allows for the network, the
+# scheduling and the computation of a step, which the simulators do not include.
 _DELAY = 0.030
 
 
@@ -74,10 +74,10 @@ class DrivenArmConfig(ArmRobotConfig):
 class DrivenArm(ArmRobot):
     """An arm commanded by positions, through a driver that takes velocities.
 
-    An action passes four stages on its way to the arm: `MotionFilter`, with the limits of the
-    joints' motion; the safety filter, with a cap on the speed of the tool; a watchdog that
-    stops the arm if the loop falls silent, in a separate process with the driver; and the
-    driver, which ends every velocity by itself. Keep the stop button in hand.
+    An action passes four stages on its way to the arm. `MotionFilter` keeps the limits of the
+    joints' motion. The safety filter caps the speed of the tool. A watchdog, in a separate
+    process together with the driver, stops the arm if the loop sends nothing. The driver ends
+    every velocity by itself. Keep the stop button in hand.
 
     Attributes:
         arm: The driver's process, while connected.
@@ -167,7 +167,7 @@ class FrankaPandaConfig(FrankyConfig, DrivenArmConfig):
         FrankyConfig.__post_init__(self)
 
     def driver(self) -> FrankyConfig:
-        """Settings of the driver, which its process reads without LeRobot."""
+        """Settings of the driver alone, which the driver's process can read without LeRobot."""
         return FrankyConfig(**{f.name: getattr(self, f.name) for f in fields(FrankyConfig)})
 
 

@@ -23,7 +23,7 @@ from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
 
 _GYM_ID = "hrc_learn/mujoco_arm"
 _MORE_TIME = 1.25
-"""Time limit of a policy, in durations of a demonstration."""
+"""Time limit of a policy, as a multiple of the duration of a demonstration."""
 
 
 @EnvConfig.register_subclass("mujoco_arm")
@@ -31,8 +31,8 @@ _MORE_TIME = 1.25
 class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
     """Scenarios of a `mujoco_arm`, judged by MuJoCo's contacts; `--env.type=mujoco_arm`.
 
-    Observations and actions are those of the robot with the same settings, in the same order,
-    so that what was recorded on it can be evaluated here.
+    Observations and actions are those of the robot with the same settings, in the same order.
+    Therefore a policy trained on recordings of the robot can be evaluated here.
     """
 
     task: str | None = "placing"
@@ -119,7 +119,7 @@ class ArmEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin the episode of a seed; None: of the next random number."""
+        """Begin the episode of a seed; None: the seed is the next random number."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))

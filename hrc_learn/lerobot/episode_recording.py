@@ -1,6 +1,6 @@
-"""Recording of episodes in simulated time, of the scripted expert or a policy.
+"""Record episodes of the scripted expert or of a policy, in simulated time.
 
-LeRobot's own commands use the wall clock, and cannot record the person's input.
+LeRobot's own commands use the wall clock, and cannot record the input of a person.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def observation_features(robot: ArmRobot) -> dict[str, dict]:
 
 @contextmanager
 def new_dataset(folder: Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
-    """New dataset of a robot's observations and actions, complete at the end or absent.
+    """New dataset of a robot's observations and actions; the folder appears when complete.
 
     Args:
         folder: Folder of the new dataset; must not exist.
@@ -132,7 +132,8 @@ def _show(robot: MujocoArmRobot, expert: ArmExpert, dataset: LeRobotDataset) -> 
 
 
 _ROLLOUT_TIME = 1.5
-"""Length of a rollout in durations of a demonstration, with time to wait for a person."""
+"""Length of a rollout, as a multiple of the duration of a demonstration: the policy may have to
+wait for a person."""
 
 
 class CheckpointPolicy:
@@ -207,7 +208,7 @@ def record_rollouts(
 
     Args:
         folder: Folder of the new dataset; must not exist.
-        policy: Checkpoint, its folder `pretrained_model`.
+        policy: Folder `pretrained_model` of a checkpoint.
         config: Configuration of the robot, with the scenario, the first seed and the person.
         episodes: Number of episodes to record.
 

@@ -40,9 +40,9 @@ class ImagesConfig:
     and needs no OpenGL; "auto" renders where possible.
     """
     width: int = 160
-    """[px]"""
+    """Width of the images [px]."""
     height: int = 120
-    """[px]"""
+    """Height of the images [px]."""
 
 
 @dataclass
@@ -50,23 +50,23 @@ class MovedCameraConfig:
     """Displacement of the fixed camera; it still sees the table."""
 
     distance: float = 0.0
-    """Distance by which it is moved [m]."""
+    """Distance by which the camera is moved [m]."""
     angle: float = 0.0
-    """Angle by which it is turned [degrees]."""
+    """Angle by which the camera is turned [degrees]."""
     seed: int = 0
-    """Random seed of both directions."""
+    """Random seed of the direction of motion and of the axis of rotation."""
 
 
 @dataclass(kw_only=True)
 class WorkplaceConfig:
-    """Settings of the simulated workplace, the same for robot and environment."""
+    """Settings of the simulated workplace, common to the robot and the environment."""
 
     arm: str = "panda"
     """Registered name of the arm, or its URDF or MJCF file."""
     base: str = ""
-    """Link of such a file that is the arm's base; empty: its root."""
+    """Link in the file that is the arm's base; empty: the root of the file."""
     tip: str = ""
-    """Link of such a file that is the arm's flange; empty: its only end."""
+    """Link in the file that is the arm's flange; empty: the only end of the arm."""
     shelf: str = "middle"
     """Target shelf: "lower", "middle" or "upper"."""
     pixels: bool = False
@@ -100,8 +100,8 @@ class MujocoArmRobotConfig(WorkplaceConfig, ArmRobotConfig):
     seed: int = 0
     """Seed of the first initial configuration; each reset increments it."""
     imperfections: float = 0.0
-    """Size of the errors of arm, calibration and workplace, in multiples of the nominal ones;
-    each seed draws its own."""
+    """Size of the errors of arm, calibration and workplace, in multiples of the nominal errors;
+    each seed draws other errors."""
     episode_time: float = 0.0
     """Time [s] after which the scenario starts again, equal to `--dataset.episode_time_s`:
     lerobot-record does not report the end of an episode. 0: never."""
@@ -241,7 +241,7 @@ class MujocoArmRobot(ArmRobot):
         return values
 
     def _look_at_marker(self) -> tuple[float, float, float]:
-        """Pixel of the marker, and 1; if it is hidden, its last pixel, and 0."""
+        """Pixel (u, v) of the tool's marker, and 1; if it is hidden, its last pixel, and 0."""
         pixel = self.run.tool_pixel()
         u, v = self._marker[:2] if pixel is None else pixel.tolist()
         self._marker = (u, v, float(pixel is not None))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hrc_learn.teleoperation import ScriptedForce
 
 PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
-"""No person, a script that pulls the elbow at random moments of a simulation, or the input
+"""No person; a script that pulls the elbow at random moments of a simulation; or the input
 device of a real person. Gamepad and keyboard guide the elbow here, not the end effector."""
 
 
@@ -47,13 +47,13 @@ class PersonConfig:
     offset from them ("stay").
     """
     observed: Literal["posture", "joints"] = "posture"
-    """Observed joint positions and velocities: those of the policy's own posture, as without
-    the person, or the measured ones.
+    """Observed joint positions and velocities: those of the policy's own posture, as if there
+    were no person ("posture"), or the measured ones ("joints").
     """
     record: bool = False
-    """Observe the null-space input, and the joint displacement that it caused."""
+    """Observe the person's null-space input, and the joint displacement that it causes."""
     host: str = "127.0.0.1"
-    """Address of the page. Anyone that can reach it can move the arm."""
+    """Address of the page. Anyone that can reach this address can move the arm."""
     port: int | None = None
     """Port of the page; None: the first free one from 8080 on."""
     worker: bool = False
@@ -74,7 +74,7 @@ def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
     """Pulls of the scripted person, drawn from a seed."""
     from hrc_learn.teleoperation import random_pulls
 
-    # A separate generator keeps everything but the pulls alike in runs with and without them.
+    # With a separate generator, runs with and without pulls differ in nothing but the pulls.
     return random_pulls(np.random.default_rng([seed, 1]))
 
 
@@ -95,7 +95,7 @@ class RobotPage:
             host: Address of the page.
             port: Port of the page; None: the first free one from 8080 on.
             note: Text shown on the page.
-            guides: True if the person also guides the end effector, and not the body only.
+            guides: True if the person guides the end effector, too; False: only the body.
         """
         from hrc_learn.sim import World
         from hrc_learn.sim.workplace import Workplace
@@ -110,7 +110,7 @@ class RobotPage:
         """Show the present posture of the arm.
 
         Args:
-            driver: Driver of the arm, read if there is no world.
+            driver: Driver of the arm; it is read only if there is no world.
             world: Simulated world with everything around the arm; None for a real arm.
         """
         if world is None:

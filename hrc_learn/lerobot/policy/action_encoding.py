@@ -1,4 +1,4 @@
-"""Encoding of actions as coordinates without jumps, and the meaning of their columns."""
+"""Encode actions as coordinates without jumps, and find the meaning of action columns."""
 
 from collections.abc import Sequence
 
@@ -10,20 +10,22 @@ from hrc_learn.dmp import orientation_error
 from hrc_learn.geometry import quaternion
 
 SMALLEST_SPREAD = 1e-3
-"""Smallest divisor: components that vary by less are not amplified to a spread of one."""
+"""Smallest divisor: a component with a smaller spread is not amplified to a spread of one."""
 
 
 class ActionEncoding(nn.Module):
     """Actions as coordinates of mean zero and spread one, and back.
 
-    A rotation vector becomes the error e = log(r conj(q)) to a reference r, the mean
-    orientation of the demonstrations; orientations are interpolated linearly in e (see
-    `hrc_learn/dmp/orientation_error.py`). So coordinates do not jump where a rotation vector
-    does, at half a turn, which is the orientation of a gripper that points down.
+    A rotation vector of orientation q becomes the error e = log(r conj(q)) to a reference r,
+    the mean orientation of the demonstrations. Orientations are interpolated linearly in e (see
+    `hrc_learn/dmp/orientation_error.py`). A rotation vector jumps at half a turn, which is the
+    orientation of a gripper that points down. The coordinates do not jump there.
     """
 
     mean: Tensor
+    """Mean of each component, (A)."""
     std: Tensor
+    """Spread of each component, (A)."""
     reference: Tensor
     """Unit quaternions (w, x, y, z), one for each rotation vector."""
 
@@ -31,7 +33,7 @@ class ActionEncoding(nn.Module):
         """Start with a mean of zero, a spread of one and references without rotation.
 
         Args:
-            width: A, number of components of an action.
+            width: Number A of components of an action.
             triples: Indices of the three components of each rotation vector [rad].
         """
         super().__init__()
@@ -50,7 +52,7 @@ class ActionEncoding(nn.Module):
     def to_actions(
         self, coordinates: Float[Tensor, "*batch T A"]
     ) -> Float[Tensor, "*batch T A"]:
-        """Actions of coordinates; rotation vectors are those nearest to the reference's."""
+        """Actions from coordinates, with the rotation vectors nearest to the reference's."""
         actions = coordinates * self.std + self.mean
         for triple, reference in zip(self.triples, self.reference, strict=True):
             q = orientation_error.to_orientation(actions[..., triple], reference)
@@ -62,7 +64,7 @@ class ActionEncoding(nn.Module):
 
     @torch.no_grad()
     def learn(self, episodes: Sequence[Float[Tensor, "_frames A"]]) -> None:
-        """Take mean, spread and references from demonstrated actions.
+        """Set mean, spread and references from demonstrated actions.
 
         Raises:
             ValueError: An orientation is more than half a turn away from the mean.
@@ -87,6 +89,7 @@ class ActionEncoding(nn.Module):
         self.std.copy_(std.clamp_min(SMALLEST_SPREAD))
 
     def _unrolled(self, actions: Tensor) -> Tensor:
+        """Actions with each rotation vector replaced by its error to the reference."""
         for triple, reference in zip(self.triples, self.reference, strict=True):
             q = quaternion.exp(actions[..., triple])
             error = orientation_error.to_error(q, reference)
@@ -99,16 +102,16 @@ def _replaced(values: Tensor, columns: list[int], new: Tensor) -> Tensor:
     return values.index_copy(-1, index, new.to(values))
 
 
-# Components of action and state that belong together, by their names.
+# The functions below find components of action and state that belong together, by their names.
 
 ROTATION = ("wx", "wy", "wz")
-"""Last part of the names of a rotation vector's components, as LeRobot has them."""
+"""Last part of the names of a rotation vector's components, as LeRobot names them."""
 ENDINGS = ("", ".pos")
 """Possible endings of names; lerobot-rollout drops names without an ending."""
 
 
 def rotation_triples(names: Sequence[str] | None) -> list[list[int]]:
-    """Components that make up rotation vectors, such as ee.wx, ee.wy, ee.wz.
+    """Indices of components that make up rotation vectors, such as ee.wx, ee.wy, ee.wz.
 
     Args:
         names: Names of all components; None: unknown.
@@ -131,8 +134,8 @@ def matched_columns(
 ) -> list[int]:
     """State columns that measure each component of the action; -1: not measured.
 
-    If neither has names and their widths agree, the state counts as the measured action. A
-    rotation vector counts as measured only if all its components are.
+    If neither action nor state has names and their widths agree, the state counts as the
+    measured action. A rotation vector counts as measured only if all its components are.
 
     Args:
         action_names: Names of the action's components; None: unknown.
@@ -152,9 +155,9 @@ def matched_columns(
 
 
 TWO_LEVEL = 0.9
-"""Fraction of the largest variance possible between minimum and maximum (Bhatia and Davis 2000,
-"A better bound on the variance") from which a column counts as two-level. The fraction is 1 for
-a column that only takes its extremes.
+"""A column counts as two-level if its variance is more than this fraction of the largest
+variance possible between its minimum and maximum (Bhatia and Davis 2000, "A better bound on the
+variance"). The fraction is 1 for a column that takes no other values.
 """
 
 

@@ -12,9 +12,9 @@ from torch.nn.utils.rnn import pad_sequence
 from hrc_learn.dmp import JointDMP, Response, fit_ridge
 
 HARMONICS = 4
-"""Sines and cosines of the phase that the network sees."""
+"""Number of sines, and of cosines, of the phase among the inputs of the network."""
 DURATIONS = math.log(3)
-"""Largest deviation of a predicted duration from the fitted one, as a logarithm."""
+"""Largest deviation of the logarithm of a predicted duration from that of the fitted one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,13 +24,13 @@ class Primitives:
     weights: Float[Tensor, "*batch A N"]
     start: Float[Tensor, "*batch A"]
     start_velocity: Float[Tensor, "*batch A"]
-    """[1/s]"""
+    """Velocity at the start [1/s]."""
     goal: Float[Tensor, "*batch A"]
     duration: Float[Tensor, "*batch"]
-    """[s]"""
+    """Duration of the motion [s]."""
 
     def from_rest(self) -> Float[Tensor, "*batch A M"]:
-        """Coordinates of the motion that begins at rest at its goal."""
+        """Coordinates of the same primitive if it begins at rest and at its goal."""
         ends = torch.stack([torch.zeros_like(self.goal), self.goal, self.goal], dim=-1)
         return torch.cat([self.weights, ends], dim=-1)
 
@@ -40,16 +40,19 @@ class ContextualMotion(nn.Module):
 
     x = a + B c + r(features, phase),   x = (weights, y_0', y_0, g) of each coordinate, log tau
 
-    The context c holds the numbers measured at the start of the episode. a and B come from a
-    fit in closed form (`fit_closed_form`), and the network r starts at zero. So the policy
-    works before any training, and training learns the residual. Weights are in units of the
-    spring's stiffness, in which they are as large as the motion.
+    y_0' is the start velocity times the duration tau, y_0 the start and g the goal. The context
+    c holds the numbers measured at the start of the episode. a (`base`) and B (`slopes`) come
+    from a fit in closed form (`fit_closed_form`), and the network r starts at zero. Therefore
+    the policy works before any training, and training learns the residual. In x, weights are
+    divided by the spring's stiffness, which makes them about as large as the motion.
     """
 
     centre: Tensor
     """Context at which the primitives are `base`."""
     low: Tensor
+    """Lowest context; lower values are clamped."""
     high: Tensor
+    """Highest context; higher values are clamped."""
 
     def __init__(
         self, response: Response, width: int, context: int, features: int, hidden: int
@@ -58,9 +61,9 @@ class ContextualMotion(nn.Module):
 
         Args:
             response: Response of the primitives.
-            width: A, number of coordinates.
-            context: C, length of the context.
-            features: Features of the first and the current observation together.
+            width: Number A of coordinates.
+            context: Length C of the context.
+            features: Number of features of the first and the current observation together.
             hidden: Width of the network.
         """
         super().__init__()
@@ -97,7 +100,7 @@ class ContextualMotion(nn.Module):
             features: Features of the first and the current observation.
             elapsed: Time since the start of the episode [s].
         """
-        # Linear extrapolation outside the demonstrations is unbounded.
+        # Clamp the context: linear extrapolation outside the demonstrations is unbounded.
         c = torch.minimum(torch.maximum(context, self.low), self.high) - self.centre
         x = self.base + c @ self.slopes
         phase = elapsed / self._duration(x)
@@ -107,7 +110,7 @@ class ContextualMotion(nn.Module):
         )
 
     def primitives(self, x: Float[Tensor, "*batch K"]) -> Primitives:
-        """Primitives from x (see the class)."""
+        """Primitives from the vector x (see the class)."""
         per_coordinate = x[..., :-1].unflatten(-1, (self.width, -1))
         duration = self._duration(x)
         return Primitives(
@@ -119,6 +122,7 @@ class ContextualMotion(nn.Module):
         )
 
     def _duration(self, x: Tensor) -> Tensor:
+        """Duration [s] from the vector x, within `DURATIONS` of the fitted duration."""
         fitted = self.base[-1].detach()
         return (fitted + (x[..., -1] - fitted).clamp(-DURATIONS, DURATIONS)).exp()
 
@@ -128,9 +132,10 @@ REGULARIZATIONS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 FEWEST = 4
 """Fewest demonstrations for which a regression can be distinguished from chance."""
 SMALLEST_VARIATION = 0.05
-"""Fraction of its spread by which a context value must vary between demonstrations."""
+"""A context value is used only if its whitened standard deviation between demonstrations is
+larger."""
 MARGIN = 0.5
-"""Fraction of the demonstrated range by which contexts may lie outside it."""
+"""Contexts may lie outside the demonstrated range by this fraction of the range."""
 
 
 @torch.no_grad()
@@ -142,18 +147,18 @@ def fit_closed_form(
 ) -> float:
     """Set base and slopes of `motion` from demonstrations.
 
-    One primitive is fitted to each demonstration. The motion is their mean or, if that predicts
-    demonstrations left out better, a ridge regression on the context.
+    One primitive is fitted to each demonstration. The result is the mean of these primitives,
+    or a ridge regression on the context if it predicts left-out demonstrations better.
 
     Args:
-        motion: Changed in place.
-        demonstrations: Coordinates frame by frame.
+        motion: Motion whose base, slopes and range of contexts are set in place.
+        demonstrations: Whitened actions of each demonstration.
         contexts: Whitened context of each demonstration.
         fps: Frames a second.
 
     Returns:
-        Root mean square error of the motions of left-out demonstrations, relative to the spread
-        of the coordinates; NaN for a single demonstration.
+        Root mean square error of motions predicted for left-out demonstrations, relative to the
+        spread of the coordinates; NaN for a single demonstration.
     """
     x, c, n = _fit_each(motion.response, demonstrations, fps), contexts.double(), len(contexts)
     left_out = (x - x.mean(0)) * n / (n - 1) if n > 1 else x * torch.nan
@@ -177,7 +182,7 @@ def fit_closed_form(
 def _fit_each(
     response: Response, demonstrations: Sequence[Tensor], fps: float
 ) -> Float[Tensor, "n K"]:
-    """Coordinates of one primitive for each demonstration, as in `ContextualMotion`."""
+    """Vector x (see `ContextualMotion`) of a primitive fitted to each demonstration."""
     position = pad_sequence([d.double() for d in demonstrations], batch_first=True)
     lengths = torch.tensor([len(d) for d in demonstrations])
     frame = torch.arange(position.shape[1])
@@ -195,8 +200,8 @@ def _fit_each(
 
 
 def _error(motion: ContextualMotion, difference: Float[Tensor, "n K"]) -> float:
-    """Motion error caused by a difference in coordinates, root mean square."""
-    # The map to motions is linear in all but the duration, which shifts them in time.
+    """Root mean square error of motions that differences of the vectors x cause."""
+    # The motion is linear in all of x but the duration, which shifts the motion in time.
     per_coordinate = difference[:, :-1].unflatten(-1, (motion.width, -1)).clone()
     per_coordinate[..., :-3] *= motion.response.spring.stiffness
     s = torch.linspace(0, 1, 100, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The policy `dmp`, one movement primitive per episode, and its checkpoint without training.
+"""The policy `dmp`, with one movement primitive per episode, and its fit without training.
 
 LeRobot finds policy and processors in the module of the configuration.
 """
@@ -40,10 +40,10 @@ EARLIEST = -1_000_000
 @PreTrainedConfig.register_subclass("dmp")
 @dataclass
 class DMPConfig(MotionPolicyConfig):
-    """Settings of one movement primitive an episode, corrected with every chunk."""
+    """Settings of a policy with one movement primitive per episode."""
 
     n_basis: int = 50
-    """Basis functions a coordinate."""
+    """Number of basis functions for each coordinate."""
     hidden_dim: int = 128
     """Width of the network that corrects the primitive."""
 
@@ -63,11 +63,13 @@ class Underway:
     """State of an episode's motion at one time, in the coordinates of the primitives."""
 
     context: Float[Tensor, "B C"]
-    """Numbers of the first observation, whitened."""
+    """Numbers (not images) of the first observation, whitened."""
     features: Float[Tensor, "B F"]
     """Features of the first observation."""
     position: Float[Tensor, "B A"]
+    """Whitened action at this time."""
     velocity: Float[Tensor, "B A"]
+    """Rate of change of the whitened action [1/s]."""
     elapsed: Float[Tensor, "B"]
     """Time of this state since the start of the episode [s]."""
     lead: Float[Tensor, "B"]
@@ -77,13 +79,13 @@ class Underway:
 
 
 class DMPPolicy(MotionPolicy):
-    """Policy that executes one movement primitive an episode, predicted from the first
-    observation and corrected by later ones.
+    """Policy that executes one movement primitive per episode, predicted from the first
+    observation and corrected by later observations.
 
-    Goal, weights, duration and, where it is not measured, the start are predicted from
-    observations. A chunk follows from them and from the state of the motion by one linear map.
-    Each chunk starts with the position and velocity that the last one ended with, so the motion
-    is C1 for any prediction.
+    Goal, weights and duration are predicted from observations; so is the start, if it is not
+    measured. One linear map turns the primitive and the state of the motion into a chunk of
+    actions. Each chunk starts with the position and velocity with which the last chunk ended,
+    so the motion is C1 (of continuous velocity) for any prediction.
     """
 
     config_class = DMPConfig  # pyright: ignore[reportAssignmentType]
@@ -132,6 +134,11 @@ class DMPPolicy(MotionPolicy):
         self._action_queue: deque[Tensor] = deque()
 
     def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:
+        """Fit primitives to demonstrations in closed form (see `fit_closed_form`).
+
+        Args:
+            demonstrations: Columns by key, (frames, components).
+        """
         actions = [shown[ACTION].to(self.encoding.mean) for shown in demonstrations]
         self.encoding.learn(actions)
         first = [{key: d[key][0] for key in self.encoder.widths} for d in demonstrations]
@@ -154,13 +161,13 @@ class DMPPolicy(MotionPolicy):
         motion, as in execution: a noisy demonstration gives no valid velocity.
 
         Args:
-            batch: Batch as LeRobot loads it by the config's delta indices: observations (B, 2,
-                ...), the first of the episode and the current one, `action` (B, chunk, A),
+            batch: Batch as LeRobot loads it by the config's delta indices: the first and the
+                current observation of the episode (B, 2, ...), `action` (B, chunk, A),
                 `action_is_pad` and `timestamp`.
-            reduction: "none" for the loss of each sample, (B); else their mean.
+            reduction: "none": the loss of each sample, (B); else the mean over samples.
 
         Returns:
-            The loss, and the root mean square error of the actions present.
+            The loss, and the root mean square error of the actions before the episode's end.
         """
         keys = (*self.encoder.widths, *self.encoder.images)
         first, now = ({key: batch[key][:, i] for key in keys} for i in (0, 1))
@@ -180,7 +187,8 @@ class DMPPolicy(MotionPolicy):
         present = ~batch[f"{ACTION}_is_pad"]
         square = difference.square().mean(-1) * present
         rmse = {"rmse": float((square.detach().sum() / present.sum()).sqrt())}
-        # Mean over chunks, not over the actions present: processes then average correctly.
+        # Average over chunks, not over the actions that count: then the mean over processes is
+        # correct.
         each = square.mean(-1)
         return (each if reduction == "none" else each.mean()), rmse
 
@@ -221,7 +229,9 @@ class DMPPolicy(MotionPolicy):
         return self._action_queue.popleft()
 
     def begin(self, observation: Observation) -> Underway:
-        """State at the start of an episode: measured positions where known, else predicted."""
+        """State at the start of an episode, with measured positions where they are known, else
+        predicted positions.
+        """
         context, features = self.encoder.numbers(observation), self.encoder(observation)
         start = features.new_zeros(len(features))
         primitives = self._primitives(context, features, features, start)
@@ -247,7 +257,13 @@ class DMPPolicy(MotionPolicy):
     def _continued(
         self, underway: Underway, seen: Float[Tensor, "B F"], time: Float[Tensor, "B T"]
     ) -> tuple[Tensor, Tensor]:
-        """Motion after a state of the episode, corrected by the features seen then."""
+        """Position and velocity of the motion after a state of the episode, (B, T, A) each.
+
+        Args:
+            underway: State of the episode.
+            seen: Features of a later observation, which correct the primitive.
+            time: Times after the state [s].
+        """
         clock = underway.elapsed + underway.lead
         primitives = self._primitives(underway.context, underway.features, seen, clock)
         duration = primitives.duration.double()
@@ -279,7 +295,7 @@ def write_closed_form_policy(
     Args:
         dataset: LeRobot dataset with actions, and a state or an environment state.
         folder: Existing folder for the checkpoint.
-        n_basis: Basis functions a coordinate.
+        n_basis: Number of basis functions for each coordinate.
         episodes: Episodes to learn from; None: all.
 
     Returns:

@@ -38,8 +38,8 @@ from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfi
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
 MEASURED = 0.5
-"""Largest root mean square difference between an action and the state of the same name for
-which the state counts as its measurement, in spreads."""
+"""A state counts as the measurement of the action of the same name if their root mean square
+difference, in spreads of the action, is not larger."""
 UNKNOWN = 0.3
 """Fraction of samples trained without the velocity of the state, as after a reset. It also
 keeps policies from relying on their own past motion regardless of observations.
@@ -51,24 +51,24 @@ SCORE_WEIGHT = 0.1
 SAME_WAY = 3.0
 """Distance from which plans count as distinct, relative to the error of the nearest plan. The
 mean of closer plans is nearer to the demonstration than any of them; the mean of distinct plans
-is not a valid plan. Three quantisation levels of one normal distribution are 2.8 apart (Max
-1960, "Quantizing for minimum distortion").
+is not a valid plan. If three plans quantise one normal distribution, they are 2.8 times their
+error apart (Max 1960, "Quantizing for minimum distortion").
 """
 LEAST_ERROR = 1e-3
-"""Smallest value of that error, in spreads: without motion it is zero, but plans must still
-count as the same."""
+"""Smallest value of the nearest plan's error, in spreads. Without motion the error is zero, but
+plans must still count as the same."""
 FORGETTING = 0.01
-"""Decay of that error's running mean at each training step."""
+"""Decay of the running mean of the nearest plan's error, at each training step."""
 
 SMALLEST_TURN = 0.05
 """Smallest spread of orientations [rad]: a hand that points down in all demonstrations varies
-by 1e-5 only, but tilts by more as soon as anything differs from the demonstrations."""
+by only 1e-5, but tilts more as soon as anything differs from the demonstrations."""
 SLOWEST = 0.3
 """Smallest scale of velocities, relative to the median velocity; slower columns are not
 amplified.
 """
 MOST_CHUNKS = 50_000
-"""Largest number of chunks in the regression; of more, evenly spaced ones are used."""
+"""Largest number of chunks in the regression; from more chunks, evenly spaced ones are used."""
 
 
 @PreTrainedConfig.register_subclass("motion_chunk")
@@ -77,32 +77,32 @@ class MotionChunkConfig(MotionPolicyConfig):
     """Settings of chunks of actions, each of which continues the executed motion."""
 
     n_basis: int | None = None
-    """Basis functions per coordinate and chunk; None: 10, or fewer for short chunks: two for
-    each five actions."""
+    """Basis functions per coordinate and chunk; None: 10, or in short chunks two for every five
+    actions."""
     hidden_dim: int = 256
     """Width of the network."""
     dropout: float = 0.1
     """Dropout probability of hidden features in training."""
     history: int = 2
     """Frames over which the velocity of observation.state is measured, if the policy receives
-    every frame (`select_action`); 0: the velocity is not used. For it, training loads a second
-    frame of all inputs."""
+    every frame (`select_action`); 0: the velocity is not used. To measure the velocity,
+    training loads a second frame of all inputs."""
     state_noise: float = 0.0
     """Noise on observation.state in training, relative to its spread. With 0.15, plans return
     to the demonstrations from nearby states. This helps where demonstrations hardly vary, such
     as scripted ones; human variation has the same effect, and noise would blur the intent.
     """
     n_plans: int = 3
-    """Plans for each observation, of which one is executed: the largest number of distinct ways
-    that the demonstrations may show from one place."""
+    """Number of plans for each observation: the largest number of distinct ways that the
+    demonstrations may show from one place. The most likely plan is executed."""
     two_level_actions: list[int] | None = None
     """Indices of the action's components that jump between two levels, such as a gripper that
     is open or closed; None: detected from the dataset's statistics."""
     blend_time: float | None = None
     """Approximate time in which a chunk changes from the executed motion to the plan [s]; None:
     the longer of 0.05 s and one action period, but at most 0.3 of the spacing of basis
-    functions. The closer they are, the larger are errors of a plan's acceleration, which the
-    next chunk continues for this time."""
+    functions. A smaller spacing causes larger errors of a plan's acceleration, which the next
+    chunk continues for this time."""
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-2
     scheduler_decay_steps: int = 20_000
@@ -139,7 +139,7 @@ class MotionChunkConfig(MotionPolicyConfig):
 
 
 class MotionChunkPolicy(MotionPolicy):
-    """Policy whose chunks continue the executed motion: C2 for any prediction.
+    """Policy whose chunks continue the executed motion with continuous acceleration (C2).
 
     From each observation and the velocity of its state, a network plans the next second or two.
     Among the motions that start with the position, velocity and acceleration to which the
@@ -154,7 +154,7 @@ class MotionChunkPolicy(MotionPolicy):
     error: Float[Tensor, ""]
     """Root mean square distance of the nearest plan from the demonstrations, in spreads."""
     levels: Float[Tensor, "2 A"]
-    """Smallest and largest action, whitened."""
+    """Smallest and largest value of each component of the action, whitened."""
     velocity_spread: Float[Tensor, "F"]
     """Root mean square velocity of the demonstrated states, whitened [1/s]; empty if velocities
     are not used."""
@@ -237,9 +237,9 @@ class MotionChunkPolicy(MotionPolicy):
 
         Args:
             batch: Batch as LeRobot loads it by the config's delta indices: observations (B, 2,
-                ...), `history` frames ago and now, or (B, ...), now only; `action` (B, chunk +
-                1, A) and `action_is_pad`.
-            reduction: "none" for the loss of each sample, (B); else their mean.
+                ...) of `history` frames ago and of now, or (B, ...) of now only; `action` (B,
+                chunk + 1, A) and `action_is_pad`.
+            reduction: "none": the loss of each sample, (B); else the mean over samples.
 
         Returns:
             The loss, and the root mean square error of the nearest plans, relative to the
@@ -292,7 +292,7 @@ class MotionChunkPolicy(MotionPolicy):
         Args:
             batch: Observations (B, ...).
             inference_delay: Number of actions that will be executed before the chunk is
-                available: leftover ones, with which the chunk begins.
+                available. These are leftover actions, and the chunk begins with them.
             prev_chunk_left_over: Actions of the last chunk that are not executed yet, (n, A) or
                 (1, n, A), as LeRobot's real-time chunking passes them.
 
@@ -309,7 +309,7 @@ class MotionChunkPolicy(MotionPolicy):
         if prev_chunk_left_over is not None:
             before = self.motion.left_over(prev_chunk_left_over)
         elif self.motion.chunk is not None:
-            # State that the plan would begin with if it could begin anywhere.
+            # State in which the plan would begin if it could begin anywhere.
             now = self.decoder.states(self._chosen(plans, None))[:, 0, 0]
             before = self.motion.nearest(now)
         else:
@@ -330,7 +330,7 @@ class MotionChunkPolicy(MotionPolicy):
         return self._action_queue.popleft()
 
     def _turned(self, batch: Observation) -> Observation:
-        """The observation with the rotation vectors in its state encoded without jumps."""
+        """The observation, with rotation vectors in the state encoded without jumps."""
         if not self.turning.triples:
             return batch
         state = batch[OBS_STATE]
@@ -343,7 +343,7 @@ class MotionChunkPolicy(MotionPolicy):
         return moved / (self.config.history * self._step * self.velocity_spread)
 
     def _now(self, batch: Mapping[str, Any]) -> tuple[dict[str, Any], Tensor, Tensor]:
-        """Encoded present observations of samples, their velocity, and 1 where it is known."""
+        """Present observations, encoded; velocities of the states; 1 where these are known."""
         now = dict(self._turned(batch))
         velocity = batch[ACTION].new_zeros(len(batch[ACTION]), len(self.velocity_spread))
         known = velocity.new_zeros(len(velocity))
@@ -358,7 +358,14 @@ class MotionChunkPolicy(MotionPolicy):
     def _go_on(
         self, batch: Observation, plans: Plans, before: MotionChunk | None, delay: int
     ) -> Float[Tensor, "B chunk A"]:
-        """Store the motion from the executed actions to a plan."""
+        """Continue the executed actions to the best plan; store and return the new chunk.
+
+        Args:
+            batch: Observations (B, ...).
+            plans: Plans for the observations.
+            before: Remainder of the previous chunk; None: the motion begins.
+            delay: Number of actions of `before` to execute before the new chunk is available.
+        """
         planned = self._chosen(plans, before)
         beginning = None
         if before is None:
@@ -395,7 +402,7 @@ class MotionChunkPolicy(MotionPolicy):
     def _beginning(
         self, batch: Observation, planned: Float[Tensor, "B 3 D"]
     ) -> Float[Tensor, "B 3 D"]:
-        """Planned state, with measured positions where they are observed."""
+        """State in which a motion begins: as planned, but at measured positions if observed."""
         if OBS_STATE not in self.encoder.widths:
             return planned
         values = batch[OBS_STATE][:, None, self.measured]  # -1: the last, which is not used
@@ -405,7 +412,7 @@ class MotionChunkPolicy(MotionPolicy):
         return torch.cat([position[:, None], planned[:, 1:]], dim=1)
 
     def _compose(self, position: Tensor, upper: Tensor) -> Float[Tensor, "B samples A"]:
-        """Actions of whitened positions, and of levels: 1 for the upper one, else 0."""
+        """Actions from whitened positions and two-level columns (1: upper level, else 0)."""
         low, high = self.levels[:, self._stepped]
         coordinates = self.encoding.mean.new_zeros(*position.shape[:2], self.levels.shape[1])
         coordinates[..., self._smooth] = position.to(coordinates)
@@ -413,7 +420,7 @@ class MotionChunkPolicy(MotionPolicy):
         return self.encoding.to_actions(coordinates)
 
     def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
-        """Take spreads, levels and two-level columns from statistics."""
+        """Set spreads, levels and two-level columns from a dataset's statistics."""
         super()._whiten(stats, dataset_meta)
         if stats is None:
             return
@@ -429,7 +436,7 @@ class MotionChunkPolicy(MotionPolicy):
 
     @torch.no_grad()
     def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:
-        """Fit the linear part in closed form, once the numbers are whitened.
+        """Fit the linear part in closed form, after the statistics for whitening are set.
 
         Args:
             demonstrations: Columns by key, (frames, components).

@@ -1,4 +1,6 @@
-"""Chunks of actions as motions: their basis, their continuation, and the network of plans."""
+"""Chunks of actions as smooth motions: their basis functions, the network that plans them, and
+their continuation from chunk to chunk.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,18 +13,19 @@ from torch.nn import functional as F
 from hrc_learn.dmp import fit_ridge
 from hrc_learn.dmp.motion_head import MotionHead
 
-# Chunks as a motion: a linear map of few numbers, with its derivatives.
+# A chunk is a motion, given by a linear map of a few coefficients.
 
 NOISE = 1e-2
-"""Noise of demonstrated actions relative to their spread; motions below it are not learned."""
+"""Noise of demonstrated actions relative to their spread; smaller motions are not learned."""
 BASIS, ACTIONS_EACH = 10, 2.5
-"""Largest number of basis functions of a chunk, and fewest actions for each of them."""
+"""`BASIS`: largest default number of basis functions of a chunk. `ACTIONS_EACH`: fewest actions
+per basis function by default."""
 BLEND_TIME = 0.05
-"""Longest default blend time [s]; one action where that takes longer."""
+"""Longest default blend time [s]; one action period if that is longer."""
 BLEND_SHARE = 0.3
-"""Blend time as a fraction of the spacing of basis functions. A plan with error e at spacing h
-has an acceleration error of some 20 e / h^2, which displaces the motion by 20 e (blend_time /
-h)^2.
+"""Largest default blend time, as a fraction of the spacing h of basis functions. A plan with
+error e has an acceleration error of about 20 e / h^2, which displaces the motion by
+20 e (blend_time / h)^2.
 """
 TINY = 1e-9
 """Relative regularisation that keeps a matrix invertible."""
@@ -38,10 +41,11 @@ class ChunkDecoder(nn.Module):
     """
 
     maps: Float[Tensor, "4 samples M"]
-    """Linear map from coefficients to position, velocity, acceleration and jerk at each action
-    and, for the final state of a chunk, at one action after the last.
+    """Linear map from coefficients to position, velocity, acceleration and jerk at each action.
+    The last sample lies one action period after the last action; it is the chunk's final state.
     """
     projection: Float[Tensor, "M samples"]
+    """Linear map from a demonstrated chunk to its coefficients."""
 
     def __init__(
         self,
@@ -55,7 +59,8 @@ class ChunkDecoder(nn.Module):
         Args:
             chunk_size: Actions of a chunk.
             step: Time between actions [s].
-            n_basis: N, weights a column; None: 10, or two per five actions if that is fewer.
+            n_basis: Number N of weights per column; None: 10, or two per five actions if that
+                is fewer.
             blend_time: Approximate time in which a chunk changes from the executed motion to
                 the plan [s]; None: the longer of 0.05 s and one action period, but at most
                 `BLEND_SHARE` of the spacing of basis functions.
@@ -82,12 +87,12 @@ class ChunkDecoder(nn.Module):
 
     @property
     def size(self) -> int:
-        """M, coefficients of a column."""
+        """Number M of coefficients of a column."""
         return self.maps.shape[-1]
 
     @property
     def samples(self) -> int:
-        """Actions of a chunk, and the one after its last."""
+        """Number of samples: the actions of a chunk, and the action after them."""
         return self.maps.shape[1]
 
     def project(self, chunks: Float[Tensor, "*batch samples D"]) -> Float[Tensor, "*batch D M"]:
@@ -97,13 +102,13 @@ class ChunkDecoder(nn.Module):
     def positions(
         self, coefficients: Float[Tensor, "*batch D M"]
     ) -> Float[Tensor, "*batch samples D"]:
-        """Actions of a chunk, and the one after its last."""
+        """Actions of a chunk, and the action after them."""
         return self.maps[0].to(coefficients) @ coefficients.mT
 
     def states(
         self, coefficients: Float[Tensor, "*batch D M"]
     ) -> Float[Tensor, "*batch samples 3 D"]:
-        """Position, velocity and acceleration at these actions."""
+        """Position, velocity and acceleration at the samples of a chunk."""
         x = coefficients.double().mT[..., None, :, :]
         return (self.maps[:3] @ x).transpose(-3, -2)
 
@@ -134,7 +139,7 @@ class ChunkDecoder(nn.Module):
         return x + off @ change.T
 
 
-# Several plans for one observation, and how likely each is.
+# A network predicts several plans for one observation, and their probabilities.
 
 RIDGE = 1e-2
 """Ridge strength of the regression that initialises a network, relative to the spread of its
@@ -147,7 +152,8 @@ DIFFERENCE = 0.02
 FARTHEST = 10.0
 """Bound of whitened inputs: larger ones are probably wrong, and are clamped."""
 LEFT_OVER = 0.05
-"""Weight of the plans that are not the nearest to the demonstration, so that all of them learn.
+"""Weight of the mean error of all plans in the loss; the nearest plan has the other part. With
+this weight, all plans learn.
 """
 
 
@@ -157,9 +163,9 @@ class Plans:
 
     coefficients: Float[Tensor, "B K D M"]
     scores: Float[Tensor, "B K"]
-    """Logits of how likely each plan is."""
+    """Logits of the probability of each plan."""
     levels: Float[Tensor, "B samples G"]
-    """Logits of two-level columns to be at the upper level."""
+    """Logits of the probability that a two-level column is at the upper level."""
 
 
 class ChunkNetwork(nn.Module):
@@ -193,10 +199,10 @@ class ChunkNetwork(nn.Module):
             numbers: Number of leading features that enter the linear function.
             features: Number of features of an observation.
             moving: Number of velocities.
-            columns: D, number of smooth columns.
-            two_level: G, number of columns with two levels only.
+            columns: Number D of smooth columns.
+            two_level: Number G of two-level columns.
             decoder: Decoder of the coefficients, with the length of a chunk.
-            n_plans: K, number of plans.
+            n_plans: Number K of plans.
             hidden: Width of the network.
             dropout: Dropout probability of its hidden features.
         """
@@ -227,7 +233,7 @@ class ChunkNetwork(nn.Module):
 
         Args:
             features: Features of the observation.
-            velocity: Velocities of its values, relative to their spreads.
+            velocity: Velocities of the observed states, relative to their spreads.
             known: 1 where the velocity is known, else 0.
         """
         features = features.clamp(-FARTHEST, FARTHEST)
@@ -251,7 +257,7 @@ class ChunkNetwork(nn.Module):
         self.spread.copy_(coefficients.std(0).clamp_min(SPREAD))
         whitened = ((coefficients - self.mean) / self.spread).flatten(1)
         if self.numbers:
-            # Not standardised again, which would amplify numbers that hardly vary.
+            # Do not standardise again: this would amplify numbers that hardly vary.
             fit = fit_ridge(numbers.double(), whitened.double(), RIDGE, standardize=False)
             constant, slopes = fit.coefficients[0], fit.coefficients[1:]
             self.linear.weight.copy_(slopes.T)
@@ -275,14 +281,14 @@ class MotionChunk:
     states: Float[Tensor, "B samples 3 D"]
     """Position, velocity and acceleration of the smooth columns."""
     stepped: Float[Tensor, "B samples G"]
-    """Values of the columns that jump."""
+    """Values of the two-level columns, which jump."""
     actions: Float[Tensor, "B samples A"]
 
 
 class ContinuedMotion:
-    """Motion executed across chunks, C2 for any plan.
+    """Motion executed across chunks, with continuous acceleration (C2) for any plan.
 
-    Smooth columns of the actions follow a movement primitive; two-level columns jump.
+    Smooth columns of the actions follow movement primitives; two-level columns jump.
     """
 
     chunk: MotionChunk | None
@@ -293,7 +299,7 @@ class ContinuedMotion:
 
         Args:
             decoder: Decoder of coefficients to the samples of a chunk.
-            compose: Function from smooth columns (B, samples, D) and those that jump (B,
+            compose: Function from smooth columns (B, samples, D) and two-level columns (B,
                 samples, G) to actions (B, samples, A).
         """
         self.decoder = decoder
@@ -305,7 +311,7 @@ class ContinuedMotion:
         self.chunk = None
 
     def after(self, steps: int | Int[Tensor, "B"]) -> MotionChunk | None:
-        """Remainder of the last chunk after some actions; it stands still beyond the end."""
+        """Remainder of the last chunk after some steps; at its end, the motion stands still."""
         if self.chunk is None:
             return None
         states = self.chunk.states
@@ -332,7 +338,7 @@ class ContinuedMotion:
     def left_over(self, actions: Float[Tensor, "*one n A"]) -> MotionChunk | None:
         """Remainder of the last chunk from the first of its leftover actions.
 
-        None if the actions are not from the last chunk, as their velocity is unknown.
+        The result is None if the actions are not from the last chunk: the velocity is unknown.
         """
         if self.chunk is None:
             return None
@@ -361,9 +367,10 @@ class ContinuedMotion:
 
         Args:
             planned: Coefficients of the smooth columns.
-            stepped: Values of the columns that jump.
+            stepped: Values of the two-level columns.
             before: Remainder of the previous chunk; None: the motion begins.
-            beginning: State to begin in if `before` is None; None: the planned one.
+            beginning: State in which the motion begins if `before` is None; None: the first
+                planned state.
             delay: Number of actions of `before` to execute before this chunk is available.
         """
         if before is None:

@@ -1,4 +1,4 @@
-"""Observations as vectors of features: whitened numbers, and keypoints of images."""
+"""Encode observations as vectors of features: whitened numbers, and keypoints of images."""
 
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -13,14 +13,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-# Convolutional backbones by name; none downloads weights.
+# Convolutional backbones are chosen by name; none of them downloads weights.
 
 GROUPS = 8
-"""Number of groups of group normalisation, which is used because batches of few demonstrations
-are too small for batch statistics.
+"""Number of groups in group normalisation. Batch normalisation is not used, because batches
+from few demonstrations are too small for batch statistics.
 """
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-"""Mean and spread of red, green and blue with which torchvision's weights were trained."""
+"""Mean and spread of red, green and blue in the images that trained torchvision's weights."""
 
 
 def make_backbone(
@@ -112,21 +112,23 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
 # Features of an observation: whitened numbers, and keypoints of images.
 
 SMALLEST_SPREAD = 1e-6
-"""Spread below which a component counts as constant."""
+"""A component with at most this spread counts as constant."""
 SMALLEST_SCALE = 0.01
-"""Smallest scale of a feature's values, relative to their median spread. A joint that is held
-at rest still varies by a thousandth of the motion of others, and differently in states that
-were not demonstrated; amplified, this moved an ALOHA arm away from its cube.
+"""Smallest scale of a feature's values, relative to their median spread. A joint held at rest
+still varies by a thousandth of the motion of other joints, and varies differently in states
+that were not demonstrated. Amplified, this variation moved an ALOHA arm away from its cube.
 """
 type Observation = Mapping[str, Any]
 """Tensors by key; LeRobot's evaluation adds other entries."""
 
 
 class ObservationEncoder(nn.Module):
-    """Numbers and images of one moment as one vector of features."""
+    """Encodes the numbers and images of one moment as one vector of features."""
 
     mean: Tensor
+    """Mean of each number."""
     std: Tensor
+    """Scale by which each number is divided."""
 
     def __init__(
         self,
@@ -165,7 +167,7 @@ class ObservationEncoder(nn.Module):
         """Number of features."""
 
     def whiten(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
-        """Take mean and spread of the numbers from a dataset's statistics."""
+        """Set mean and scale of the numbers from a dataset's statistics."""
         if not self.widths:
             return
         mean = torch.cat([torch.as_tensor(stats[key]["mean"]) for key in self.widths])
@@ -207,7 +209,7 @@ def divisors(std: Float[Tensor, "n"], fraction: float = SMALLEST_SCALE) -> Float
 
 
 class KeypointEncoder(nn.Module):
-    """Keypoints of an image, each the mean position under a spatial softmax of a feature map.
+    """Keypoints of an image: each is the mean position under the softmax of a feature map.
 
     (Levine et al. 2016, "End-to-end training of deep visuomotor policies", section 5)
     """
@@ -221,7 +223,7 @@ class KeypointEncoder(nn.Module):
         self.maps = nn.Conv2d(width, n_keypoints, kernel_size=1)
 
     def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B two_K"]:
-        """Coordinates of the keypoints, -1 to 1: u (right) of all, then v (down) of all."""
+        """Coordinates of the keypoints, -1 to 1: u (right) of each, then v (down) of each."""
         if self.pretrained:
             mean, std = (image.new_tensor(x)[:, None, None] for x in IMAGENET)
             image = (image - mean) / std

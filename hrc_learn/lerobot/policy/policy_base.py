@@ -32,19 +32,19 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class MotionPolicyConfig(PreTrainedConfig):
-    """Settings of any policy that plans motions, with the names from its dataset."""
+    """Settings of any policy that plans motions, and names of values in its dataset."""
 
     chunk_size: int = 50
-    """Actions predicted at once."""
+    """Number of actions in a predicted chunk."""
     n_action_steps: int = 25
-    """Actions executed before the next chunk is predicted."""
+    """Number of actions that are executed before the next chunk is predicted."""
     vision_backbone: str = "small"
     """Image backbone: "small", four convolutions, or a ResNet of torchvision such as
     "resnet18"; no weights are downloaded.
     """
     vision_weights: str | None = None
-    """Safetensors file of initial weights for such a ResNet, with torchvision's names; None:
-    random weights, or those of the checkpoint."""
+    """Safetensors file of initial weights for the ResNet, with torchvision's names; None:
+    random weights, or the weights of the checkpoint."""
     vision_pretrained: bool = False
     """True if the ResNet started from torchvision's weights; set by `vision_weights`."""
     n_keypoints: int = 32
@@ -52,11 +52,11 @@ class MotionPolicyConfig(PreTrainedConfig):
     fit_episodes: list[int] | None = None
     """Episodes for the fit in closed form; None: all. Exclude held-out episodes here."""
     fps: float | None = None
-    """Actions a second; None: those of the dataset."""
+    """Actions a second; None: frame rate of the dataset."""
     state_names: list[str] | None = None
-    """Components of observation.state, from the dataset."""
+    """Names of the components of observation.state, from the dataset."""
     action_feature_names: list[str] | None = None
-    """Components of the action, from the dataset."""
+    """Names of the components of the action, from the dataset."""
     optimizer_lr: float = 3e-4
     optimizer_weight_decay: float = 1e-4
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -87,7 +87,7 @@ class MotionPolicyConfig(PreTrainedConfig):
         return None
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """AdamW; training starts close to a solution, the fit in closed form."""
+        """AdamW; training starts from the fit in closed form, which is close to a solution."""
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
@@ -114,8 +114,8 @@ class MotionPolicyConfig(PreTrainedConfig):
         """Take the names of components from a dataset; LeRobot calls this.
 
         Raises:
-            ValueError: The policy was trained for other actions, or on other states or another
-                order of them.
+            ValueError: The policy was trained for other actions, on other states, or on states
+                in another order.
         """
         self.action_feature_names = _names(features, "action")
         self.state_names = _names(features, "observation.state")
@@ -218,7 +218,7 @@ class MotionPolicy(PreTrainedPolicy):
                 raise ValueError(f"{key} is not finite in {which}: check the sensor")
 
     def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
-        """Take means and spreads from a dataset's statistics.
+        """Set means and spreads from a dataset's statistics.
 
         Raises:
             ValueError: Statistics are missing or not finite.
@@ -298,7 +298,7 @@ def _require_statistics(
 
 
 MOST = 256
-"""Largest number of demonstrations that are read; of more, evenly spaced ones are chosen."""
+"""Largest number of demonstrations that are read; from more, evenly spaced ones are chosen."""
 
 
 def read_episodes(
@@ -309,7 +309,7 @@ def read_episodes(
     Args:
         root: Folder of a LeRobot dataset.
         keys: Columns wanted.
-        episodes: Indices; None: all. Of more than 256 episodes, 256 are read.
+        episodes: Indices of episodes; None: all. If there are more than 256, 256 are read.
 
     Raises:
         DatasetError: A part of the dataset cannot be read; the message names it. This is a

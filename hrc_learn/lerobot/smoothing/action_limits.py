@@ -22,7 +22,8 @@ from hrc_learn.store import Positive, read_json, write_json
 _UNUSUAL = 0.999
 """Quantile of the differences used as a limit; single glitches do not count."""
 _STILL = 1e-3
-"""Limit of a value that never moved, relative to the largest limit; limits must be positive."""
+"""Least limit of a value, relative to the largest limit of all values: limits must be positive,
+even for a value that never moved."""
 _ENCODER_STEPS = 4095
 """Encoder steps of a turn, for servos that LeRobot calibrates in degrees (Feetech STS,
 Dynamixel X).
@@ -34,7 +35,9 @@ type Range = tuple[float | None, float | None]
 
 @dataclass(frozen=True, kw_only=True)
 class ActionLimits:
-    """Limits of every value of an action, in its unit, and the state column that measures it.
+    """Limits of every value of an action, and the state column that measures the value.
+
+    Limits are in the unit of the value.
 
     Raises:
         ValueError: The lists differ in length, or a range is empty. `load` checks the rest.
@@ -44,11 +47,11 @@ class ActionLimits:
     fps: Positive
     """Actions a second."""
     velocity: list[Positive]
-    """[1/s]"""
+    """Largest velocity [1/s]."""
     acceleration: list[Positive]
-    """[1/s^2]"""
+    """Largest acceleration [1/s^2]."""
     jerk: list[Positive]
-    """[1/s^3]"""
+    """Largest jerk [1/s^3]."""
     lower: list[float | None]
     """Lowest position; None: no limit."""
     upper: list[float | None]
@@ -88,11 +91,12 @@ class ActionLimits:
     def within(
         self, ranges: Mapping[str, Range], velocities: Mapping[str, float] | None = None
     ) -> ActionLimits:
-        """The same limits, with some replaced by name.
+        """The same limits, with the limits of some values replaced.
 
         Args:
-            ranges: Lowest and highest positions.
-            velocities: Highest velocities, which apply if lower than the present ones [1/s].
+            ranges: Lowest and highest positions, by name of the value.
+            velocities: Highest velocities by name [1/s]; one applies only if it is lower than
+                the present limit.
         """
         pairs = [
             ranges.get(name, (low, high))
@@ -173,11 +177,12 @@ def _require_names(limits: ActionLimits, found: set[str], file: Path) -> None:
 
 
 def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
-    """Limits within which the policy moves at most as abruptly as its demonstrators did.
+    """Limits within which a policy moves at most as abruptly as its demonstrators did.
 
     Limits are the 99.9th percentiles of differences of the actions within episodes. Positions
-    are not limited. Where velocity or acceleration is constant, one action may change it from
-    zero to its limit.
+    are not limited. If the demonstrated velocity is constant, the limit of acceleration lets
+    the velocity change from zero to its limit within one action period. If the demonstrated
+    acceleration is constant, the limit of jerk does the same for the acceleration.
 
     Args:
         dataset: LeRobot dataset that the policy was trained on.
@@ -196,7 +201,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
     velocity, acceleration, jerk = (scale * _largest(episodes, k, fps) for k in (1, 2, 3))
     if not velocity.any():
         raise ValueError(f"the actions of {dataset} hold still: name a dataset with motions.")
-    # Second differences of rounded values of constant velocity.
+    # Largest second differences that rounding causes in values of constant velocity.
     rounding = 2 * np.finfo(np.float32).eps * np.abs(np.concatenate(episodes)).max(axis=0)
     steady = acceleration <= scale * fps**2 * rounding
     acceleration = np.where(steady, fps * velocity, acceleration)
@@ -223,19 +228,19 @@ def urdf_limits(
 ) -> tuple[dict[str, Range], dict[str, float]]:
     """Ranges and velocities of the joints of a URDF, named as LeRobot names their actions.
 
-    A URDF has no limits of acceleration or jerk: the demonstrated ones remain. Continuous
-    joints have no range. Zeros, which many exporters write, do not count as limits.
+    A URDF has no limits of acceleration or jerk. Continuous joints have no range. Zeros, which
+    many exporters write, do not count as limits.
 
     Args:
         urdf: File.
         degrees: True if the robot's actions are in degrees; a URDF has radians.
 
     Returns:
-        Lowest and highest position of `NAME.pos`, and its velocity.
+        Lowest and highest positions by `NAME.pos`, and highest velocities by `NAME.pos` [1/s].
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no URDF.
+        ValueError: The file is no URDF, or no joint has limits.
     """
     ranges: dict[str, Range] = {}
     velocities: dict[str, float] = {}
@@ -254,9 +259,9 @@ def urdf_limits(
 
 
 def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, Range]:
-    """Ranges that a robot's motors were moved through when LeRobot calibrated it.
+    """Ranges through which a robot's motors were moved when LeRobot calibrated the robot.
 
-    Commands of the motor `gripper` are 0 to 100 in either case.
+    Commands of the motor `gripper` are 0 to 100, in degrees as in percent.
 
     Args:
         calibration: File that LeRobot keeps in `calibration/robots/TYPE/ID.json`.
@@ -264,11 +269,11 @@ def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, 
             percent, -100 to 100.
 
     Returns:
-        Lowest and highest position of `NAME.pos`.
+        Lowest and highest positions by `NAME.pos`.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no calibration.
+        ValueError: The file is no calibration.
     """
     content = read_json(calibration)
     ranges: dict[str, Range] = {}

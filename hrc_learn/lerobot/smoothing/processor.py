@@ -1,7 +1,7 @@
-"""Smooth, limit-checked actions for any policy, as steps of its processors.
+"""Processor steps that smooth the actions of any LeRobot policy and keep them within limits.
 
-One step watches the state of the robot, one smooths its actions; `add_smoothing` adds both to a
-checkpoint that was trained without them.
+One step watches the state of the robot, the other smooths the actions. `add_smoothing` adds
+both steps to a checkpoint that was trained without them.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ PREPROCESSOR = "policy_preprocessor.json"
 POSTPROCESSOR = "policy_postprocessor.json"
 
 _JUMP = 5.0
-"""Multiple of the velocity limit above which a robot counts as reset for a new episode."""
+"""A robot that moved faster than this multiple of the velocity limit counts as put elsewhere,
+for example for a new episode."""
 _SAME = 1e-6
-"""Changes below this are rounding."""
+"""Changes of an action up to this value count as rounding."""
 
 _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
 class Changes:
-    """Number of changed actions, and the largest changes.
+    """Counts the actions that smoothing changed, and keeps the largest changes.
 
     Attributes:
         steps: Number of returned actions.
@@ -75,7 +76,8 @@ class Changes:
 class WatchStateStep(ProcessorStep):
     """Keeps the state that the robot reports, for the `SmoothActionsStep` of the same policy.
 
-    Belongs at the beginning of the preprocessor, where the state has its name and units.
+    This step belongs at the beginning of the preprocessor, where the state still has its
+    original name and units.
     """
 
     state: Tensor | None = field(default=None, init=False, repr=False)
@@ -83,10 +85,10 @@ class WatchStateStep(ProcessorStep):
     previous: Tensor | None = field(default=None, init=False, repr=False)
     """State before `state`; it may be older than the last reset."""
 
-    # LeRobot builds a policy's two processors from two files, first the one with this step, and
-    # passes neither to the other. So the next `SmoothActionsStep` that is built takes the
-    # newest of these steps, if it still exists. Each is taken only once, so that steps built
-    # later for another robot do not get it.
+    # LeRobot builds a policy's two processors from two files: first the preprocessor with this
+    # step, then the postprocessor with the `SmoothActionsStep`. Neither gets a reference to the
+    # other. So a new `SmoothActionsStep` takes the newest `WatchStateStep`, if it still exists.
+    # A step is taken only once, so that steps built later for another robot do not get it.
     _newest: ClassVar[weakref.ref[Any] | None] = None
 
     def __post_init__(self) -> None:
@@ -95,7 +97,7 @@ class WatchStateStep(ProcessorStep):
 
     @classmethod
     def take_newest(cls) -> WatchStateStep | None:
-        """The step that was built last; None if it is gone or taken."""
+        """The step that was built last; None if it no longer exists or was taken before."""
         step, WatchStateStep._newest = cls._newest, None
         return None if step is None else step()
 
@@ -120,12 +122,12 @@ class WatchStateStep(ProcessorStep):
 class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
 
-    Belongs at the end of the postprocessor, where actions have their units. Takes one action at
-    a time, (batch, values), as lerobot-rollout and lerobot-eval pass them on, or whole chunks
-    (batch, steps, values). A motion starts with the measured position and velocity, and
-    restarts when the robot is put elsewhere. A chunk starts at the point of the previous chunk
-    that is nearest to the robot. A value continues its motion while its measurement is not
-    finite, and is held until its first finite measurement.
+    This step belongs at the end of the postprocessor, where actions have their units. It takes
+    one action at a time, (batch, values), as lerobot-rollout and lerobot-eval pass them on, or
+    whole chunks (batch, steps, values). A motion starts with the measured position and
+    velocity, and restarts when the robot is put elsewhere. A chunk starts at the point of the
+    previous chunk that is nearest to the robot. A value is held until it is measured for the
+    first time. Later, it continues its motion while its measurement is not finite.
 
     Attributes:
         limits: Limits of the actions.
@@ -174,7 +176,7 @@ class SmoothActionsStep(ProcessorStep):
         return {**transition, TransitionKey.ACTION: smooth if whole else smooth.squeeze(-2)}  # pyright: ignore[reportReturnType]
 
     def reset(self) -> None:
-        """Forget the motion: the next one begins where the robot then is."""
+        """Forget the motion: the next motion begins at the robot's position at that time."""
         _log(self.changes)
         self.changes.clear()
         self._state = self._chunk = None
@@ -200,7 +202,8 @@ class SmoothActionsStep(ProcessorStep):
         else:
             if whole and self._chunk is not None:
                 state = self._reached(np.where(finite, measured, here), finite, self._chunk)
-            # A value is measured for the first time, or the robot was moved by other means.
+            # Restart if a value is measured for the first time, or if the robot was moved by
+            # other means.
             first = finite & np.isnan(self._before)
             farthest = _JUMP * self._filter.velocity / self.limits.fps
             jumped = (np.abs(measured - self._before) > farthest).any(-1, keepdims=True)
@@ -212,7 +215,8 @@ class SmoothActionsStep(ProcessorStep):
     def _measured(self, batch: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Measured positions (NaN: not measured) and velocities, (batch, values) each.
 
-        Velocities are zero unless those between two successive states are within the limits.
+        The velocity is the difference of two successive states. It is set to zero if any value
+        exceeds its limit.
         """
         watch = self.watch
         state = None if watch is None else watch.state
@@ -235,7 +239,13 @@ class SmoothActionsStep(ProcessorStep):
         return now, np.where(slow, velocity, 0.0)
 
     def _reached(self, here: np.ndarray, finite: np.ndarray, chunk: np.ndarray) -> MotionState:
-        """State on the previous chunk, where it is nearest to the robot."""
+        """State at the point of the previous chunk that is nearest to the robot.
+
+        Args:
+            here: Positions of the robot, (batch, values).
+            finite: True for measured values.
+            chunk: Previous chunk, (batch, steps, values).
+        """
         scaled = (chunk - here[..., None, :]) / self._filter.velocity
         seen = np.where((finite | ~finite.any(-1, keepdims=True))[:, None], scaled, 0.0)
         nearest = np.maximum(np.square(seen).sum(-1).argmin(-1), 2)
@@ -251,7 +261,7 @@ def _restarted(
     position: Float[np.ndarray, "batch values"],
     state: MotionState,
 ) -> MotionState:
-    """The state with some values at rest at other positions."""
+    """The state, with the values marked by `restarted` at rest at other positions."""
     if not restarted.any():
         return state
     rest = vars(MotionState.moving(np.where(restarted, position, state.position)))
@@ -286,7 +296,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     smooth = {"registry_name": SMOOTH, "config": asdict(limits)}
     before["steps"].insert(0, watch)  # before a step that renames or normalises the state
     after["steps"].append(smooth)
-    # The watch comes first: it has no effect should the second file never be written.
+    # Write the watch first: it has no effect if the second file is never written.
     write_json(checkpoint / PREPROCESSOR, before)
     write_json(checkpoint / POSTPROCESSOR, after)
 
@@ -304,7 +314,7 @@ def _require_width(checkpoint: Path, limits: ActionLimits) -> None:
 
 
 def remove_smoothing(checkpoint: Path) -> None:
-    """Remove the steps; raises like `add_smoothing`."""
+    """Remove the steps of `add_smoothing`; raises the errors of `read_pipeline`."""
     for name in (PREPROCESSOR, POSTPROCESSOR):
         write_json(checkpoint / name, read_pipeline(checkpoint / name))
 

@@ -27,8 +27,8 @@ _LATE = 2.0
 _WAIT = 0.5
 """Action periods to wait for a late action before the motion comes to rest."""
 _FOLLOW = 0.1
-"""Fraction of an action's lateness by which later actions are postponed: jitter of the loop is
-suppressed, but its drift is followed.
+"""Fraction of an action's lateness by which later actions are postponed. A small fraction
+suppresses the jitter of the loop, but follows its drift.
 """
 
 
@@ -41,14 +41,15 @@ class ActionUpsampler:
     """Setpoints between actions, on a B-spline, within limits.
 
     The last d + 1 actions are the control points of a uniform B-spline of degree d. Degree 0
-    holds the newest action, 1 interpolates linearly, 2 has continuous velocity, and 3
-    continuous acceleration too. The derivatives of the curve lie between the differences of its
-    control points, so if the actions keep the limits at their own rate, the setpoints keep them
-    at any rate. For other actions, a `MotionFilter` at the setpoint rate keeps the limits.
+    holds the newest action, degree 1 interpolates linearly, degree 2 has continuous velocity,
+    and degree 3 also continuous acceleration. The derivatives of the curve lie between the
+    differences of its control points. Therefore, if the actions keep the limits at their own
+    rate, the setpoints keep them at any rate. For other actions, a `MotionFilter` at the
+    setpoint rate keeps the limits.
 
-    A curve of degree d lags behind the actions by (d + 1)/2 action periods. A smaller latency
-    extrapolates each control point along the difference of the last two actions, which
-    amplifies their noise.
+    A curve of degree d lags behind the actions by (d + 1)/2 action periods. For a smaller
+    latency, each control point is extrapolated along the difference of the last two actions.
+    This amplifies the noise of the actions.
 
     Attributes:
         latency: Latency of the curve behind the actions [s].
@@ -139,7 +140,7 @@ class ActionUpsampler:
         self.push(self._newest)
 
     def setpoint(self, phase: float) -> Float[np.ndarray, "*batch D"]:
-        """The next setpoint, 1/rate after the last.
+        """The next setpoint, 1/rate seconds after the last one.
 
         Args:
             phase: Time since the newest action, in action periods. If the next action is late
@@ -153,7 +154,7 @@ class ActionUpsampler:
     def frame(self, action: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "n *batch D"]:
         """All setpoints until the next action is due.
 
-        If the setpoint rate is no multiple of the action rate, their number varies.
+        If the setpoint rate is no multiple of the action rate, the number of setpoints varies.
 
         Raises:
             ValueError: Same as `push`.
@@ -190,12 +191,15 @@ def _weights(degree: int, u: float) -> Float[np.ndarray, " points"]:
 @RobotConfig.register_subclass(SMOOTH_ROBOT)
 @dataclass(kw_only=True)
 class SmoothRobotConfig(RobotConfig):
-    """`--robot.type=smooth --robot.of=so101_follower --robot.options='{port: /dev/ttyACM0}'`"""
+    """Settings of a robot that moves smoothly between actions. For example:
+
+    `--robot.type=smooth --robot.of=so101_follower --robot.options='{port: /dev/ttyACM0}'`
+    """
 
     of: str = ""
     """Type of the wrapped robot, as in --robot.type."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Settings of the wrapped robot, as YAML; without the wrapper, they would be given as
+    """Settings of the wrapped robot, as YAML. Without the wrapper, a setting would be given as
     --robot.NAME=VALUE."""
     limits: Path | None = None
     """File of limits, as `hrc smooth --limits` writes it."""
@@ -218,8 +222,9 @@ class SmoothRobot(Robot):
 
     It has the observations and actions of the wrapped robot, so every LeRobot program and
     inference mode can use it in place of that robot. The motors receive setpoints, which reach
-    an action about `latency` after it. If actions stop coming, the motion comes to rest at the
-    last one. At `connect` and `begin`, the path starts at the robot's present position.
+    an action about `latency` after the action was sent. If no more actions come, the motion
+    comes to rest at the last action. At `connect` and `begin`, the path starts at the robot's
+    present position.
 
     Attributes:
         inner: The wrapped robot.
@@ -309,7 +314,7 @@ class SmoothRobot(Robot):
             self._thread.start()
 
     def begin(self) -> None:
-        """Restart the path at the robot's present position, as after moving it by hand.
+        """Restart the path at the robot's present position, for example after a manual motion.
 
         Raises:
             ValueError: The robot does not report its position for a value of its actions.
@@ -345,7 +350,8 @@ class SmoothRobot(Robot):
         if now - last > 1 / limits.fps or not np.isfinite(here).all():
             return  # the robot has been at rest since it was connected, as far as is known
         velocity = (here - before) / (last - then) if last > then else np.zeros_like(here)
-        # A robot that was put elsewhere between two readings did not move that fast.
+        # A velocity beyond the limits means that the robot was put elsewhere between the
+        # readings: start at rest.
         slow = bool((np.abs(velocity) <= limits.velocity).all())
         self.upsampler.reset(here, velocity if slow else 0.0)
 
@@ -353,10 +359,10 @@ class SmoothRobot(Robot):
         """Continue the motion to an action.
 
         Args:
-            action: Action; values that it does not name keep their last target.
+            action: Values by name. Values that are not named keep their last target.
 
         Returns:
-            The setpoint sent last.
+            The setpoint that was sent last.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected, or stopped taking setpoints.
@@ -418,7 +424,7 @@ class SmoothRobot(Robot):
     def _phase(self, now: float) -> float:
         """Time since the newest action of the path, in action periods; takes actions when due.
 
-        The first action is due when it comes, each further one an action period later.
+        The first action is due when it comes, each further action one action period later.
         """
         fps = self.upsampler.limits.fps
         if self._started is None:
