@@ -44,7 +44,7 @@ class HeldGizmo:
 
 
 Key = tuple[Hashable, str]
-"""Holder (identifier of a client), and name of the held gizmo."""
+"""Holder (ID of a browser's client, or "headset"), and name of the held gizmo or hand."""
 
 
 class HeldGizmos:
