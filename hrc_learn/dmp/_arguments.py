@@ -282,3 +282,20 @@ def _collapse_identical(values: Tensor, ndim: int) -> Tensor:
         return values
     first = values[(0,) * (values.ndim - ndim)]
     return first if bool((values == first).all()) else values
+
+
+def contexts_of(values: Any, n: int, device: torch.device | None = None) -> Tensor:
+    """Contexts (n, C) in float64, one row for each of `n` demonstrations.
+
+    Raises:
+        ValueError: The number of rows differs from `n`, or a number is not finite.
+    """
+    given = to_tensor(values, torch.float64, device)
+    if not given.ndim or len(given) != n or not given.numel():
+        raise ValueError(
+            f"context must have one row for each of {n} demonstrations, got "
+            f"{tuple(given.shape)}"
+        )
+    if not given.isfinite().all():
+        raise ValueError("context must be finite")
+    return given.reshape(n, -1)

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import to_tensor
+from hrc_learn.dmp._arguments import contexts_of, to_tensor
 from hrc_learn.dmp.framed_dmp import FramedDMP, Frames
 from hrc_learn.dmp.joint_dmp import JointDMP, select_basis_count
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
@@ -170,19 +170,10 @@ def choose(
     n = len(x)
     given = torch.cat([x[..., -2], x[..., -1]], dim=-1)
     if context is not None:
-        given = to_tensor(context, torch.float64, x.device)
-        if not given.ndim or len(given) != n:
-            raise ValueError(
-                f"context must have one row for each of {n} demonstrations, got "
-                f"{tuple(given.shape)}"
-            )
-        given = given.reshape(n, -1)
-        if not given.isfinite().all():
-            raise ValueError("context must be finite")
+        given = contexts_of(context, n, x.device)
     found = [c for each in fits for c in _candidates(each, given, frames)]
-    eligible = found
-    if regression_only:
-        eligible = [c for c in found if c.family == "ridge" and c.shrinkage == 1]
+    only = regression_only
+    eligible = [c for c in found if not only or (c.family == "ridge" and c.shrinkage == 1)]
     if not eligible:
         raise ValueError(f"a regression needs {FEWEST} demonstrations or more, got {n}")
     best = eligible[0]

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
+from hrc_learn.dmp._arguments import Points, Times, Vectors, contexts_of, to_tensor
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.probabilistic_dmp import (
     PATH_TIMES,
@@ -73,8 +73,8 @@ class MixtureDMP[P: MotionPrimitive]:
                 `ProbabilisticDMP.fit`.
 
         Raises:
-            ValueError: Fewer than two primitives, more modes than primitives, or a wrong number
-                of contexts.
+            ValueError: Fewer than two primitives, more modes than primitives, or contexts that
+                are not finite or not one row for each primitive.
         """
         motion = with_common_reference(primitives).motion
         n = motion.weights.shape[:-2].numel()
@@ -86,10 +86,7 @@ class MixtureDMP[P: MotionPrimitive]:
         s = torch.linspace(0, 1, PATH_TIMES, dtype=torch.float64).to(x)
         paths = (x @ motion.response.evaluate(s)[:, 0].mT).flatten(1)
         r = _responsibilities(principal_components(paths), n_modes)
-        if context is None:
-            c = x[..., -2:].flatten(1)
-        else:
-            c = to_tensor(context, torch.float64).reshape(n, -1)
+        c = x[..., -2:].flatten(1) if context is None else contexts_of(context, n, x.device)
         return cls(
             modes=tuple(gaussians_of_modes(primitives, r, slack)),
             probability=r.mean(0),

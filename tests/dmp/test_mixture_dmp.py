@@ -177,6 +177,14 @@ def test_refuses_with_a_sentence(shown, mixture):
         MixtureDMP.fit(shown[0])
     with pytest.raises(ValueError, match="context must be"):
         mixture.at([math.pi])
+    for context, fault in (
+        (torch.zeros(3, 6), r"one row for each of 9 demonstrations, got \(3, 6\)"),
+        (torch.zeros(8, 1), "one row for each of 9"),
+        (torch.zeros(9, 0), "one row for each of 9"),
+        (torch.full((9, 1), math.nan), "context must be finite"),
+    ):
+        with pytest.raises(ValueError, match=fault):
+            MixtureDMP.fit(shown, context)
 
 
 @pytest.mark.parametrize(
