@@ -140,7 +140,7 @@ class CameraReference:
     def fit(
         demonstrations: Sequence[ImageDemonstration], fps: float, image_size: tuple[int, int]
     ) -> CameraReference:
-        """Fit the camera, and the threshold from displacements found without any motion.
+        """Fit the camera, and the threshold from displacements found for an unmoved camera.
 
         Args:
             demonstrations: Two or more demonstrations with one fixed camera; read several

@@ -38,8 +38,8 @@ class Measurement:
     pose: Pose
     """Pose of the tool when the image was taken."""
     feature: Float[Tensor, "*batch rows"]
-    """Image feature [px], u and v of each point in turn; any value, also NaN, where not
-    `valid`."""
+    """Image feature [px]: u and v of the first point, then of the next. Where `valid` is False,
+    the value does not matter and may be NaN."""
     valid: Bool[Tensor, "*batch"]
     """True if the feature is visible and its image was not used before."""
     dt: float | Float[Tensor, ""]
@@ -545,8 +545,8 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         spread = (P_phi * phi).sum(-1, keepdim=True) + 2 * self.config.pixel_noise**2
         change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
         change = change.unflatten(-1, (6, -1)) * self.scale.unsqueeze(-1)  # (*batch, 2, 6, K)
-        # The outer product of a vector with itself is exactly symmetric. That of the gain and
-        # P_phi is not: its asymmetry would grow until the covariance is indefinite.
+        # The outer product of a vector with itself is exactly symmetric. The outer product of
+        # gain and P_phi is not: the asymmetry would grow until the covariance is indefinite.
         root = P_phi / spread.sqrt()
         return replace(
             state,

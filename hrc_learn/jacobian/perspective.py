@@ -202,9 +202,9 @@ def on_plane(
 def unexplained(
     demonstrations: Sequence[ImageDemonstration], camera: Float[Tensor, "13"]
 ) -> Sequence[ImageDemonstration]:
-    """Demonstrations whose feature is the residual pixel, seen minus predicted by a camera.
+    """Demonstrations with the residual as feature: seen pixel minus a camera's prediction.
 
-    They are read on access.
+    The demonstrations are read on access.
     """
     return LazyMap(demonstrations, partial(_left_by, camera))
 
@@ -332,8 +332,8 @@ def adjust_bundle(
 ) -> Float[Tensor, "points 13"]:
     """Fit one camera and many points of a link together (bundle adjustment).
 
-    Levenberg-Marquardt with the robust cost r^2 e^2 / (r^2 + e^2) of an error e. The Schur
-    complement of the points leaves ten equations for the camera (Triggs et al. 2000).
+    The Levenberg-Marquardt method minimises the robust cost r^2 e^2 / (r^2 + e^2) of errors e.
+    The Schur complement of the points leaves ten equations for the camera (Triggs et al. 2000).
 
     Args:
         cameras: Copies of one camera, one for each point, with the point as the marker.

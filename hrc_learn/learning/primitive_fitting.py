@@ -242,7 +242,7 @@ class FittedPrimitives:
     n_basis: int
     """Number of basis functions."""
     selection: BasisSelection | None = None
-    """Selection of the number of basis functions; None if it was given."""
+    """Selection of the number of basis functions; None if the number was given."""
 
     def save(self, folder: Path, each: bool = False) -> None:
         """Write the mean primitives to `folder/CHANNEL`.
@@ -397,8 +397,8 @@ def fit_streamed(
         Primitives by channel, and measured values by name.
 
     Raises:
-        ValueError: A channel is pose or orientation, whose coordinates depend on the goal of a
-            demonstration.
+        ValueError: A channel is pose or orientation: coordinates of orientations depend on the
+            goal of each demonstration, so they have no common primitive.
     """
     fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
     for channel in channels or ("joint",):

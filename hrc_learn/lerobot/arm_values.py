@@ -90,7 +90,7 @@ class ArmValues:
 
         Returns:
             Positions of the joints [rad] or pose of the end effector, and opening of the
-            gripper [m], NaN where none is given.
+            gripper [m]; NaN if no opening is given.
 
         Raises:
             ValueError: Names are missing.

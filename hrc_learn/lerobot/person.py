@@ -43,8 +43,8 @@ class PersonConfig:
     kind: PersonKind = "none"
     """Input device: "page", "gamepad", "keyboard", "scripted"; "none": no person."""
     after_push: Literal["return", "stay"] = "return"
-    """Behaviour after release: the joints return to those of the actions ("return"), or stay
-    offset from them ("stay").
+    """Behaviour after release: the joints return to the positions that the actions command
+    ("return"), or keep their offset from these positions ("stay").
     """
     observed: Literal["posture", "joints"] = "posture"
     """Observed joint positions and velocities: those of the policy's own posture, as if there

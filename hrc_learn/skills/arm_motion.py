@@ -81,7 +81,7 @@ def joints_near(
     Args:
         chain: Kinematics of the arm.
         pose: Pose of the end effector. If it is out of reach, the result only comes closer.
-        near: Joint positions that bring the end effector to about a centimetre from it [rad].
+        near: Joint positions with the end effector about a centimetre from the pose [rad].
     """
     q = near
     for _ in range(_ITERATIONS):
@@ -150,7 +150,7 @@ class PositionServo:
                 f"targets must come within {config.safety.longest_step:g} s of each other, but "
                 f"dt is {dt:g} s: raise the frame rate."
             )
-        # These limits are tighter than those of the safety filter, so it need not intervene.
+        # These limits are tighter than the safety filter's, so the filter need not intervene.
         limits, margin = chain.limits, 1.5 * config.safety.margin
         self.limits = replace(
             limits,

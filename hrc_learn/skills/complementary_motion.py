@@ -47,7 +47,7 @@ _ROUNDING = 1e-3
 
 
 class ComplementaryMotion:
-    """Combines a policy, which moves the end effector, with a person, who moves the null space.
+    """Combines a policy that moves the end effector with a person that moves the null space.
 
     The policy requests joint positions, called its posture. Without a push, they are passed on
     unchanged. While a person pushes the joints aside, the end effector keeps the pose that it

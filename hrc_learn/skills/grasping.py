@@ -66,9 +66,9 @@ _OPENING_TIME = 0.3
 # Timeout of a finger motion [s]: 3.2 s for the Franka Hand's full stroke at a quarter of its
 # speed, half a second to start, and a margin.
 _LONGEST_FINGER_MOTION = 4.0
-# The fingers count as moved if their opening changed by more than _FINGERS_MOVED [m], and as at
-# rest if it changes by less than a tenth of that within _FINGERS_REST [s]. Grippers report the
-# opening at 50 Hz.
+# The fingers count as moved if their opening changed by more than `_FINGERS_MOVED` [m]. They
+# count as at rest if the opening changes by less than a tenth of `_FINGERS_MOVED` within
+# `_FINGERS_REST` [s]. Grippers report the opening at 50 Hz.
 _FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
 # Clearance to keep from objects, since the marker plate protrudes from the arm's capsules [m].
 _PLATE_CLEARANCE = 0.06

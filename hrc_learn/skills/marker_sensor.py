@@ -245,7 +245,7 @@ class DelayedDetection:
             time: Present time [s].
         """
         arrived = None
-        # Clocks sum rounded steps, so a nanosecond early counts as in time.
+        # Clocks sum rounded steps, so an image that is a nanosecond early counts as in time.
         taken_by = time - self._latency.delay + 1e-9
         while self._pending and self._pending[0].time <= taken_by:
             arrived = self._pending.popleft()
@@ -287,14 +287,14 @@ def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialCha
     position = chain.forward(torch.from_numpy(log["joint_position"][rows])).position
     over_table = ((position - middle.position).norm(dim=-1) < _OVER_TABLE).numpy()
     occluded = over_table & np.isnan(log["feature"][rows, 0])
-    # Rising and falling edges alternate; their distances are lengths in steps.
+    # Rising and falling edges alternate: an occlusion lasts from a rising to a falling edge.
     edges = np.flatnonzero(np.diff(np.concatenate([[False], occluded, [False]]).astype(int)))
     steps = edges[1::2] - edges[::2]
     dt = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     return float(steps.max()) * dt if len(steps) else 0.0
 
 
-# Number of images averaged for the reference pixel of a held marker: those of half a second.
+# Number of images that are averaged for the reference pixel of a held marker: half a second.
 _AVERAGED_IMAGES = 12
 
 

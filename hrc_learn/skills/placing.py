@@ -65,7 +65,7 @@ class Workplace(Protocol):
 
     @property
     def robot(self) -> Arm:
-        """The arm that works there."""
+        """The arm of the workplace."""
         ...
 
     @property
@@ -139,7 +139,8 @@ class Workplace(Protocol):
 
         Args:
             name: Name of the shelf.
-            half_size: Half edges of the object [m]; None: those of the scene's first object.
+            half_size: Half edges of the object [m]; None: half edges of the scene's first
+                object.
 
         Raises:
             ValueError: There is no such shelf.
@@ -371,7 +372,7 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
             f"{k * plan.dt:.1f} s, above its limit of {float(limits.velocity[joint]):.2f} "
             "rad/s: plan it slower."
         )
-    # One sample in 40 ms: at most 2 cm of motion at the speed of a placing motion.
+    # Check one sample every 40 ms: a placing motion moves at most 2 cm in this time.
     every = max(1, round(0.04 / plan.dt))
     samples = np.concatenate([plan.path[:-1:every], plan.path[-1:]])
     touches = world.collisions_along(samples, carried)

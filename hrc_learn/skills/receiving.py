@@ -45,7 +45,7 @@ class ReceivingConfig:
     certainty: float = 0.95
     """Probability of a hand-over above which the robot moves."""
     speed: float = 0.5
-    """Speed of the end effector towards a certain meeting point [m/s]."""
+    """Speed of the end effector towards a meeting point predicted without uncertainty [m/s]."""
     acceleration: float = 1.0
     """Acceleration of the end effector [m/s^2]."""
     tolerance: float = 0.06

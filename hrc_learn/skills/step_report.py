@@ -1,4 +1,4 @@
-"""Reports of a control step: feedback to the person who guides an arm, and the log."""
+"""Reports of a control step: feedback to the person that guides an arm, and log columns."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -18,10 +18,10 @@ from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reaso
 from hrc_learn.store import read_toml
 
 # An arm counts as following the person if it keeps more than this fraction of the requested
-# motion. Late servos and the curvature of the null space alone reduce the fraction to this.
+# motion. Late servos and the curvature of the null space can reduce the fraction to this value.
 _FOLLOWED = 0.97
-# Distance from a joint limit below which it is reported [rad]. Pushes end 0.12 rad before the
-# limit, which is the margin of the safety filter plus that of the task.
+# A joint closer to its limit than this is reported [rad]. Pushes end 0.12 rad before the limit:
+# this is the margin of the safety filter plus the margin of the task.
 _NEAR_LIMIT = 0.15
 # Time between two updates of contacts and joint limits [s]: no device shows them faster.
 _UPDATE_EVERY = 0.1
@@ -64,7 +64,7 @@ def contact_force(
 
 
 class PersonFeedback:
-    """Feedback of each step to the person who guides an arm.
+    """Collects the feedback of each step to the person that guides an arm.
 
     Causes that keep the arm from following the person are collected over one step. Each cause
     keeps a fraction of the motion that the previous causes have left; the arm follows the

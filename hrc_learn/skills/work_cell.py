@@ -116,7 +116,7 @@ class WorkCell:
         human: Person near the arm; may be replaced between two steps.
         human_input: Newest input of the person, with a smoothed null-space effort.
         observation: Newest detection of markers that has arrived.
-        load: Object in the gripper, which must keep its distance from people as well.
+        load: Object in the gripper; it keeps its distance from people, too. None: no object.
         tracked_markers: Markers detected every `detect_every` steps; empty: none.
         region: Position region of the last command, if it came from the adaptive controller;
             else None.

@@ -74,7 +74,7 @@ MOST_CHUNKS = 50_000
 @PreTrainedConfig.register_subclass("motion_chunk")
 @dataclass
 class MotionChunkConfig(MotionPolicyConfig):
-    """Settings of chunks of actions, each of which continues the executed motion."""
+    """Settings of a policy that predicts chunks of actions, as parts of one smooth motion."""
 
     n_basis: int | None = None
     """Basis functions per coordinate and chunk; None: 10, or in short chunks two for every five
@@ -405,7 +405,8 @@ class MotionChunkPolicy(MotionPolicy):
         """State in which a motion begins: as planned, but at measured positions if observed."""
         if OBS_STATE not in self.encoder.widths:
             return planned
-        values = batch[OBS_STATE][:, None, self.measured]  # -1: the last, which is not used
+        # The index -1 (not measured) selects the last value, which is not used below.
+        values = batch[OBS_STATE][:, None, self.measured]
         seen = self.encoding.to_coordinates(values.to(self.encoding.mean))[:, 0]
         seen, there = seen[:, self._smooth].to(planned), self.measured[self._smooth] >= 0
         position = torch.where(there, seen, planned[:, 0])
