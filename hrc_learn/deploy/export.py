@@ -206,7 +206,7 @@ def _hashed(x: Any, seen: dict[int, Any]) -> Iterator[bytes]:
     yield f"{kind.__module__}.{kind.__qualname__}\n".encode()
     if isinstance(x, Tensor):
         yield f"{x.dtype} {tuple(x.shape)} {x.device}\n".encode()
-        yield x.detach().cpu().contiguous().numpy().tobytes()
+        yield x.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes()
     elif isinstance(x, _PLAIN):
         yield f"{x!r}\n".encode()
     elif id(x) in seen:
@@ -220,17 +220,19 @@ def _hashed(x: Any, seen: dict[int, Any]) -> Iterator[bytes]:
 
 def _parts(x: Any) -> Iterable[Any]:
     """Values that an object consists of."""
-    if isinstance(x, Mapping):
-        return x.items()
-    if isinstance(x, set):
-        return sorted(x, key=repr)
-    if isinstance(x, list | tuple):
-        return x
+    library = type(x).__module__.split(".")[0]
+    if library in ("builtins", "collections", "hrc_learn", "torch", "types"):
+        if isinstance(x, Mapping):
+            return x.items()
+        if isinstance(x, set):
+            return sorted(x, key=repr)
+        if isinstance(x, list | tuple):
+            return x
     if isinstance(x, SerialChain):
         # Everything that affects a step. The arm's shape is left out: it does not affect a
         # step, and may be a function, which cannot be hashed.
         return x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds
-    if type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(x, "__dict__"):
+    if library in ("hrc_learn", "torch") and hasattr(x, "__dict__"):
         return (x.__getstate__(),)
     raise UnknownCodeError(f"the code of {type(x).__qualname__} is unknown")
 

@@ -96,6 +96,18 @@ def test_code_it_cannot_know_is_refused():
         content_hash(controller(kind=Own))
     with pytest.raises(UnknownCodeError, match="function"):
         content_hash([lambda x: x])
+    for container in (dict, list, tuple, set):
+        own = type("Own", (container,), {"__module__": "somebody"})()
+        with pytest.raises(UnknownCodeError, match="Own"):
+            content_hash({"part": own})
+
+
+def test_half_precision_is_hashed_by_its_bits():
+    one, other = (
+        torch.ones((), dtype=torch.bfloat16),
+        torch.full((), 1.01, dtype=torch.bfloat16),
+    )
+    assert content_hash(one) == content_hash(one.clone()) != content_hash(other)
 
 
 def test_a_change_of_any_source_that_a_step_is_made_from_changes_the_hash(
