@@ -260,7 +260,8 @@ class _Search:
                 for finding in filter(None, (tools[k], item)):
                     draw_finding(image, finding)
                 tiles.append(image[::smaller, ::smaller])
-            rows.append(np.hstack(tiles))
+            # A single image with the tool is the first and the last one.
+            rows.append(np.hstack((tiles * 2)[:2]))
         return np.vstack(rows)
 
     def object(self, camera: Float[Tensor, "13"]) -> tuple[Object, list[Finding | None]] | None:
