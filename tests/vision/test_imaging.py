@@ -301,7 +301,9 @@ def test_a_carton_has_its_colour_and_print_by_its_name():
         assert 0.2 < (image == base).all(axis=-1).mean() < 0.9
     # All is printed on the base colour: another one shows in the same places.
     blue = carton("a", (0.1, 0.2, 0.8, 1.0))
-    np.testing.assert_array_equal((one != blue).any(axis=-1), (one == base).all(axis=-1))
+    differs, plain = (one != blue).any(axis=-1), (one == base).all(axis=-1)
+    assert differs[plain].all()
+    assert differs[~plain].mean() < 0.1  # OpenCV 5 blends the edges of letters
     # Words in white and black, in five rows of the height.
     for ink in ((250, 250, 245), (20, 20, 25)):
         rows = np.flatnonzero((one == ink).all(axis=-1).any(axis=1))
