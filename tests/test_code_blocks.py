@@ -101,6 +101,7 @@ def reader(tmp_path, monkeypatch):
 RUN = [page for page in PAGES if pasted(page).strip()]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
 @pytest.mark.usefixtures("reader")
 def test_a_page_can_be_pasted_from_top_to_bottom(page):

@@ -106,6 +106,7 @@ def test_the_site_opens_without_a_network(tmp_path):
     assert not list(out.rglob("_*"))
 
 
+@pytest.mark.long
 @builder
 @pytest.mark.parametrize(
     ("name", "old", "new", "complaint"),

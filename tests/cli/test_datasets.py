@@ -133,6 +133,7 @@ def test_a_preview_writes_a_mapping_that_can_be_corrected(tmp_path):
     assert "map.json: colums: no such setting; did you mean columns?" in error
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_commands_and_gripper_are_named_on_the_command_line(tmp_path):
     q, path = joint_path(200, 7), tmp_path / "run.npz"
@@ -307,6 +308,7 @@ def record_marker(root, episodes=2, frames=20):
     return np.array(centres)
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_an_image_jacobian_is_fitted_to_a_marker_found_in_the_videos(tmp_path):
     root, values = tmp_path / "set", tmp_path / "values.json"

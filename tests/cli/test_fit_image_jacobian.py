@@ -17,6 +17,7 @@ from hrc_learn.sim.workplace import Workplace
 FRAMES = 60
 
 
+@pytest.mark.long
 def test_it_writes_a_model_like_the_camera_of_the_work_cell(tmp_path):
     poses = wander(FRAMES, 4, rng=generator(0))
     workplace = Workplace()

@@ -79,6 +79,7 @@ def test_a_follower_records_what_its_leader_shows(tmp_path):
     assert features["action"]["names"][-1] == "gripper.pos"
 
 
+@pytest.mark.long
 def test_a_leader_that_is_not_there_is_one_line(tmp_path):
     (tmp_path / "mine.json").write_text(json.dumps(calibration()))
     words = ("record", "leader", "--robot", "so101", "--out", tmp_path / "set")

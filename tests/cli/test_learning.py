@@ -35,6 +35,7 @@ def fitted(poses):
     return out, done(*fit, "--out", out).output
 
 
+@pytest.mark.long
 def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     model = tmp_path / "model"
     done(

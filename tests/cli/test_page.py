@@ -26,6 +26,7 @@ def test_a_wrong_port_and_a_port_in_use_end_in_one_line(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_a_page_on_the_network_runs_for_its_duration(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -9,6 +9,7 @@ from hrc_learn.controller import AdaptiveController, SafetyFilter
 pytestmark = pytest.mark.simulation
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "fault",
     [

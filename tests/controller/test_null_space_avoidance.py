@@ -42,6 +42,7 @@ def drive(twist: Tensor, stiffness: float, *, filtered: bool) -> Tensor:
     return worst
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stiffness", [10.0, 1000.0])
 def test_the_null_space_cannot_keep_limits_and_the_filter_does(stiffness: float):
     """Whatever its gain: back and up, a tilt, and a turn of the tool about its axis."""

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.simulation
 
 POISONS = {"nan": torch.nan, "inf": torch.inf, "-inf": -torch.inf}
 DT = 0.02
-ESTIMATORS = [CompositeEstimator, KalmanEstimator]
+ESTIMATORS = [CompositeEstimator, pytest.param(KalmanEstimator, marks=pytest.mark.long)]
 
 
 @pytest.fixture(autouse=True)
@@ -189,6 +189,7 @@ def test_one_tick_of_poison_leaves_the_next_healthy(estimator):
     ]
 
 
+@pytest.mark.long
 def test_steps_of_no_length_brake_for_one_tick_each():
     """By the last length that was valid: within the limits of acceleration."""
     scene = Scene(KalmanEstimator, 1)

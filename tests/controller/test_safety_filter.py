@@ -53,7 +53,7 @@ def at_the_brink(*batch: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("kind", ["noise", "push", "bang-bang", "broken"])
-@pytest.mark.parametrize("dt", [0.001, 0.008, 0.05])
+@pytest.mark.parametrize("dt", [0.001, 0.008, pytest.param(0.05, marks=pytest.mark.long)])
 def test_no_command_breaks_a_limit(kind: str, dt: float):
     """Each step checks position, velocity, acceleration and jerk: from rest anywhere inside
     the limits, and from states that leave no choice but to brake."""
@@ -167,7 +167,7 @@ HALTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("depth", [-0.2, 0.0215])
+@pytest.mark.parametrize("depth", [0.0215, pytest.param(-0.2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("halt", HALTS)
 @shapes_unchecked()  # for speed
 def test_outside_its_limits_a_stopped_arm_rests_and_returns_when_asked(halt, depth):

@@ -375,6 +375,7 @@ def kill_and_recover(root, seconds):
     return announced, load_demos(recover_dataset(root))
 
 
+@pytest.mark.long
 def test_a_killed_recording_loses_the_open_episode_at_most(tmp_path):
     announced, demos = kill_and_recover(tmp_path / "set", 0.05)
     assert announced <= len(demos) <= announced + 1

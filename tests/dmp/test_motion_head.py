@@ -201,6 +201,7 @@ def linear_zero(head, z):
     return torch.cat([0 * z[..., : head.n_linear], z[..., head.n_linear :]], -1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", [{}, {"since": 0.6}], ids=["whole", "from a state"])
 def test_divergence_of_motions_is_that_of_noisy_positions(head, factor, state):
     start, time = torch.zeros(3, 2).double(), 0.6 + TIME[::8]

@@ -60,6 +60,7 @@ def test_periods_are_found():
         assert fit_rhythmic(time, y).duration.item() == pytest.approx(PERIOD, rel=1e-3)
 
 
+@pytest.mark.long
 def test_periods_are_found_in_noise():
     """Of 0.3 of the amplitude, over five periods."""
     rng, time = torch.Generator().manual_seed(0), torch.linspace(0, 8.3, 400).double()

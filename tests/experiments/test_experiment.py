@@ -102,6 +102,7 @@ def work(tmp_path, capsys):
     return run
 
 
+@pytest.mark.long
 def test_a_new_experiment_is_run_repeated_and_reported(work):
     status, values, folder, shown = work(ThrowExperiment(), trials=4, film=True)
     assert status == 0

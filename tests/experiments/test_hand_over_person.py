@@ -23,6 +23,7 @@ WORKPLACE, ITEM = Workplace(), ObjectConfig()
 NOMINAL = Imperfections.nominal()
 
 
+@pytest.mark.long
 @shapes_unchecked()
 def test_what_was_shown_tells_movements_of_other_people_apart(monkeypatch):
     monkeypatch.setattr(surroundings, "_VISITS", 15)

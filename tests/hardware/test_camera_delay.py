@@ -49,6 +49,7 @@ def at_the_table(imperfections):
     return world
 
 
+@pytest.mark.long
 def test_the_delay_of_a_camera_is_found():
     world = at_the_table(Imperfections.nominal())
     camera, before = LateCamera(world, 0.083, 0.021), world.data.qpos[:7].copy()

@@ -384,6 +384,7 @@ def test_the_process_ends_on_a_signal_and_says_why_it_cannot_begin(box, monkeypa
     assert collector == list(names)
 
 
+@pytest.mark.long
 def test_the_far_end_of_a_load_keeps_the_cap_on_the_tool():
     """By finite differences of the point, 0.5 m beyond the flange, as the wrist turns."""
     far_end = torch.tensor([0.1, 0.0, 0.5, 1.0], dtype=torch.float64)

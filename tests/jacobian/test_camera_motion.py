@@ -126,6 +126,7 @@ def test_a_moved_camera_is_that_of_opencv():
     np.testing.assert_allclose(marker_pixels(there, pose)[0], expected, atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("turn", "shift"),
     [
@@ -300,6 +301,7 @@ KNOCKS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", KNOCKS[:2])
 def test_a_moved_camera_shows_things_where_it_would_have_seen_them(reference, plane, place):
     rng = np.random.default_rng(12)

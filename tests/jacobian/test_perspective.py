@@ -81,7 +81,7 @@ def demonstration(rng, rotation, shift, focal, marker, frames=200, noise=0.1):
     return ImageDemonstration(pose=pose, feature=feature, visible=visible)
 
 
-@pytest.mark.parametrize("focal", [900.0, 2000.0])
+@pytest.mark.parametrize("focal", [900.0, pytest.param(2000.0, marks=pytest.mark.long)])
 def test_the_focal_length_is_found_from_motion(focal):
     rng = np.random.default_rng(1)
     rotation, shift = camera(rng)
@@ -241,7 +241,10 @@ def error_against(network, demonstrations):
     return float(torch.cat(errors).median())
 
 
-@pytest.mark.parametrize(("number", "bound"), [(1, 0.015), (2, 0.01), (4, 0.01), (8, 0.005)])
+LONGER = [pytest.param(*case, marks=pytest.mark.long) for case in [(4, 0.01), (8, 0.005)]]
+
+
+@pytest.mark.parametrize(("number", "bound"), [(1, 0.015), (2, 0.01), *LONGER])
 def test_a_camera_comes_first_and_the_network_learns_the_rest(number, bound):
     """A single path hardly shows perspective: over 15 seeds its median error is 1.3 %."""
     rng = np.random.default_rng(3)
@@ -258,6 +261,7 @@ def test_a_camera_comes_first_and_the_network_learns_the_rest(number, bound):
     np.testing.assert_allclose(eye_of(found.camera), EYE, atol=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_the_covariance_is_honest():
     """Errors of the camera's position in standard deviations of their covariance."""
@@ -323,6 +327,7 @@ def test_demonstrations_without_the_marker_are_refused():
     fit_camera([enough], IMAGE)
 
 
+@pytest.mark.long
 def test_estimators_learn_what_the_camera_leaves():
     """Of a camera that fits, nothing is left; of one that rolled, most is learned."""
     rng = np.random.default_rng(6)

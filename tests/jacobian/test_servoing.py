@@ -63,6 +63,7 @@ def servo(Estimator, roll):
     return (camera.project(pose) - target).norm(dim=-1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("roll", [0.0, 1.5, 3.0])
 @pytest.mark.parametrize(
     "Estimator",

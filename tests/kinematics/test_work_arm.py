@@ -163,6 +163,7 @@ def test_five_joints_reach_the_position_and_the_nearest_orientation():
         assert ((first - second).abs() / 2e-4 < 1e-4).all()
 
 
+@pytest.mark.long
 def test_a_pose_of_another_direction_is_no_nearest_one():
     arm = bare((2, 4)).with_hand()
     _, poses = poses_of(arm, 5, seed=6)

@@ -54,6 +54,7 @@ def policy(tmp_path_factory):
     return home / "policy"
 
 
+@pytest.mark.long
 def test_a_checkpoint_is_rolled_out_and_recorded_with_what_the_person_does(
     policy, tmp_path, monkeypatch
 ):

@@ -98,6 +98,7 @@ def test_bad_input_of_a_benchmark_is_one_line(run_here, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_a_benchmark_writes_its_figures(run_here, tmp_path):
     sizes = ("--episodes", 2, "--frames", 50, "--repeats", 1)
     out = tmp_path / "figures.json"

@@ -46,6 +46,7 @@ def test_arm_follows_a_velocity_without_lag(world):
     np.testing.assert_allclose(state.joint_velocity, velocity, atol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("joint", range(7))
 @shapes_unchecked()
 def test_the_filter_allows_for_what_the_servo_overshoots(world, joint):

@@ -166,6 +166,7 @@ def test_no_drawing_makes_the_command_jump():
     assert float(torch.stack(loop.velocity).abs().max()) > 0.1  # it has moved
 
 
+@pytest.mark.long
 def test_what_the_camera_sees_beyond_the_walls_does_not_draw_it_out():
     """The planned target is at the middle of the planned box; the box drawn is beside it."""
     x, y, z = CENTRE.tolist()
@@ -193,6 +194,7 @@ def test_in_a_region_over_the_planned_place_the_task_goes_on():
     assert loop.said == ["The drawn region guides the end effector."]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turn", [(0.0, -0.2, 0.2), (0.0, 1.5, 0.0)])
 def test_the_turn_comes_on_top_of_the_planned_orientation(turn):
     loop = Loop()

@@ -212,6 +212,7 @@ def test_only_a_marker_last_seen_near_the_border_has_left_the_image(law, pixel, 
     assert law.out_of_view(state, 10.0) == out
 
 
+@pytest.mark.long
 def test_the_null_space_returns_except_while_a_person_pushes_it(law):
     state, speeds = law.initial_state(panda.ready), []
     far = panda.ready + 10.0

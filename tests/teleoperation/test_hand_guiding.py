@@ -134,6 +134,7 @@ def returned(person, seconds, offset):
     return arm, np.array(path)
 
 
+@pytest.mark.long
 def test_an_arm_that_is_sent_to_a_posture_goes_straight_there_and_rests():
     offset = np.array([0.25, -0.1, 0.0, 0.15, 0.0, 0.05, -0.2])
     arm, path = returned(Wish(), 6.0, offset)
@@ -146,6 +147,7 @@ def test_an_arm_that_is_sent_to_a_posture_goes_straight_there_and_rests():
     assert fastest == pytest.approx(RETURN_SPEED, rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "asked",
     [

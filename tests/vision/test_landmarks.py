@@ -158,6 +158,7 @@ def test_eight_points_make_a_tool(count, there):
     assert (own.find(few, WIDTH) is not None) == there
 
 
+@pytest.mark.long
 def test_points_that_lie_as_on_no_rigid_tool_are_none():
     elsewhere = np.random.default_rng(2).uniform(0, 1000, (20, 2))
     assert tool().find(seen_as(elsewhere, tool().descriptors[:20]), WIDTH) is None
