@@ -22,7 +22,7 @@ def matrices(pose):
 
 def turned(pose, rotvec):
     """The pose turned by a rotation vector in the base frame."""
-    R = Rotation.from_rotvec(np.broadcast_to(rotvec, (len(Q), 3))).as_matrix() @ matrices(pose)
+    R = Rotation.from_rotvec(rotvec + np.zeros((len(Q), 3))).as_matrix() @ matrices(pose)
     T = np.tile(np.eye(4), (len(Q), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R, pose.position.numpy() + SHIFT
     return Pose.from_matrix(torch.from_numpy(T[:, :3]))
