@@ -362,6 +362,7 @@ def test_measured_values_are_written_as_numbers(tmp_path):
     assert json.loads(path.read_text()) == {"a": 1, "b": 0.5, "c": None, "d": 3}
 
 
+@pytest.mark.long
 def test_the_dataset_may_be_the_working_folder(monkeypatch, tmp_path):
     write_set(tmp_path / "set", **SETS["v2.0"])
     monkeypatch.chdir(tmp_path / "set")

@@ -464,6 +464,7 @@ def test_demonstrations_are_streamed_to_the_browser(viewer, recording, tmp_path)
     assert json.loads((tmp_path / "figures.json").read_text())["episodes"] == 1
 
 
+@pytest.mark.long
 @pytest.mark.simulation
 def test_a_dataset_is_shown_with_the_arm_that_is_named(recording, tmp_path):
     hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")

@@ -98,6 +98,7 @@ def test_a_recording_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_a_dashboard_in_the_way_is_one_line(places, tmp_path, capfd):
     """Rerun writes its warnings past Python, to the process's own stderr."""
     out = tmp_path / "out.rrd"

@@ -58,6 +58,7 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     done("evaluate", "--model", model, "--dataset", poses, "--most-nrmse", 1e-9, status=1)
 
 
+@pytest.mark.long
 def test_an_episode_of_one_frame_is_left_out_of_a_fit_with_a_note(tmp_path):
     lengths = (60, 1, 50, 1)
     episodes = [{"observation.state": joint_path(n, seed=n)} for n in lengths]

@@ -58,6 +58,7 @@ def played(folder):
 GOAL = (0.5, -0.1, 0.4)
 
 
+@pytest.mark.long
 def test_a_motion_is_written_as_table_film_recording_and_episode(models, tmp_path):
     out, values = tmp_path / "out", tmp_path / "values.json"
     goal = ("--goal", *GOAL, "--robot", "panda")

@@ -52,6 +52,7 @@ def _no_shape_checks() -> Iterator[None]:
         yield
 
 
+@pytest.mark.long
 def test_converges_from_near_starts_with_a_good_jacobian():
     rng = sampling.generator(5)
     controller, camera = grasping(100, rng=rng)

@@ -110,6 +110,7 @@ def test_a_step_that_ends_early_equals_one_of_all_steps():
     assert free >= 10
 
 
+@pytest.mark.long
 def test_the_order_is_strict_to_the_weight_of_the_task():
     """Linear programming knows no weights: whether the path can be kept, and at which speed."""
     state = constraint_states.of_panda(150, seed=2, pairs=3)

@@ -61,6 +61,7 @@ PLANTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("plant", "dt"), [*((name, 0.02) for name in PLANTS), ("all of it", 0.004)]
 )

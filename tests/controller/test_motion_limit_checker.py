@@ -69,6 +69,7 @@ def test_it_finds_nothing(judge, ticks, tmp_path):
     assert verdict["findings"] == 0, verdict["shown"]
 
 
+@pytest.mark.long
 def test_it_finds_what_a_filter_with_other_limits_lets_pass(tmp_path):
     """The Panda's are no limits of the FR3, nor the other way round."""
     with shapes_unchecked():

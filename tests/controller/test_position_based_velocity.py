@@ -87,6 +87,7 @@ def test_limits_that_do_not_tighten_are_as_before():
         torch.testing.assert_close(buffer, plain.barrier.get_buffer(name), rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("arm", [panda, fr3], ids=["panda", "fr3"])
 @pytest.mark.parametrize("constraints", [None, ConstraintConfig()], ids=["", "constrained"])
 def test_hostile_streams_keep_all_limits(arm, constraints):

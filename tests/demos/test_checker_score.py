@@ -59,6 +59,7 @@ def test_a_sound_set_has_no_errors(clean):
     assert all("no unit declared" in warning.message for warning in report.warnings)
 
 
+@pytest.mark.long
 def test_every_defect_is_found_with_level_place_and_figures(clean, name, tmp_path):
     """Each kind in one of the sets; tools/score_checker.py tests all in each, and real sets."""
     done = list(outcomes(clean, "set", FINDINGS[name], tmp_path, check_here))

@@ -80,6 +80,7 @@ def test_commanded_velocities_equal_the_eager_ones(tmp_path, batch, dtype, toler
     assert np.abs(sent[0]).max() > 0.5
 
 
+@pytest.mark.long
 def test_threads_share_a_large_batch(tmp_path):
     arms = 1040
     step, example = VelocityStep(panda), told(arms, dtype=torch.float64)
@@ -109,6 +110,7 @@ class Mixed(VelocityStep):
         return super().step(state, replace(observation, joint_velocity=wanted))
 
 
+@pytest.mark.long
 def test_arms_that_depend_on_each_other_are_refused(tmp_path):
     with pytest.raises(UnknownOperationError, match="an arm of the batch reads observation"):
         export_step(Mixed(panda), told(4, dtype=torch.float64), tmp_path)

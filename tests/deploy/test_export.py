@@ -245,6 +245,7 @@ class Sorted(VelocityStep):
         return super().step(state, replace(observation, joint_velocity=wanted))
 
 
+@pytest.mark.long
 def test_a_step_that_cannot_be_compiled_runs_eagerly_and_says_so(tmp_path):
     law = Sorted(panda)
     example = WantedVelocity(

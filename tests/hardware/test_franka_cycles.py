@@ -221,6 +221,7 @@ def test_a_velocity_is_followed_until_it_runs_out_and_the_motion_ends_at_rest(bo
     np.testing.assert_allclose(moving.joint_position, seen[200][1], atol=2e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", ["stop", "end", "parent"])
 def test_a_motion_is_braked_to_rest_by_an_order_and_by_the_death_of_the_commander(
     box, order, monkeypatch
@@ -259,6 +260,7 @@ def test_after_lost_cycles_the_answers_go_on_from_what_the_box_has(box):
     assert box.report.cycles == len(box.answers)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lockstep", [False, True])
 def test_an_answer_that_would_come_too_late_is_not_given_but_to_a_simulator(box, lockstep):
     box.command(range(10, 300))

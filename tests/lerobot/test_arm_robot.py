@@ -62,6 +62,7 @@ def six(monkeypatch):
     return arm
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("space", ["joint", "ee"])
 def test_names_are_those_of_the_arms_joints(six, simulated, space):
     robot = simulated(scenario="grasping", action_space=space, velocity=True, hand=True)

@@ -86,6 +86,7 @@ def rollout(step, pose, pixels):
         assert step(transition) is transition
 
 
+@pytest.mark.long
 def test_a_camera_that_stands_still_is_left_in_peace(step, caplog):
     rng = np.random.default_rng(1)
     for _ in range(2):

@@ -161,6 +161,7 @@ def test_two_robots_of_one_checkpoint_do_not_see_each_other(checkpoint):
     torch.testing.assert_close(move_second(-here), -here)
 
 
+@pytest.mark.long
 def test_a_step_takes_the_watch_built_before_it_if_it_still_exists():
     watch = WatchStateStep()
     assert SmoothActionsStep(**SETTINGS).watch is watch

@@ -60,6 +60,7 @@ def projected(world):
     return {id: camera.project(pose[:3, 3]) for id, pose in world.marker_poses().items()}
 
 
+@pytest.mark.long
 @pytest.mark.egl
 def test_a_camera_sees_on_when_the_one_before_it_is_gone(world):
     camera = egl_or_skip(world)

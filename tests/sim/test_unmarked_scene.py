@@ -51,6 +51,7 @@ def test_the_same_object_has_the_same_print_in_every_scene(world):
     assert print_of(1) == print_of(2)
 
 
+@pytest.mark.long
 @pytest.mark.egl
 def test_a_camera_sees_no_marker(world):
     try:

@@ -124,6 +124,7 @@ def inside(position, region, tolerance=1e-3):
     return (np.abs(position - region.centre) <= np.array(region.half_size) + tolerance).all()
 
 
+@pytest.mark.long
 def test_a_drawing_leads_the_end_effector_and_what_was_planned_does_so_again_afterwards():
     loop = Loop()
     at_plan = loop.run(1.5)

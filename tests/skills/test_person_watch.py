@@ -254,6 +254,7 @@ class Hand:
         return np.broadcast_to(self._tip - [0.0, 0.0, down], (1, 2, 3)).copy()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [0.1, 0.2])
 def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
     """Seen as late as nominal, with 9 m/s^2: commands take effect before it is there."""

@@ -313,6 +313,7 @@ def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tab):
     np.testing.assert_array_equal(cut.command_position, source.command_position[30:100])
 
 
+@pytest.mark.long
 @pytest.mark.browser
 def test_a_phone_shows_image_and_buttons_at_once(page, tab):
     tab.set_viewport_size({"width": 390, "height": 844})

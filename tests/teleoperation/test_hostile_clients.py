@@ -77,6 +77,7 @@ def besieged(session, kinds, seed=0):
     wait_until(lambda: not session.asked.effort(7).any(), "rest")
 
 
+@pytest.mark.long
 def test_one_of_each_kind_changes_nothing(session):
     besieged(session, ATTACKS)
     assert http(session.page, "/")[0] == 200

@@ -191,6 +191,7 @@ def no_traceback(caplog):
     assert not raised, [record.getMessage() for record in raised]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_traceback")
 def test_a_page_lives_on_after_damaged_messages(session):
     asyncio.run(onslaught(session.page, 42, seed=0))

@@ -180,6 +180,7 @@ def test_the_page_shows_the_region_that_a_controller_follows(world, beside, monk
     assert beside.status(cell).note == ""
 
 
+@pytest.mark.long
 def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, beside):
     page = beside
     human, advance = joined(beside, ScriptedPerturbation(panda, ()), world.advance)
