@@ -186,7 +186,7 @@ def _write(
 
 
 def _record_expert(args: Record, episodes: int, seed: int) -> None:
-    """Record the columns of lerobot-record with mujoco_arm, arm_expert and simulated time."""
+    """Record the scripted expert in simulation, with the columns that lerobot-record writes."""
     from hrc_learn.lerobot.episode_recording import record_expert
     from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 
@@ -206,7 +206,8 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
         seed=seed,
     )
     config = with_settings(args.config, Settings(robot=default)).robot
-    # Camera motion is detected from the tool's pose and marker: the marker needs the pose.
+    # Camera motion is detected by comparing the marker with the tool's pose: a recorded marker
+    # needs the pose as well.
     config = replace(config, hand=config.hand or config.marker)
     failed = 0
     with Progress(transient=True) as progress:

@@ -230,7 +230,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     fields = whole.fields
     clocked = {name: one for name, one in fields.items() if one.clock}
     if not any(one.kind == "number" for one in clocked.values()):
-        # No name identifies the tool: the pose of any frame may be the tool's.
+        # There are no joints and no frame named as a tool: any pose may be the tool's.
         poses = {n: replace(f, kind="number") for n, f in fields.items() if f.kind == "pose"}
         fields = {**fields, **poses}
     numbers = [n for n in clocked if fields[n].kind == "number"]

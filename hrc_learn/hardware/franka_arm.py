@@ -2,8 +2,8 @@
 
 This works with an FR3 only: pylibfranka 0.21 uses version 10 of the network protocol, as does
 an FR3 with system 5.9 or later. A Panda (FER) uses version 5, with libfranka 0.9 or earlier,
-for which no pylibfranka exists. Use `FrankyArm` for it, with franky's build for its server
-version.
+for which no pylibfranka exists. For a Panda, use `FrankyArm` with the build of the package
+franky for the arm's protocol version.
 
 Tested against the protocol simulators franka-sim, including all limits that it enforces, and
 franky-sim. NOT RUN ON HARDWARE.
@@ -66,13 +66,14 @@ class FrankaArm(Connected):
                 arm.command(velocity(arm.read()))
 
     Loop and gripper run in processes of their own: nothing that Python does here delays them,
-    and only `stop`, `recover` and `close` wait for them. An `ArmProcess` is not needed: a
-    velocity holds for `FrankaConfig.timeout`; afterwards, or when this process has died, the
-    loop brings the arm to rest and ends the motion. If the loop dies or stalls, the control box
-    stops the arm after 20 ms.
+    and only `stop`, `recover` and `close` wait for them. A velocity holds for
+    `FrankaConfig.timeout`; afterwards, or when this process has died, the loop brings the arm
+    to rest and ends the motion. The arm therefore needs no `ArmProcess` around it. If the loop
+    dies or stalls, the control box stops the arm after 20 ms.
 
-    For any command, position, velocity, acceleration, jerk and tool speed stay within the
-    limits of `chain`. The arm may still hit itself or others; the control box then stops it.
+    Whatever is commanded, the arm keeps the limits of `chain` on position, velocity,
+    acceleration, jerk and tool speed. The arm may still hit itself or others; the control box
+    then stops it.
 
     After a fault, the control box has stopped the arm: `command` raises the reason, `read`
     continues as long as there is a connection, and `recover` makes the arm ready again.
@@ -102,7 +103,7 @@ class FrankaArm(Connected):
         self._names, limits = chain.joint_names, chain.limits
         self._rest = config.rest_timeout(limits.velocity, limits.acceleration, limits.jerk)
         self._shared, self._orders = Shared(), Orders()
-        # Lock among the threads of this process that command. The loop never waits for it.
+        # Lock held by a thread of this process while it commands. The loop never waits for it.
         self._writing = threading.Lock()
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(

@@ -91,8 +91,8 @@ def keep_best(
         `held_out_CHANNEL_KIND_nrmse_median`.
 
     Raises:
-        ValueError: A demonstration lacks a column or, with `regression_only`, there is no
-            channel for a regression, or too few demonstrations.
+        ValueError: A demonstration lacks a column. With `regression_only`: no channel can be
+            regressed, or there are too few demonstrations.
     """
     metrics: dict[str, float] = {}
     chosen: dict[str, str] = {}
@@ -109,7 +109,7 @@ def keep_best(
             known = metrics.get(name, error)
             metrics[name] = error if candidate is best.chosen else min(known, error)
     if regression_only and not chosen:
-        raise ValueError("a function of a context needs the channel joint or position.")
+        raise ValueError("a regression on a context needs joint positions or tool positions.")
     if chosen:
         write_json(folder / CHOICE, {"models": chosen, "context": columns})
     return metrics

@@ -58,8 +58,8 @@ class PageConfig(AddressConfig):
     until the next sign of life [s].
     """
     timeout: float = 0.6
-    """Time without a sign of life after which everything held is released, and longest time
-    that the page may be busy during a drag [s].
+    """Time without a sign of life from the controlling client after which everything held is
+    released [s]. A browser that is busy for longer loses its drag.
     """
     meshes: bool = True
     """True draws the arm with its meshes, False with capsules. With capsules, a browser without
@@ -84,10 +84,11 @@ class PageConfig(AddressConfig):
             )
 
 
-# Smallest distance between touch points [m]: here, a touch 1 cm off turns the arm by 6 degrees.
+# Smallest distance between touch points [m]. At this distance, an error of 1 cm at one point
+# rotates the overlaid arm by 6 degrees.
 _APART = 0.1
 _PERIOD = 0.04
-"""Period of refreshes, which renew the person's efforts and the scene [s]."""
+"""Period of refreshes [s]. Each posts the person's efforts and redraws the scene."""
 _PANEL_EVERY = 5  # refreshes of the scene per refresh of the panel: text may be slower
 _MOST_FAILURES = 25
 """Number of successive failed refreshes after which the page ends: one second. A failed refresh
@@ -138,8 +139,8 @@ class Page:
             config: Settings of the page.
             boxes: Fixed boxes beyond those of the world.
             task: Description of the task to demonstrate.
-            guides: True if the person guides the end effector and records; False next to an arm
-                that works autonomously.
+            guides: True if the person guides the end effector and records demonstrations;
+                False if the arm works autonomously.
             draws: True if people draw regions, mark targets and turn the end effector; None:
                 same as `guides`. People can always pull in the null space.
         """
@@ -417,9 +418,9 @@ def slow_words(silence: float, lag: float, config: PageConfig) -> str:
     """
     if lag > config.timeout / 2:
         return (
-            f"This browser was busy for {lag:.1f} s: beyond {config.timeout:.1f} s the "
-            "arm lets go. Make its window smaller, hide the virtual twin, or put ?fixedDpr=0.5 "
-            "behind the page's address, which draws a quarter of the pixels."
+            f"This browser was busy for {lag:.1f} s. After {config.timeout:.1f} s the arm "
+            "no longer follows it. Make its window smaller, hide the virtual twin, or put "
+            "?fixedDpr=0.5 behind the page's address, which draws a quarter of the pixels."
         )
     if silence > config.silence:
         return (

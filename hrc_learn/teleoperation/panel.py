@@ -66,7 +66,7 @@ def felt_words(feedback: Feedback) -> list[str]:
     if feedback.near_limits:
         felt.append(f"near their limits: {', '.join(feedback.near_limits)}")
     if feedback.slip >= _LEAST_SLIP:
-        felt.append(f"the object held slips: {1e3 * feedback.slip:.0f} mm")
+        felt.append(f"slip of the held object: {1e3 * feedback.slip:.0f} mm")
     distance = feedback.person_distance
     if distance is not None:
         known = math.isfinite(distance)
@@ -111,7 +111,7 @@ class Panel:
             boxes: Furniture that targets may be marked on.
             forces: Initial gains of gizmos.
             request: Receives the requests of buttons.
-            scene: Scene, whose twin and gizmo the panel sets.
+            scene: Scene, in which the panel shows or hides the virtual twin and the gizmo.
             held: Held gizmos, and the rotation added by the rings of the end effector's gizmo.
             task: Description of the task.
             guides: True if the person guides the end effector and records.
@@ -171,8 +171,8 @@ class Panel:
         fine = self._gui.add_checkbox(
             "Fine turn",
             False,
-            hint="Rings turn the end effector away from the rule: down in front of the robot, "
-            "level at the end of its reach.",
+            hint="By itself the end effector points down near the robot and forward at the end "
+            "of its reach. Rings at the gizmo rotate it from there.",
         )
         fine.on_update(in_loop(lambda _: scene.let_turn(fine.value)))
         gripper = self._gui.add_button_group("Gripper", ("open", "close"))

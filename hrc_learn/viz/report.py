@@ -110,7 +110,7 @@ class Picture:
     caption: str = ""
     narrow: bytes = b""
     """PNG file of a figure for phones, with its panels above one another; drawn together with
-    `png`. Empty for photographs, which dark pages show unchanged."""
+    `png`. Empty for photographs."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):
@@ -209,7 +209,7 @@ def leading(
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
     """Measurements to show first, and the others, both in the order of the table.
 
-    All that missed their targets come first, then others with a target.
+    All that missed their targets are shown first; those that met a target fill up the rest.
 
     Args:
         table: All measurements.

@@ -139,7 +139,7 @@ def test_contexts_are_ends_or_columns(demos, tmp_path):
     middle = LearnedMotion.load(tmp_path / "learned" / "position").at(context=[2.0])
     assert middle.goal[0].item() == pytest.approx(0.3 + 0.25, abs=1e-4)
     fitted = fit_primitives(more, 15, channels=("orientation",))
-    with pytest.raises(ValueError, match="needs the channel joint or position"):
+    with pytest.raises(ValueError, match="needs joint positions or tool positions"):
         keep_best(fitted, more, column, tmp_path, regression_only=True)
     with pytest.raises(ValueError, match=r"episode 0: no column 'observation.mass'"):
         contexts(demos, ("observation.mass",), fitted.motions, "position")

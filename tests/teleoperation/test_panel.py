@@ -104,7 +104,7 @@ def test_what_the_arm_feels_is_said_while_nobody_pushes():
     )
     told = " ".join(words(felt))
     assert told == (
-        "contact: 30 N near their limits: joint4 the object held slips: 4 mm "
+        "contact: 30 N near their limits: joint4 slip of the held object: 4 mm "
         "nearest person: 0.4 m away, pace 30 %"
     )
     # Friction feels like a small force; unknown people are said to be.

@@ -258,7 +258,7 @@ def test_forces_are_said_from_20_n_in_steps_of_5(force, said):
 
 
 @pytest.mark.parametrize(
-    ("slip", "said"), [(0.00099, []), (0.001, ["the object held slips: 1 mm"])]
+    ("slip", "said"), [(0.00099, []), (0.001, ["slip of the held object: 1 mm"])]
 )
 def test_a_slip_is_said_from_a_millimetre(slip, said):
     assert felt_words(Feedback(slip=slip)) == said

@@ -311,8 +311,8 @@ def _pages(content: bytes) -> Iterator[_Page]:
 def _row_group(pages: Sequence[_Page], model: Sequence[_Struct]) -> tuple[int, _Struct] | None:
     """Number of pages and metadata of the next row group; None if it is incomplete.
 
-    A column begins with its dictionary, unless it holds Booleans. Any page of the first column
-    may be its last one.
+    A column begins with its dictionary, unless it holds Booleans. The number of pages of the
+    first column is unknown, so each page is tried as its last one.
     """
     for first in accumulate(page.values for page in pages):
         rows, columns, at = first // model[0][5][1], [], 0
@@ -343,7 +343,7 @@ def _column(model: _Struct, pages: Sequence[_Page]) -> _Struct:
     if pages[0].values:  # no dictionary
         del sizes[11]
     made = {number: (_I64, size) for number, size in sizes.items()}
-    # Plain, levels by run length, and dictionary: the encodings of pyarrow.
+    # The encodings that pyarrow uses: plain values, run lengths and dictionaries.
     return made | {1: model[1], 2: (_LIST, (_I32, [0, 3, 8])), 3: model[3], 4: model[4]}
 
 
