@@ -274,19 +274,24 @@ class ArmRobot(Device, Robot):
 
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
-        if self._person_config.kind != "none":
-            self._invite(self._person_config)
         connected_robots().append(self)
+        try:
+            if self._person_config.kind != "none":
+                self._invite(self._person_config)
+        except BaseException:
+            self.disconnect()
+            raise
 
     @check_if_not_connected
     def disconnect(self) -> None:
         self._loop.end()
         connected_robots().remove(self)
-        self.complement = None
-        if self._page is not None:
-            self._page.close()
-            self._page = None
-        super().disconnect()
+        self.complement, page, self._page = None, self._page, None
+        try:
+            super().disconnect()
+        finally:  # a page that failed raises its error
+            if page is not None:
+                page.close()
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from lerobot.cameras import Camera, CameraConfig, make_cameras_from_configs
 from lerobot.robots import RobotConfig
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.hardware import ArmProcess, FrankyArm, FrankyConfig, Ros2Arm, Ros2Config
@@ -234,7 +235,7 @@ class Ros2Camera(Camera):
         super().__init__(config)
         self.config, self._session = config, None
         self._image: np.ndarray | None = None
-        self._taken_at, self._came = 0.0, threading.Condition()
+        self._taken_at, self._came, self._refused = 0.0, threading.Condition(), ""
 
     @property
     def is_connected(self) -> bool:
@@ -244,11 +245,12 @@ class Ros2Camera(Camera):
     def find_cameras() -> list[dict[str, Any]]:
         return []
 
+    @check_if_already_connected
     def connect(self, warmup: bool = True) -> None:
         """Wait for the first image.
 
         Raises:
-            ConnectionError: No image comes, or its size is not the configured one.
+            ConnectionError: No usable image comes, or its size is not the configured one.
         """
         from sensor_msgs.msg import CompressedImage, Image
 
@@ -256,18 +258,25 @@ class Ros2Camera(Camera):
         kind = CompressedImage if topic.endswith("/compressed") else Image
         self._session = Ros2Session("hrc_camera")
         self._session.node.create_subscription(kind, topic, self._take, quality())
-        shape, wanted = self.read().shape[:2], (self.height, self.width)
-        if shape != wanted:
+        try:
+            height, width = self.read().shape[:2]
+            if (height, width) != (self.height, self.width):
+                text = f"camera {topic} publishes {width}x{height}"
+                raise ConnectionError(f"{text}, not {self.width}x{self.height}: set that size.")
+        except BaseException:
             self.disconnect()
-            text = f"camera {topic} publishes {shape[1]}x{shape[0]}"
-            raise ConnectionError(f"{text}, not {self.width}x{self.height}: set that size.")
+            raise
 
     def _take(self, message: Any) -> None:
         from hrc_learn.demos.recording_messages import image_of
 
-        image = image_of(message)
+        try:
+            image = image_of(message)
+        except ValueError as error:  # it would end the thread of the session
+            self._refused = f" ({error})"
+            return
         with self._came:
-            self._image, self._taken_at = image, time.monotonic()
+            self._image, self._taken_at, self._refused = image, time.monotonic(), ""
             self._came.notify_all()
 
     def read(self) -> np.ndarray:
@@ -278,11 +287,13 @@ class Ros2Camera(Camera):
         """
         return self.async_read(1e3 * self.config.timeout)
 
+    @check_if_not_connected
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
         since = time.monotonic()
         with self._came:
             if not self._came.wait_for(lambda: self._taken_at > since, timeout_ms / 1e3):
                 text = f"no image on {self.config.topic} for {timeout_ms / 1e3:g} s"
+                text += self._refused
                 raise ConnectionError(f"{text}: is the camera's driver running?")
             assert self._image is not None
             return self._image
@@ -296,7 +307,7 @@ class Ros2Camera(Camera):
         age = time.monotonic() - self._taken_at
         if self._image is None or age > max_age_ms / 1e3:
             raise ConnectionError(
-                f"the newest image on {self.config.topic} is {age:.2f} s old."
+                f"the newest image on {self.config.topic} is {age:.2f} s old{self._refused}."
             )
         return self._image
 

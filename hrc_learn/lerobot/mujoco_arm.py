@@ -147,8 +147,6 @@ class MujocoArmRobot(ArmRobot):
         self.name = f"mujoco_{work_arm.name}"  # before LeRobot derives folders from it
         super().__init__(config, work_arm)
         self.config = config
-        self._began = self._looked = 0.0
-        self._marker = (0.0, 0.0, 0.0)
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -202,6 +200,8 @@ class MujocoArmRobot(ArmRobot):
         from hrc_learn.sim import CameraChange, Imperfections
         from hrc_learn.teleoperation.scenarios import ScenarioRun, ScenarioView
 
+        self._began = self._looked = 0.0
+        self._marker, self._rotation = (0.0, 0.0, 0.0), DOWN
         config, images = self.config, self.config.images
         scenario = make_scenario(config.scenario, config.shelf, self.work_arm)
         sizes = Imperfections.nominal().scaled(config.imperfections)
@@ -223,6 +223,7 @@ class MujocoArmRobot(ArmRobot):
 
     def _close(self) -> None:
         self.cameras = {}
+        self.initial_configurations += 1  # `connect` builds another scene
 
     @check_if_not_connected
     def get_observation(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
@@ -148,8 +148,10 @@ def open_device(config: PersonConfig, arm: Arm) -> tuple[Human, RobotPage | None
             return LinkGuide(Gamepad.open(chain), chain), None
         case "keyboard":
             return LinkGuide(TerminalKeyboard.open(chain), chain), None
-        case _:
+        case "scripted":
             return ScriptedPerturbation(chain, ()), None
+    kinds = ", ".join(get_args(PersonKind))
+    raise ValueError(f"person.kind must be one of {kinds}, but is {config.kind!r}.")
 
 
 def scripted_person(chain: SerialChain, seed: int) -> Human:

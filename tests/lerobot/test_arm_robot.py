@@ -1,6 +1,7 @@
 """What LeRobot's names for the values of an arm stand for."""
 
 from functools import cache
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hrc_learn.lerobot.arm_robot import ArmRobot, connected_robots, the_robot
 from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
 from hrc_learn.lerobot.driven_arms import FrankaPandaConfig
 from hrc_learn.lerobot.episode_recording import observation_features
-from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 
 READY = panda.ready.numpy()
@@ -145,6 +146,38 @@ def test_a_robot_is_found_where_it_is_the_only_one(simulated):
     assert connected_robots() == [left, right]
     left.disconnect()
     assert the_robot() is right
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"), [("keyboard", "needs a terminal"), ("webcam", "one of none, scripted")]
+)
+def test_a_robot_whose_person_cannot_be_reached_is_disconnected(
+    tmp_path, monkeypatch, kind, message
+):
+    monkeypatch.setattr("sys.stdin", StringIO())
+    config = MujocoArmRobotConfig(calibration_dir=tmp_path, action_space="ee")
+    config.person.kind = kind
+    robot = MujocoArmRobot(config)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=message):
+            robot.connect()
+        assert not robot.is_connected
+        assert connected_robots() == []
+
+
+def test_a_page_that_has_failed_does_not_leave_the_arm_connected(simulated):
+    pytest.importorskip("viser", reason="the extra `ui` is not installed")
+    robot = simulated(action_space="ee", person=PersonConfig(kind="page"))
+
+    class Failed:
+        def close(self):
+            raise RuntimeError("the page does not follow the arm any more")
+
+    page, robot._page = robot._page, Failed()
+    page.close()
+    with pytest.raises(RuntimeError, match="does not follow"):
+        robot.disconnect()
+    assert not robot.is_connected
 
 
 def test_an_action_of_the_hand_in_part_is_none_of_it():

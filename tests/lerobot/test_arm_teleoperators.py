@@ -212,6 +212,19 @@ def test_home_begins_the_scenario_anew(simulated, served):
     assert robot.run.seed == 4
 
 
+@pytest.mark.simulation
+def test_the_expert_begins_again_with_a_robot_that_is_connected_again(simulated, tmp_path):
+    robot = simulated(scenario="grasping")
+    expert = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
+    expert.connect()
+    first = expert.get_action()
+    for _ in range(20):
+        robot.send_action(expert.get_action())
+    robot.disconnect()
+    robot.connect()
+    assert expert.get_action() == first
+
+
 @pytest.fixture
 def franka(tmp_path):
     with served_franka(tmp_path, joints=READY + 0.3 * np.eye(7)[1]) as served:

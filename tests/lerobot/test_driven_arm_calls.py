@@ -7,6 +7,8 @@ import pytest
 
 pytest.importorskip("lerobot")
 
+from lerobot.utils.errors import DeviceAlreadyConnectedError
+
 from hrc_learn.hardware import FrankyArm, Ros2Config
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import driven_arms
@@ -236,6 +238,26 @@ def test_images_of_another_size_are_refused_with_both(topic, size):
     with pytest.raises(ConnectionError, match=f"publishes {size[0]}x{size[1]}, not 64x48"):
         camera.connect()
     assert topic.closed == 1
+    assert not camera.is_connected
+
+
+def test_a_camera_that_sends_nothing_usable_is_left_disconnected_and_says_why(topic):
+    from sensor_msgs.msg import Image
+
+    camera = camera_of(topic, [])
+    with pytest.raises(ConnectionError, match=r"no image on /front for 2 s: is the camera's"):
+        camera.connect()
+    assert (topic.closed, camera.is_connected) == (1, False)
+    topic.images = [(64, 48)]
+    camera.connect()
+    with pytest.raises(DeviceAlreadyConnectedError):
+        camera.connect()
+    topic.take(Image(height=48, width=64, encoding="32FC1", step=256, data=bytes(48 * 256)))
+    topic.now += 1.0
+    with pytest.raises(ConnectionError, match=r"1\.00 s old \(images of encoding 32FC1 are not"):
+        camera.read_latest()
+    with pytest.raises(ConnectionError, match=r"for 0\.2 s \(images of encoding 32FC1 are not"):
+        camera.async_read()
 
 
 @pytest.mark.parametrize("size", [{"width": 0}, {"height": 0}, {"width": None}])

@@ -157,6 +157,9 @@ def test_what_the_driver_says_is_told(make):
     with pytest.raises(DeviceNotConnectedError, match="no answer on the bus"):
         robot.get_observation()
     robot.disconnect()
+    robot.connect()  # with the cable plugged in again
+    assert robot.get_observation()["a.pos"] == pytest.approx(robot.inner.sent[-1][0])
+    robot.disconnect()
 
 
 @pytest.mark.parametrize(

@@ -307,6 +307,7 @@ class SmoothRobot(Robot):
 
     def connect(self, calibrate: bool = True) -> None:
         self.inner.connect(calibrate)
+        self._error = None
         self.begin()
         if self.config.clock == "wall":
             self._stop.clear()
