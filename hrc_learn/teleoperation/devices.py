@@ -119,7 +119,6 @@ class Gamepad(Human):
         self._chain, self._controller, self._update = chain, controller, update
         self._clock, self._next_pulse = clock, float("-inf")
         self._held: set[int] = set()
-        self._gripper: float | None = None
 
     @classmethod
     def open(cls, chain: SerialChain) -> Gamepad:
@@ -154,12 +153,10 @@ class Gamepad(Human):
             self._held = set()
             return HumanInput()
         pressed = self._pressed()
-        for button, width in ((_LEFT_SHOULDER, OPEN), (_RIGHT_SHOULDER, 0.0)):
-            if button in pressed:
-                self._gripper = width
+        opens = OPEN if _LEFT_SHOULDER in pressed else None
         return HumanInput(
             twist=self._twist(state),
-            gripper=self._gripper,
+            gripper=0.0 if _RIGHT_SHOULDER in pressed else opens,
             requests=tuple(BUTTONS[b] for b in sorted(pressed & BUTTONS.keys())),
         )
 
@@ -262,7 +259,6 @@ class TerminalKeyboard(Human):
             keys: State of the keys.
         """
         self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
-        self._gripper: float | None = None
 
     @classmethod
     def open(cls, chain: SerialChain) -> TerminalKeyboard:
@@ -278,17 +274,17 @@ class TerminalKeyboard(Human):
 
     def read(self, state: ArmState) -> HumanInput:
         """Motion of the end effector, gripper and requests, from keys typed lately."""
-        requests = []
+        requests, gripper = [], None
         for key in self._typed():
             if key in KEYS:
                 requests.append(KEYS[key])
             elif key in _GRIPPER:
-                self._gripper = _GRIPPER[key]
+                gripper = _GRIPPER[key]
             else:
                 self._keys.press(key)
         return HumanInput(
             twist=steering_twist(self._chain, state, self._keys.direction()),
-            gripper=self._gripper,
+            gripper=gripper,
             requests=tuple(requests),
         )
 

@@ -174,6 +174,7 @@ class Page:
             boxes,
             config.forces,
             self.human.request,
+            self.human.grip,
             self._scene,
             held,
             task,
@@ -359,7 +360,6 @@ class Page:
             HumanInput(
                 nullspace_input=command.nullspace_input,
                 twist=command.twist,
-                gripper=panel.gripper,
                 region=None if editor is None else editor.region,
                 target=None if editor is None else editor.target,
                 turn=held.turn_vector,
@@ -381,6 +381,8 @@ class Page:
                 self._wake.set()
             case messages.Ask(request=request):
                 self.human.request(request)
+            case messages.Gripper(width=width):
+                self.human.grip(width)
             case _:
                 loop = self._server.get_event_loop()
                 loop.call_soon_threadsafe(self._panel.hear, message)

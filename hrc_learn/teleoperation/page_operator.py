@@ -270,7 +270,7 @@ class PageHuman(Human):
         self._holds_for, self._clock, self._present = holds_for, clock, present
         # The input and the end of its validity: changed together, as one reference.
         self._posted = (HumanInput(), float("-inf"))
-        self._requests: deque[Request] = deque()
+        self._requests, self._openings = deque[Request](), deque[float](maxlen=1)
         self.state: ArmState | None = None
         self.feedback = Feedback()
 
@@ -282,12 +282,18 @@ class PageHuman(Human):
         """Make a request, which the next `read` returns once."""
         self._requests.append(request)
 
+    def grip(self, width: float) -> None:
+        """Request an opening of the gripper [m], which the next `read` returns once."""
+        self._openings.append(width)
+
     def read(self, state: ArmState) -> HumanInput:
         """Present input of the person. Region, target and turn remain when the rest expires."""
         self.state = state
         asked, deadline = self._posted
         if self._clock() > deadline or not self._present():
             asked = HumanInput(region=asked.region, target=asked.target, turn=asked.turn)
+        if self._openings:
+            asked = replace(asked, gripper=self._openings.pop())
         if not self._requests:
             return asked
         requests = tuple(self._requests.popleft() for _ in range(len(self._requests)))

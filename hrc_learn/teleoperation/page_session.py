@@ -239,6 +239,7 @@ class PageSession:
         if self._jumps:
             self.world.hold(self._workplace.scene.objects[0].name, self._home)
             self.arm.restart()
+            self._width = None  # the gripper is closed again
             return
         now, home = torch.from_numpy(self._opened.arm.read().joint_position), self._home
         way = joint_line(now, torch.from_numpy(home), speed=1.0, dt=_LOOK).numpy()

@@ -86,7 +86,6 @@ class Panel:
     """All controls, and the status above them.
 
     Attributes:
-        gripper: Opening requested by the person [m]; None: not yet requested.
         keys: Keys that are held to move the end effector.
         editor: Region and target that people draw; None: they cannot draw.
     """
@@ -97,6 +96,7 @@ class Panel:
         boxes: Sequence[Box],
         forces: InteractionForceConfig,
         request: Callable[[Request], None],
+        grip: Callable[[float], None],
         scene: PageScene,
         held: HeldGizmos,
         task: str,
@@ -111,6 +111,7 @@ class Panel:
             boxes: Furniture that targets may be marked on.
             forces: Initial gains of gizmos.
             request: Receives the requests of buttons.
+            grip: Receives the openings of the gripper that buttons request [m].
             scene: Scene, in which the panel shows or hides the virtual twin and the gizmo.
             held: Held gizmos, and the rotation added by the rings of the end effector's gizmo.
             task: Description of the task.
@@ -129,7 +130,6 @@ class Panel:
         self._task = self._switch = self._keep = None
         self._next: Request = "start"
         self.keys = KeyboardState()
-        self.gripper: float | None = None
         self._state, self._told = gui.add_html(""), gui.add_html("")
         if guides:
             with gui.add_folder("Demonstration"):
@@ -138,7 +138,7 @@ class Panel:
             self._bars, self._safety = gui.add_html(""), gui.add_html("")
         with gui.add_folder("Arm"):
             if guides:
-                self._add_end_effector(scene)
+                self._add_end_effector(scene, grip)
             twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
             twin.on_update(in_loop(lambda _: scene.show_twin(twin.value)))
             self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
@@ -166,7 +166,7 @@ class Panel:
             group.on_click(in_loop(lambda event, of=requests: request(of[event.target.value])))
             self._keep = self._keep or group  # the first: save and discard
 
-    def _add_end_effector(self, scene: PageScene) -> None:
+    def _add_end_effector(self, scene: PageScene, grip: Callable[[float], None]) -> None:
         """Add the controls that move and turn the end effector and operate the gripper."""
         fine = self._gui.add_checkbox(
             "Fine turn",
@@ -176,7 +176,7 @@ class Panel:
         )
         fine.on_update(in_loop(lambda _: scene.let_turn(fine.value)))
         gripper = self._gui.add_button_group("Gripper", ("open", "close"))
-        gripper.on_click(in_loop(lambda _: self._move_gripper(gripper.value)))
+        gripper.on_click(in_loop(lambda _: grip(OPEN if gripper.value == "open" else 0.0)))
         for key in DIRECTIONS:
             command = self._gui.add_command(
                 f"Move the end effector {_KEYS[key]}",
@@ -187,9 +187,6 @@ class Panel:
             "Keys **I K J L U O** move the end effector away, back, left, right, up, down."
         )
 
-    def _move_gripper(self, word: str) -> None:
-        self.gripper = OPEN if word == "open" else 0.0
-
     @property
     def task(self) -> str:
         """Description of the task."""
@@ -198,8 +195,6 @@ class Panel:
     def hear(self, message: messages.Message) -> None:
         """Handle a message of a headset, like the panel's own controls."""
         match message:
-            case messages.Gripper(width=width):
-                self.gripper = width
             case messages.Task(task=task) if self._task is not None:
                 self._task.value = task
             case messages.Region(centre=centre, half_size=half_size) if self.editor:

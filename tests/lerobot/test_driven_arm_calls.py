@@ -254,9 +254,9 @@ def test_a_camera_that_sends_nothing_usable_is_left_disconnected_and_says_why(to
         camera.connect()
     topic.take(Image(height=48, width=64, encoding="32FC1", step=256, data=bytes(48 * 256)))
     topic.now += 1.0
-    with pytest.raises(ConnectionError, match=r"1\.00 s old \(images of encoding 32FC1 are not"):
+    with pytest.raises(ConnectionError, match=r"1\.00 s old \(images of encoding 32FC1"):
         camera.read_latest()
-    with pytest.raises(ConnectionError, match=r"for 0\.2 s \(images of encoding 32FC1 are not"):
+    with pytest.raises(ConnectionError, match=r"for 0\.2 s \(images of encoding 32FC1"):
         camera.async_read()
 
 

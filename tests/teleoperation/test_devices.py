@@ -152,9 +152,12 @@ def test_shoulder_buttons_open_and_close_the_gripper():
     assert gamepad.read(STATE).gripper is None
     pad.buttons = {9}
     assert gamepad.read(STATE).gripper == 0.08
-    pad.buttons = set()
-    assert gamepad.read(STATE).gripper == 0.08
+    assert gamepad.read(STATE).gripper is None  # a press counts once
     pad.buttons = {10}
+    assert gamepad.read(STATE).gripper == 0.0
+    pad.buttons = set()
+    gamepad.read(STATE)
+    pad.buttons = {9, 10}
     assert gamepad.read(STATE).gripper == 0.0
 
 

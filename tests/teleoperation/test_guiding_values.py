@@ -441,6 +441,9 @@ def test_what_is_posted_holds_for_a_moment():
     assert asked.twist.tolist() == [1] * 6
     assert asked.requests == ("start", "stop")
     assert human.read(reading()).requests == ()
+    for width in (0.08, 0.02):
+        human.grip(width)
+    assert [human.read(reading()).gripper for _ in range(2)] == [0.02, 0.03]
     now[0] = 1.25
     assert human.read(reading()).twist.any()
     now[0] = 1.26

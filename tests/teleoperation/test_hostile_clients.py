@@ -167,20 +167,23 @@ def test_a_view_needs_the_session_of_its_client(session):
     asyncio.run(refused(socket(session.page, "view"), codes=(401,)))
 
 
-def test_a_watcher_leads_at_no_time(session):
-    page = session.page
+def test_a_watcher_leads_at_no_time(session, monkeypatch):
+    page, openings = session.page, []
+    monkeypatch.setattr(page.human, "grip", openings.append)
 
-    async def watch():
-        async with socket(page, secret=page.address.watch_token) as one:
+    async def watch(secret):
+        async with socket(page, secret=secret) as one:
             await one.send(json.dumps({"type": "lead", "wish": "ask"}))
             await one.send(json.dumps({"type": "gripper", "width": 0.0}))
             await one.send(hands())
             states = [json.loads(await one.recv())["status"] for _ in range(3)]
         return states[-1]
 
-    told = asyncio.run(watch())
+    told = asyncio.run(watch(page.address.watch_token))
     assert (told["role"], told["taken"], told["may_lead"]) == ("watches", False, False)
-    assert session.asked.gripper is None
+    assert openings == []
+    assert asyncio.run(watch(page.address.token))["role"] == "leads"
+    assert openings == [0.0]
 
 
 def test_an_error_of_ours_closes_that_client_only(session, monkeypatch):

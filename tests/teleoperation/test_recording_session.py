@@ -144,6 +144,18 @@ def test_the_gripper_is_sent_a_width_once(session, screen):
     assert screen.placed == len(widths) + 3
 
 
+def test_a_gripper_that_home_has_closed_is_opened_again(session, screen):
+    asked = {0: HumanInput(gripper=0.08), 1: request("home"), 2: HumanInput(gripper=0.08)}
+    screen.human.steps = asked
+    held = session.world.config.objects[0].name
+    grips = []
+    for _ in range(60):
+        session.step()
+        grips.append(session.world.holds(held))
+    assert grips[1]
+    assert not grips[-1]
+
+
 def test_each_step_lets_a_control_period_pass_and_every_tenth_is_shown(session, screen, world):
     began = world.time
     run(session, 21)
