@@ -53,7 +53,9 @@ class ControllerNode:
     Attributes:
         session: The node.
         stopped: Reason of the last stop; empty while active.
-        latencies: Times from the arrival of a joint state to its command [s].
+        commands: Number of commands so far.
+        latencies: Times from the arrival of a joint state to its command [s], of the newest
+            100,000 commands.
     """
 
     def __init__(
@@ -78,7 +80,8 @@ class ControllerNode:
         self._safety, self._done = safety or SafetyConfig(), TransitionCallbackReturn
         self.session = Ros2Session("hrc_learn", LifecycleNode)
         self.node: Any = self.session.node
-        self.latencies = deque[float](maxlen=100_000)
+        self.latencies, self.commands = deque[float](maxlen=100_000), 0
+        self._seeing = threading.Lock()  # a step and a feature exclude each other
         self._arm: Ros2Arm | None = None
         self._runner: StepRunner
         self._active, self.stopped = threading.Event(), ""
@@ -225,16 +228,19 @@ class ControllerNode:
         limit = self._value("heartbeat")
         if limit and now - self._heard > limit:
             raise ArmFaultError(f"no heartbeat for {now - self._heard:.2f} s: send ~/heartbeat")
-        if state.time <= last:
+        if state.time == last:
             return last
         values = self._runner.observation
         if last:
             values["dt"][...] = min(max(state.time - last, 1e-3), self._config.silence)
         values["joint_position"][:] = state.joint_position
-        arm.command(self._runner.step())
+        with self._seeing:
+            command = self._runner.step()
+            values["feature_new"][...] = 0
+            self._states.append((state.time, state.joint_position))
+        arm.command(command)
+        self.commands += 1
         self.latencies.append(time.monotonic() - received)
-        values["feature_new"][...] = 0
-        self._states.append((state.time, state.joint_position))
         self._report(now)
         return state.time
 
@@ -292,13 +298,15 @@ class ControllerNode:
 
     def _see(self, pixel: np.ndarray, stamp: float) -> None:
         """Pair a feature with the joint positions at the time of its image."""
-        values, visible = self._runner.observation, np.isfinite(pixel).all()
-        values["feature_visible"][...] = values["feature_new"][...] = visible
-        if visible and self._states:
-            newest = self._states[-1][0]
-            at = min(self._states, key=lambda one: abs(one[0] - (stamp or newest)))
-            values["feature"][:], values["image_joint_position"][:] = pixel, at[1]
-            values["feature_age"][...] = newest - at[0]
+        values = self._runner.observation
+        with self._seeing:
+            visible = len(self._states) > 0 and np.isfinite(pixel).all()
+            values["feature_visible"][...] = values["feature_new"][...] = visible
+            if visible:
+                newest = self._states[-1][0]
+                at = min(self._states, key=lambda one: abs(one[0] - (stamp or newest)))
+                values["feature"][:], values["image_joint_position"][:] = pixel, at[1]
+                values["feature_age"][...] = newest - at[0]
 
     def _on_push(self, message: Any) -> None:
         effort, values = np.array(message.data), self._runner.observation["nullspace_input"]
@@ -364,7 +372,7 @@ class ControllerNode:
         Args:
             recent: Number of newest commands whose latency counts; 0: all.
         """
-        rows = {"commands": float(len(self.latencies))}
+        rows = {"commands": float(self.commands)}
         if hasattr(self, "_runner"):
             counts = map(float, self._runner.state["safety.counts"])
             rows |= {f"safety_{k}": n for k, n in zip(INTERVENTIONS, counts, strict=True)}
