@@ -248,7 +248,7 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
         raise ValueError("demonstration.duration must be positive, and pause not negative.")
     site = replace(settings.site, driver="lerobot")
     robot = ArmChoice(args.robot).arm()
-    names = robot.chain.joint_names
+    names, lerobot = robot.chain.joint_names, site.lerobot
     writer = DatasetWriter(
         args.out,
         fps=config.fps,
@@ -261,7 +261,9 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
     rate = Rate(1 / config.fps)
     with (
         writer,
-        closing(LeaderArm(site.leader, names)) as leader,
+        closing(
+            LeaderArm(site.leader, names, lerobot.unit, lerobot.zeros, lerobot.reversed)
+        ) as leader,
         opened_arm(site, robot.chain) as arm,
         ending_at_rest(arm.stop),
     ):

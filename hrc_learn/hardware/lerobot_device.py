@@ -48,7 +48,7 @@ def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -
         port = getattr(config, "port", None)
         raise ConnectionError(
             f"{place} cannot be reached{f' at {port}' if port else ''} ({in_words(error)}): "
-            "check cable, power and --robot.port (lerobot-find-port names it)."
+            f"check cable, power and --{kind}.port (lerobot-find-port names it)."
         ) from error
     if not device.is_calibrated:
         with suppress(Exception):
@@ -212,19 +212,23 @@ def forget_late_replies(device: Any) -> None:
 class LeaderArm:
     """A teleoperator of LeRobot with the joints of an arm, such as the SO-101 leader."""
 
-    def __init__(self, settings: Mapping[str, Any], joint_names: Sequence[str]):
-        """Connect; the units come from the leader's own calibration.
+    def __init__(self, settings: Mapping[str, Any], joint_names: Sequence[str], *units: Any):
+        """Connect; the ranges come from the leader's own calibration.
+
+        LeRobot sends the values of a leader to its follower unchanged. Therefore both have the
+        same unit, zeros and directions.
 
         Args:
             settings: LeRobot's settings of the teleoperator: type, port, id and others.
             joint_names: Joints of the arm that follows the leader.
+            units: Unit, zeros and reversed joints of the follower, as in `JointUnits.of`.
 
         Raises:
             ValueError: There is no such type, or its joints are different.
             ConnectionError: The leader cannot be reached, or is not calibrated.
         """
         self._device = open_device("teleop", settings)
-        self._units = JointUnits.of(self._device, joint_names)
+        self._units = JointUnits.of(self._device, joint_names, *units)
 
     def read(self) -> tuple[Float[np.ndarray, " joints"], float]:
         """Joint positions [rad], and opening of the gripper's handle as a fraction.

@@ -251,8 +251,8 @@ class Servo:
 class Leader:
     """Turns its first joint, with its handle open by a quarter."""
 
-    def __init__(self, settings, names):
-        self.settings, self.names, self.reads, self.closed = settings, names, 0, False
+    def __init__(self, settings, names, *units):
+        self.settings, self.units, self.reads, self.closed = settings, units, 0, False
         Leader.made = self
 
     def read(self):
@@ -294,7 +294,11 @@ def test_a_follower_is_recorded_after_each_pause(monkeypatch, tmp_path, capsys):
         tmp_path,
         robot="so101",
         episodes=2,
-        config=(*config, "site.device.type=so101_follower", "demonstration.task=turn"),
+        config=(
+            *(*config, "site.device.type=so101_follower", "demonstration.task=turn"),
+            "site.lerobot.zeros.elbow_flex=1.57",
+            'site.lerobot.reversed=["wrist_roll"]',
+        ),
     )
     # 0.31 s at 50 Hz are 16 frames, and 0.2 s another 10 that are not kept.
     assert values == {**values, "episodes": 2, "frames": 32, "missed_ticks": 4}
@@ -302,6 +306,7 @@ def test_a_follower_is_recorded_after_each_pause(monkeypatch, tmp_path, capsys):
     assert Rate.made[-1].ticks == Leader.made.reads == 2 * 26
     assert (follower.stopped, Leader.made.closed) == (1, True)
     assert sites[0].driver == "lerobot"
+    assert Leader.made.units == ("", {"elbow_flex": 1.57}, ("wrist_roll",))  # the follower's
     said = capsys.readouterr().out.splitlines()
     assert [line for line in said if "demonstration " in line and "of" in line] == [
         "demonstration 1 of 2 in 0.2 s",
