@@ -19,7 +19,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
+from hrc_learn.geometry.numerics import check_settings
+from hrc_learn.hardware.driver_process import (
+    ArmFaultError,
+    Connected,
+    checked_velocity,
+    opened_fraction,
+)
 from hrc_learn.hardware.lerobot_device import (
     JointUnits,
     forget_late_replies,
@@ -63,6 +69,12 @@ class LeRobotConfig:
     """Joint positions, in the arm's description, at which LeRobot's values are 0 [rad]."""
     reversed: tuple[str, ...] = ()
     """Joints whose direction in LeRobot is opposite to the direction in the description."""
+
+    def __post_init__(self) -> None:
+        numbers = "rate", "timeout", "silence", "lag", "blocked", "opening"
+        check_settings(self, finite=numbers)
+        if self.unit not in ("", "deg", "rad"):
+            raise ValueError(f"unit must be deg, rad or empty, but is {self.unit!r}.")
 
 
 class LeRobotArm(Connected):
@@ -160,9 +172,13 @@ class LeRobotArm(Connected):
             self._velocity, self._commanded_at = velocity, time.monotonic()
 
     def move(self, width: float) -> None:
-        """Set the opening of the gripper [m], without waiting until it is reached."""
+        """Set the opening of the gripper [m], without waiting until it is reached.
+
+        Raises:
+            ValueError: The opening is NaN.
+        """
         with self._lock:
-            self._share = float(np.clip(width / self.config.opening, 0.0, 1.0))
+            self._share = opened_fraction(width, self.config.opening)
 
     def stop(self) -> None:
         """Let the servos hold the arm at the present commanded positions.

@@ -18,7 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry.numerics import check_settings
-from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
+from hrc_learn.hardware.driver_process import (
+    ArmFaultError,
+    Connected,
+    checked_velocity,
+    opened_fraction,
+)
 from hrc_learn.hardware.lerobot_arm import led_goal
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of, start_guard
 from hrc_learn.kinematics import SerialChain
@@ -27,7 +32,10 @@ from hrc_learn.watchdog import Watchdog
 
 _CLOCK_RESET = 1.0
 """Backward step of the time stamps [s] above which the clock must have been reset. After a
-smaller step, the message was only reordered."""
+smaller step, the message was only reordered, unless no newer one comes for `silence`."""
+_DRIFT = 5e-4
+"""Fastest drift of the robot's clock against this machine's [s/s]: NTP slews a clock by 500 ppm
+at most. What grows faster is a delay of the messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +71,14 @@ class Ros2Config:
     """Position of `gripper_joint` when closed."""
 
     def __post_init__(self) -> None:
-        check_settings(self, finite=("timeout", "silence", "startup", "lag"))
+        check_settings(self, finite=("timeout", "silence", "startup", "lag", "opening"))
+        if self.interface not in ("velocity", "position", "trajectory"):
+            raise ValueError(
+                f"interface must be velocity, position or trajectory, but is {self.interface!r}."
+            )
+        travel = self.gripper_open - self.gripper_closed
+        if not travel or not math.isfinite(travel):
+            raise ValueError("gripper_open and gripper_closed must be finite and different.")
         if bool(self.gripper) != bool(self.gripper_joint):
             raise ValueError(
                 "gripper and gripper_joint belong together: give both, or neither."
@@ -106,10 +121,14 @@ class Ros2Arm(Connected):
 
         self._lock, self._changed = threading.Lock(), threading.Condition()
         self._state: ArmState | None = None
-        self._offset, self.received, self._seen = math.inf, -math.inf, ()
+        self._offset, self.received, self._seen = math.inf, -math.inf, dict[str, float]()
+        self._width = math.nan if config.gripper else 0.0
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
-        self._commanded_at, self._moved_at, self._step = -math.inf, 0.0, config.timeout
+        # Times of the last command and of the last change of the goal, and for how long from
+        # then on the goal moves on at the velocity, and brakes [s].
+        self._commanded_at, self._moved_at = -math.inf, 0.0
+        self._hold = self._brake = 0.0
         node, kind, self._numbers = self.session.node, config.interface, Float64MultiArray
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
         self._hand, once = None, quality(reliable=True)
@@ -133,13 +152,17 @@ class Ros2Arm(Connected):
         atexit.register(self.close)
 
     def _await_state(self) -> None:
+        def complete() -> bool:
+            return self._state is not None and not math.isnan(self._state.gripper_width)
+
         with self._changed:
-            if self._changed.wait_for(lambda: self._state is not None, self.config.startup):
+            if self._changed.wait_for(complete, self.config.startup):
                 return
         why = "is its driver running, and ROS_DOMAIN_ID the same?"
         if self._seen:
-            missing = ", ".join(sorted({*self._names} - {*self._seen}))
-            why = f"{missing} are not among {', '.join(self._seen)}"
+            missing = sorted({*self._names, self.config.gripper_joint} - {*self._seen, ""})
+            why = f"{', '.join(missing)} are not among {', '.join(self._seen)}"
+            why = why if missing else "their positions are missing or not finite"
         topic, longest = self.config.joint_states, self.config.startup
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
 
@@ -154,40 +177,39 @@ class Ros2Arm(Connected):
                 time.sleep(0.02)
 
     def _on_state(self, message: Any) -> None:
-        names, now = message.name, time.monotonic()
-        self._seen = names
-        places = {name: i for i, name in enumerate(names)}
-        if not {*self._names} <= places.keys():
+        config, now, last = self.config, time.monotonic(), self._state
+        missing = [math.nan] * len(message.name)
+        position, speed = (
+            dict(zip(message.name, x if len(x) == len(missing) else missing, strict=True))
+            for x in (message.position, message.velocity)
+        )
+        self._seen |= position
+        opened = position.get(config.gripper_joint, math.nan) - config.gripper_closed
+        if math.isfinite(opened):
+            travel = config.gripper_open - config.gripper_closed
+            self._width = config.opening * opened / travel
+        if not {*self._names} <= position.keys():
             return
-        order = [places[name] for name in self._names]
-        complete = len(message.position) == len(names)
-        position = np.array(message.position if complete else [np.nan] * len(names))[order]
-        stamp, last = stamp_of(message) or now, self._state
-        reordered = last is not None and stamp <= last.time
-        if reordered and last is not None and last.time - stamp > _CLOCK_RESET:
-            reordered, self._offset, last = False, math.inf, None
-        if reordered or not np.isfinite(position).all():
+        q, velocity = (np.array([x[name] for name in self._names]) for x in (position, speed))
+        stamp = stamp_of(message) or now
+        back = -math.inf if last is None else last.time - stamp
+        reset = back > (_CLOCK_RESET if now - self.received <= config.silence else 0.0)
+        if (back >= 0 and not reset) or not np.isfinite(q).all():
             self.ignored += 1
             return
-        velocity = np.array(message.velocity, float)
-        if len(velocity) == len(names) and np.isfinite(velocity[order]).all():
-            velocity = velocity[order]
-        elif last is None:
-            velocity = np.zeros(len(order))
-        else:
-            velocity = (position - last.joint_position) / (stamp - last.time)
-        config, width = self.config, 0.0
-        if config.gripper_joint in places:
-            moved = message.position[places[config.gripper_joint]] - config.gripper_closed
-            width = config.opening * moved / (config.gripper_open - config.gripper_closed)
-        elif last is not None:
-            width = last.gripper_width
+        if reset:
+            self._offset, last = math.inf, None
+        if not np.isfinite(velocity).all():
+            velocity = np.zeros(len(q))
+            if last is not None:
+                velocity = (q - last.joint_position) / (stamp - last.time)
         state = ArmState(
-            time=stamp, joint_position=position, joint_velocity=velocity, gripper_width=width
+            time=stamp, joint_position=q, joint_velocity=velocity, gripper_width=self._width
         )
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
-            self._offset = min(self._offset, now - stamp)
+            drifted = self._offset + _DRIFT * (now - self.received)
+            self._offset = min(drifted, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()
         if config.interface == "position" and self._velocity.any():
@@ -212,9 +234,12 @@ class Ros2Arm(Connected):
         return state
 
     def wait(self, after: float, timeout: float) -> bool:
-        """Wait for a state newer than a given time; False after the timeout [s]."""
+        """Wait for a state newer than a given time; False after the timeout [s].
+
+        A state before that time is newer, too: the clock has been reset.
+        """
         with self._changed:
-            newer = lambda: self._state is not None and self._state.time > after  # noqa: E731
+            newer = lambda: self._state is not None and self._state.time != after  # noqa: E731
             return self._changed.wait_for(newer, timeout)
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
@@ -234,32 +259,28 @@ class Ros2Arm(Connected):
             raise
         self._dog.feed()
         with self._lock:
-            self._send(velocity, state)
             self._commanded_at = time.monotonic()
+            self._send(velocity, state)
 
     def _send(self, velocity: np.ndarray, state: ArmState) -> None:
         """Send a velocity, starting from where the previous one has moved the goal by now."""
         now, config, rest = time.monotonic(), self.config, self.config.timeout
         elapsed = now - self._moved_at
-        if config.interface == "trajectory":
-            # Distance along the last trajectory, as a time at its velocity: the trajectory
-            # keeps the velocity for its step, then brakes.
-            coast = np.clip(elapsed - self._step, 0, rest)
-            moved = min(elapsed, self._step) + coast * (1 - 0.5 * coast / rest)
-        else:
-            # The arm has waited at the last position: a sudden catch-up would be a jump.
-            held = min(now, self._commanded_at + rest) - self._moved_at
-            moved = np.clip(held, 0, rest / 3)
+        # Distance that the goal has moved since, as a time at the previous velocity.
+        coast = np.clip(elapsed - self._hold, 0, self._brake)
+        moved = min(elapsed, self._hold) + coast * (1 - 0.5 * coast / rest)
         here, limits = state.joint_position, self._chain.limits
         goal = here if self._goal is None else self._goal + moved * self._velocity
         bounds = (here, config.lag, limits.lower.numpy(), limits.upper.numpy())
         self._goal = goal = led_goal(goal, *bounds)
         self._velocity, self._moved_at = velocity, now
         if config.interface == "trajectory":
-            self._step = float(np.clip(elapsed, 1e-3, rest))
-            ahead = led_goal(goal + self._step * velocity, *bounds)
+            self._hold, self._brake = float(np.clip(elapsed, 1e-3, rest)), rest
+            ahead = led_goal(goal + self._hold * velocity, *bounds)
             self._commands.publish(self._trajectory(ahead, velocity))
         else:
+            # The arm has waited at the last position: a sudden catch-up would be a jump.
+            self._hold = float(np.clip(self._commanded_at + rest - now, 0, rest / 3))
             values = velocity if config.interface == "velocity" else goal
             self._commands.publish(self._numbers(data=values.tolist()))
 
@@ -268,7 +289,7 @@ class Ros2Arm(Connected):
         from rclpy.duration import Duration
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-        step, rest = self._step, self.config.timeout
+        step, rest = self._hold, self.config.timeout
         end = goal + 0.5 * rest * velocity
         message: Any = JointTrajectory(joint_names=list(self._names))
         message.header.stamp = self.session.node.get_clock().now().to_msg()
@@ -279,11 +300,15 @@ class Ros2Arm(Connected):
         return message
 
     def move(self, width: float) -> None:
-        """Set the opening of the gripper [m], if there is one."""
+        """Set the opening of the gripper [m], if there is one.
+
+        Raises:
+            ValueError: The opening is NaN.
+        """
         config = self.config
         if self._hand is None:
             return
-        share = float(np.clip(width / config.opening, 0.0, 1.0))
+        share = opened_fraction(width, config.opening)
         travel = config.gripper_open - config.gripper_closed
         self._hand.publish(self._numbers(data=[config.gripper_closed + share * travel]))
 

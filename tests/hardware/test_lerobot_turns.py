@@ -181,6 +181,22 @@ def test_the_gripper_opens_by_its_share_of_the_opening(servos, connect):
         assert servos.goals[-1]["gripper.pos"] == pytest.approx(percent)
     servos.turn()
     assert arm.read().gripper_width == 0.0
+    with pytest.raises(ValueError, match="width of the gripper must be a number"):
+        arm.move(math.nan)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        *(({name: 0.0}, f"{name} must be positive") for name in ("rate", "opening", "lag")),
+        ({"blocked": math.nan}, "blocked must be positive and finite"),
+        ({"timeout": math.inf}, "timeout must be positive and finite"),
+        ({"unit": "grad"}, "unit must be deg, rad or empty, but is 'grad'"),
+    ],
+)
+def test_settings_are_checked(settings, message):
+    with pytest.raises(ValueError, match=message):
+        LeRobotConfig(**settings)
 
 
 def test_a_joint_that_stays_behind_is_not_wound_up_and_stops_the_arm(servos, connect):
@@ -415,7 +431,7 @@ def test_a_device_that_cannot_be_used_says_why(monkeypatch, kind):
         open_it()
     assert device.gone == [1]
     device.error = OSError("two\nlines")
-    text = rf"--{kind}.type=x cannot be reached at /dev/a \(two lines\): check cable"
+    text = rf"--{kind}.type=x cannot be reached at /dev/a \(two lines\): check .*--{kind}.port "
     with pytest.raises(ConnectionError, match=text):
         open_it()
     config.port = None
@@ -440,6 +456,13 @@ def test_a_leader_arm_gives_radians_and_the_fraction_of_its_handle(monkeypatch):
     assert fraction == pytest.approx(0.3)
     leader.close()
     assert servos.gone == 1
+    zeros, backwards = {NAMES[1]: 0.5}, NAMES[1:2]
+    units = JointUnits.of(servos, NAMES, "", zeros, backwards)  # of the follower
+    leader = lerobot_device.LeaderArm({"type": "so101_leader"}, NAMES, "", zeros, backwards)
+    position, fraction = leader.read()
+    assert position[1] == pytest.approx(0.5 - math.pi / 6)
+    asked = units.action(position, fraction)
+    assert asked == pytest.approx(servos.get_action())
 
 
 def test_closing_ends_the_thread_and_disconnects(servos):

@@ -275,6 +275,57 @@ def test_a_gripper_is_read_from_its_joint_and_led_within_its_travel(graph):
     assert graph.sent[-1] == (topic, message)
 
 
+def test_a_gripper_with_messages_of_its_own_is_read_and_missed(graph):
+    hand = {"gripper": "/hand", "gripper_joint": "knuckle", "startup": 0.01}
+    with pytest.raises(
+        ConnectionError, match=f"knuckle are not among {NAMES[0]}, .*{NAMES[6]}$"
+    ):
+        position_arm(graph, **hand)
+    graph.greeting = [(10.0, [0.03], (), ["knuckle"]), (10.01, READY)]
+    arm = position_arm(graph, **hand)
+    assert arm.read().gripper_width == pytest.approx(0.06)
+    for angle in (0.01, np.nan):
+        graph.state(10.02, [angle], (), ["knuckle"])
+    graph.state(10.03, READY)
+    assert arm.read().gripper_width == pytest.approx(0.02)
+    with pytest.raises(ValueError, match="width of the gripper must be a number"):
+        arm.move(np.nan)
+    graph.greeting = [(10.0, [*READY[:6], np.nan])]
+    with pytest.raises(ConnectionError, match="positions are missing or not finite"):
+        position_arm(graph, startup=0.01)
+
+
+def test_a_clock_that_steps_back_by_less_than_a_second_is_followed(graph):
+    """As NTP sets a clock that is more than 0.128 s off."""
+    arm = position_arm(graph)
+    for k in range(50):
+        graph.now += 0.02
+        graph.state(10.0 + 0.02 * k - 0.5 * (k > 10), READY + k)
+    state = arm.read()
+    assert state.time == pytest.approx(10.48)
+    assert arm.ignored <= 12  # for as long as a silence
+    assert state.joint_position[0] == pytest.approx(READY[0] + 49)
+    graph.now += 0.19
+    arm.read()
+    for _ in range(30):  # a driver that hangs repeats its last state
+        graph.now += 0.02
+        graph.state(10.48, READY)
+    with pytest.raises(ArmFaultError, match=r"is 0\.79 s old"):
+        arm.read()
+
+
+@pytest.mark.parametrize("drift", [-3e-4, 3e-4])
+def test_a_clock_that_drifts_does_not_make_states_old(graph, drift):
+    arm = position_arm(graph)
+    for k in range(1, 1000):
+        graph.now += 1.0
+        graph.state(10.0 + k * (1 - drift), READY)
+        arm.read()
+    graph.now += 0.21
+    with pytest.raises(ArmFaultError, match=r"is 0\.21 s old"):
+        arm.read()
+
+
 def test_a_newer_state_is_waited_for(graph):
     arm = position_arm(graph)
     assert not arm.wait(10.0, 0.01)
@@ -294,6 +345,9 @@ def test_a_newer_state_is_waited_for(graph):
         ({"silence": np.inf}, "silence must be positive"),
         ({"gripper": "/g"}, "belong together"),
         ({"gripper_joint": "g"}, "belong together"),
+        ({"opening": 0.0}, "opening must be positive"),
+        ({"gripper_closed": 0.04}, "gripper_open and gripper_closed must be"),
+        ({"gripper_open": np.nan}, "gripper_open and gripper_closed must be"),
     ],
 )
 def test_settings_are_checked(settings, message):
@@ -317,13 +371,13 @@ def test_limits_of_time_are_exclusive(graph):
 
 
 def test_states_are_the_newest_and_commands_arrive(graph):
+    graph.greeting = [(10.0, [*READY, 0.0], (), (*NAMES, "knuckle"))]
     arm = position_arm(graph, gripper="/hand", gripper_joint="knuckle")
     assert qualities_of(graph) == {
         STATES: (False, False),
         COMMANDS: (True, False),
         "/hand": (True, False),
     }
-    assert arm.read().gripper_width == 0.0  # its joint has not been seen
     arm.close()
     assert graph.closed
     assert 0.05 in graph.sleeps  # for the last message to leave
