@@ -74,7 +74,7 @@ class Ros2Config:
         check_settings(self, finite=("timeout", "silence", "startup", "lag", "opening"))
         if self.interface not in ("velocity", "position", "trajectory"):
             raise ValueError(
-                f"interface must be velocity, position or trajectory, but is {self.interface!r}."
+                f"interface must be velocity, position or trajectory, not {self.interface!r}."
             )
         travel = self.gripper_open - self.gripper_closed
         if not travel or not math.isfinite(travel):
