@@ -6,7 +6,7 @@ LeRobot finds policy and processors in the module of the configuration.
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from hrc_learn.lerobot.policy.contextual_motion import (
     fit_closed_form,
 )
 from hrc_learn.lerobot.policy.observation_encoder import Observation
-from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig
+from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig, Statistics
 
 __all__ = ["DMPConfig", "DMPPolicy", "make_dmp_pre_post_processors", "write_closed_form_policy"]
 
@@ -92,41 +92,16 @@ class DMPPolicy(MotionPolicy):
     name = "dmp"  # pyright: ignore[reportAssignmentType]
     config: DMPConfig
 
-    def __init__(
-        self,
-        config: DMPConfig,
-        dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
-        dataset_meta: Any = None,
-        **_: Any,
-    ):
-        """Build the policy and, given a dataset, fit it in closed form.
-
-        A loaded policy takes its statistics and weights from the checkpoint instead.
-
-        Args:
-            config: Configuration with known features.
-            dataset_stats: Statistics for whitening the numbers.
-            dataset_meta: `LeRobotDatasetMetadata` with the frame rate and, if the dataset is on
-                disk, the folder of the demonstrations.
-
-        Raises:
-            ValueError: The policy cannot work with the features, the frame rate is unknown or
-                differs from the dataset's, or the demonstrations cannot be fitted.
-        """
-        super().__init__(config, dataset_meta)
+    def _build(self, stats: Statistics | None) -> None:
         self.motion = ContextualMotion(
-            response_of(SpringDamper(), GaussianBasis(count=config.n_basis)),
+            response_of(SpringDamper(), GaussianBasis(count=self.config.n_basis)),
             len(self.encoding.mean),
             context=sum(self.encoder.widths.values()),
             features=2 * self.encoder.size,
-            hidden=config.hidden_dim,
+            hidden=self.config.hidden_dim,
         )
         self.left_out_error = math.nan
         """Cross-validated error of the closed form, relative to the spread of the actions."""
-        if config.pretrained_path is None:
-            self._whiten(dataset_stats, dataset_meta)
-            self._fit_dataset(dataset_meta)
-        self.reset()
 
     def reset(self) -> None:
         """Forget the present motion: an episode begins."""

@@ -33,7 +33,7 @@ from hrc_learn.lerobot.policy.motion_chunks import (
     Plans,
 )
 from hrc_learn.lerobot.policy.observation_encoder import Observation, divisors
-from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig
+from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig, Statistics
 
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
@@ -159,28 +159,8 @@ class MotionChunkPolicy(MotionPolicy):
     """Root mean square velocity of the demonstrated states, whitened [1/s]; empty if velocities
     are not used."""
 
-    def __init__(
-        self,
-        config: MotionChunkConfig,
-        dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
-        dataset_meta: Any = None,
-        **_: Any,
-    ):
-        """Build the policy and, given a dataset, fit its linear part in closed form.
-
-        A loaded policy takes its statistics and weights from the checkpoint instead.
-
-        Args:
-            config: Configuration with known features.
-            dataset_stats: Statistics for whitening the numbers.
-            dataset_meta: `LeRobotDatasetMetadata` with the frame rate and, if the dataset is on
-                disk, the folder of the demonstrations.
-
-        Raises:
-            ValueError: The policy cannot work with the features, the frame rate is unknown or
-                differs from the dataset's, or statistics are missing.
-        """
-        super().__init__(config, dataset_meta)
+    def _build(self, stats: Statistics | None) -> None:
+        config = self.config
         widths, width = self.encoder.widths, len(self.encoding.mean)
         states = config.state_names if OBS_STATE in widths else None
         # Rotation vectors in the state are encoded like those of actions, so they do not jump.
@@ -189,8 +169,8 @@ class MotionChunkPolicy(MotionPolicy):
         self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
         moving = widths.get(OBS_STATE, 0) if config.history else 0
         self.register_buffer("velocity_spread", torch.ones(moving))
-        if config.pretrained_path is None:
-            self._whiten(dataset_stats, dataset_meta)
+        if stats is not None:
+            self._find_levels(stats)
         config.two_level_actions = config.two_level_actions or []
         self._stepped = sorted(config.two_level_actions)
         if not set(self._stepped) < set(range(width)):
@@ -214,9 +194,6 @@ class MotionChunkPolicy(MotionPolicy):
             dropout=config.dropout,
         )
         self.motion = ContinuedMotion(self.decoder, self._compose)
-        if config.pretrained_path is None:
-            self._fit_dataset(dataset_meta)
-        self.reset()
 
     def supports_rtc(self) -> bool:
         """True: chunks continue the leftover actions exactly, without guidance."""
@@ -420,11 +397,8 @@ class MotionChunkPolicy(MotionPolicy):
         coordinates[..., self._stepped] = low + upper * (high - low)
         return self.encoding.to_actions(coordinates)
 
-    def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
-        """Set spreads, levels and two-level columns from a dataset's statistics."""
-        super()._whiten(stats, dataset_meta)
-        if stats is None:
-            return
+    def _find_levels(self, stats: Statistics) -> None:
+        """Set levels and two-level columns from a dataset's statistics."""
         mean, std, low, high = (
             torch.as_tensor(stats[ACTION][k]).to(self.encoding.mean)
             for k in ("mean", "std", "min", "max")

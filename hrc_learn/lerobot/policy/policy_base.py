@@ -29,6 +29,9 @@ from hrc_learn.lerobot.policy.observation_encoder import Observation, Observatio
 
 logger = logging.getLogger(__name__)
 
+Statistics = Mapping[str, Mapping[str, Any]]
+"""Mean, spread, minimum and maximum of each feature of a dataset, by key."""
+
 
 @dataclass
 class MotionPolicyConfig(PreTrainedConfig):
@@ -145,16 +148,27 @@ class MotionPolicy(PreTrainedPolicy):
     measured: Int[Tensor, "A"]
     """State columns that measure the action's components; -1: not measured."""
 
-    def __init__(self, config: MotionPolicyConfig, dataset_meta: Any = None):
-        """Make the encoders of observations and actions.
+    def __init__(
+        self,
+        config: MotionPolicyConfig,
+        dataset_stats: Statistics | None = None,
+        dataset_meta: Any = None,
+        **_: Any,
+    ):
+        """Build the policy and, given a dataset, fit it in closed form.
+
+        A loaded policy takes its statistics and weights from the checkpoint instead.
 
         Args:
             config: Configuration with known features.
-            dataset_meta: `LeRobotDatasetMetadata` with the frame rate.
+            dataset_stats: Statistics for whitening the numbers.
+            dataset_meta: `LeRobotDatasetMetadata` with the frame rate and, if the dataset is on
+                disk, the folder of the demonstrations.
 
         Raises:
-            ValueError: The policy cannot work with the features, or the frame rate is unknown
-                or differs from the dataset's.
+            ValueError: The policy cannot work with the features, the frame rate is unknown or
+                differs from the dataset's, statistics are missing, or the demonstrations
+                cannot be fitted.
         """
         super().__init__(config)
         config.validate_features()
@@ -178,6 +192,21 @@ class MotionPolicy(PreTrainedPolicy):
         self.encoding = ActionEncoding(width, rotation_triples(names))
         columns = matched_columns(names, states, (width, widths.get(OBS_STATE, 0)))
         self.register_buffer("measured", torch.tensor(columns))
+        if config.pretrained_path is not None:
+            self._build(None)
+        else:
+            self._whiten(dataset_stats, dataset_meta)
+            self._build(dataset_stats)
+            self._fit_dataset(dataset_meta)
+        self.reset()
+
+    @abstractmethod
+    def _build(self, stats: Statistics | None) -> None:
+        """Make the network, after the encoders.
+
+        Args:
+            stats: Statistics of the dataset; None: unknown, or loaded with the weights.
+        """
 
     def get_optim_params(self) -> Any:
         """All parameters, in one group."""
@@ -217,7 +246,7 @@ class MotionPolicy(PreTrainedPolicy):
                 which = ", ".join(names[i] if names else str(i) for i in bad)
                 raise ValueError(f"{key} is not finite in {which}: check the sensor")
 
-    def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
+    def _whiten(self, stats: Statistics | None, dataset_meta: Any) -> None:
         """Set means and spreads from a dataset's statistics.
 
         Raises:
@@ -280,7 +309,7 @@ def frame_rate(config: MotionPolicyConfig, dataset_meta: Any) -> float:
 
 
 def _require_statistics(
-    stats: Mapping[str, Mapping[str, Any]], key: str, width: int, names: tuple[str, ...]
+    stats: Statistics, key: str, width: int, names: tuple[str, ...]
 ) -> None:
     for name in names:
         if name not in stats.get(key, {}):
