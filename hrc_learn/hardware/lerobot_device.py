@@ -17,6 +17,8 @@ from jaxtyping import Float
 GRIPPER = "gripper.pos"
 """Name of a gripper's value in LeRobot: 0 to 100 % of its calibrated range."""
 _ATTEMPTS = 3
+_LONG = {"robot": "robot", "teleop": "teleoperator"}
+"""LeRobot's names of packages, classes and functions for the two kinds of options."""
 _STATUS_REGISTERS = ("Status", "Hardware_Error_Status")
 """Registers of Feetech and Dynamixel servos, 0 without a fault."""
 
@@ -33,12 +35,11 @@ def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -
         ConnectionError: The device cannot be reached, or is not calibrated.
         ModuleNotFoundError: LeRobot or the maker's SDK is not installed.
     """
-    config = _config(kind, settings)
-    package = import_module(f"lerobot.{'robots' if kind == 'robot' else 'teleoperators'}")
-    maker = "make_robot_from_config" if kind == "robot" else "make_teleoperator_from_config"
+    config, long = _config(kind, settings), _LONG[kind]
     place = f"--{kind}.type={settings['type']}"
     try:
-        device = _connected(getattr(import_module(f"{package.__name__}.utils"), maker), config)
+        utils = import_module(f"lerobot.{long}s.utils")
+        device = _connected(getattr(utils, f"make_{long}_from_config"), config)
     except ImportError as error:
         raise ModuleNotFoundError(
             f"{place} needs its maker's SDK: pip install 'lerobot[feetech]' (or [dynamixel]); "
@@ -79,9 +80,8 @@ def _config(kind: str, settings: Mapping[str, Any]) -> Any:
     """Configuration of a device, as an instance of LeRobot's own class."""
     import_module("lerobot")  # without LeRobot, the error should name it
     draccus = import_module("draccus")
-    folder = "robots" if kind == "robot" else "teleoperators"
-    package = import_module(f"lerobot.{folder}")
-    base = package.RobotConfig if kind == "robot" else package.TeleoperatorConfig
+    package = import_module(f"lerobot.{_LONG[kind]}s")
+    base = getattr(package, f"{_LONG[kind].capitalize()}Config")
     wanted = settings.get("type")
     if not isinstance(wanted, str):
         raise ValueError(f"--{kind}.type is missing: such as --{kind}.type=so101_follower")

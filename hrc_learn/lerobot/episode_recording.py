@@ -98,27 +98,21 @@ def record_expert(
         RuntimeError: More demonstrations fail than succeed.
     """
     robot, expert = MujocoArmRobot(config), ArmExpert(ArmExpertConfig())
-    with new_dataset(folder, robot) as dataset:
-        robot.connect()
-        expert.connect()
-        try:
-            written = failed = 0
-            while written < episodes:
-                if written + failed:
-                    robot.begin(robot.run.seed + 1)
-                succeeded = _show(robot, expert, dataset)
-                if succeeded:
-                    dataset.save_episode()
-                    written += 1
-                else:
-                    dataset.clear_episode_buffer()
-                    failed += 1
-                yield written, succeeded
-                if failed > max(3, written):
-                    raise RuntimeError(f"{failed} of {failed + written} demonstrations failed.")
-        finally:
-            expert.disconnect()
-            robot.disconnect()
+    with new_dataset(folder, robot) as dataset, robot, expert:
+        written = failed = 0
+        while written < episodes:
+            if written + failed:
+                robot.begin(robot.run.seed + 1)
+            succeeded = _show(robot, expert, dataset)
+            if succeeded:
+                dataset.save_episode()
+                written += 1
+            else:
+                dataset.clear_episode_buffer()
+                failed += 1
+            yield written, succeeded
+            if failed > max(3, written):
+                raise RuntimeError(f"{failed} of {failed + written} demonstrations failed.")
 
 
 def _show(robot: MujocoArmRobot, expert: ArmExpert, dataset: LeRobotDataset) -> bool:
@@ -217,13 +211,9 @@ def record_rollouts(
     """
     robot = MujocoArmRobot(config)
     leader = CheckpointPolicy(policy, robot)
-    with new_dataset(folder, robot) as dataset:
-        robot.connect()
-        try:
-            for k in range(episodes):
-                for observation, action in roll_out(robot, leader, config.seed + k):
-                    add_frame(dataset, observation, action, robot.run.scenario.task)
-                dataset.save_episode()
-                yield robot.run.succeeded()
-        finally:
-            robot.disconnect()
+    with new_dataset(folder, robot) as dataset, robot:
+        for k in range(episodes):
+            for observation, action in roll_out(robot, leader, config.seed + k):
+                add_frame(dataset, observation, action, robot.run.scenario.task)
+            dataset.save_episode()
+            yield robot.run.succeeded()

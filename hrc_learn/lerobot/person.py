@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -101,9 +100,9 @@ class RobotPage:
         from hrc_learn.sim.workplace import Workplace
         from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 
-        self._served, self._ghost = ExitStack(), World(Workplace.of(arm).scene)
+        self._ghost = World(Workplace.of(arm).scene)
         page = Page(self._ghost, PageConfig(host=host, port=port), guides=guides)
-        self.page = self._served.enter_context(page)
+        self.page = page.__enter__()
         self.page.show(PageStatus(title="LeRobot", note=note))
 
     def show(self, driver: Driver, world: World | None) -> None:
@@ -121,7 +120,7 @@ class RobotPage:
 
     def close(self) -> None:
         """Stop serving the page."""
-        self._served.close()
+        self.page.__exit__(None, None, None)
 
 
 def open_device(config: PersonConfig, arm: Arm) -> tuple[Human, RobotPage | None]:
