@@ -332,8 +332,7 @@ class Touch(Human):
         dt = state.time - self._time
         if dt < 0:  # the simulation was restarted
             self._restart()
-            dt = math.inf
-        if math.isinf(dt):
+        if not 0 <= dt < math.inf:
             dt = self._config.smoothing
         config, q = self._config, torch.from_numpy(state.joint_position)
         origins, jacobian = self._chain.joint_origins_and_jacobian(q)
@@ -351,7 +350,7 @@ class Touch(Human):
         self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
         if self.place == "hand" and not meets:
             self._pushed = self._time
-        if self._nobody_touches():
+        if self._nobody_touches() and dt > 0:  # zero: the same reading again
             self._bias.follow(arm.jacobian, state.joint_velocity, state.external_torque, dt)
         return HumanInput(
             nullspace_input=self._nullspace_input(arm) if self.place == "elbow" else still,

@@ -295,6 +295,21 @@ def test_who_leans_on_the_hand_for_long_is_taken_for_a_load():
     assert not leaned_on(touch, (0.0, 0.0, -20.0), 15.0).pause
 
 
+def test_a_reading_that_comes_twice_counts_once():
+    """As of an arm that is read faster than it reports, or whose clock stands still."""
+    once, twice, rng = Touch(panda), Touch(panda), np.random.default_rng(0)
+    for k in range(60):
+        here = reading(
+            0.01 * k, rng.normal(size=7) + (k > 30) * np.array([0, 0, 0, 20, 0, 0, 0])
+        )
+        expected, _ = once.read(here), twice.read(here)
+        np.testing.assert_array_equal(
+            twice.read(here).nullspace_input, expected.nullspace_input
+        )
+    assert once.place != "nothing"
+    np.testing.assert_array_equal(twice.force, once.force)
+
+
 def test_a_clock_that_is_set_back_is_that_of_another_run():
     touch = Touch(panda)
     assert leaned_on(touch, (0.0, 0.0, -20.0), 2.0).pause
