@@ -272,7 +272,7 @@ class DemonstrationRecorder:
         """Save an open demonstration if it has a motion, and wait until all is on disk."""
         if self.state != "ready":  # as after a signal: do not lose the motion
             self._insists = True
-            self._save(task=self._task() or UNNAMED)
+            self._save(task=self._task().strip() or UNNAMED)
         wait(self._writing)
 
     @property
@@ -325,7 +325,7 @@ class DemonstrationRecorder:
             # Long demonstrations take longer to write, so their drafts become rarer.
             self._draft_due = now + max(_DRAFT_EVERY, self._quality.seconds / 10)
             if not self._quality.worthless():
-                frames, task = self._frames[:], self._task() or UNNAMED
+                frames, task = self._frames[:], self._task().strip() or UNNAMED
                 self._draft = self._thread.submit(self._write_draft, frames, task)
 
     def _forget(self) -> None:

@@ -108,6 +108,16 @@ def test_a_demonstration_that_is_open_when_the_program_is_ended_is_kept(folder, 
     assert len(demo) == (18 if last == "start" else 9)
 
 
+@pytest.mark.parametrize("task", ["", "  "])
+def test_an_open_demonstration_without_a_name_is_kept_at_the_end(folder, task):
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    with DemonstrationRecorder(writer, lambda: task) as recorder:
+        recorder.handle("start")
+        record(recorder, 0, 9)
+    (demo,) = load_demos(folder)
+    assert demo.task == UNNAMED
+
+
 def test_what_does_not_move_or_has_no_name_is_not_saved(folder):
     task = [" "]
     writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
