@@ -244,7 +244,9 @@ def _points(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     frames = np.arange(len(values))
     if len(values) <= _MOST_POINTS:
         return frames, values
-    stretches = np.array_split(frames, _MOST_POINTS // 2)
-    ends = [(part[values[part].argmin()], part[values[part].argmax()]) for part in stretches]
+    # NaN is no extreme; a section without any number remains a gap.
+    low, high = (np.where(np.isnan(values), end, values) for end in (np.inf, -np.inf))
+    sections = np.array_split(frames, _MOST_POINTS // 2)
+    ends = [(part[low[part].argmin()], part[high[part].argmax()]) for part in sections]
     chosen = np.unique(ends)
     return chosen, values[chosen]

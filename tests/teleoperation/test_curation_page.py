@@ -252,6 +252,11 @@ def test_curves_of_long_episodes_lose_no_spike():
     assert len(points) <= 2000
     assert max(points) == 7.0
     assert frames[points.argmax()] == 54_321
+    values[54_300], values[70_000:80_000] = np.nan, np.nan  # a sensor that falls out
+    frames, points = _points(values)
+    assert np.nanmax(points) == 7.0
+    assert np.isnan(points[(frames > 70_500) & (frames < 79_500)]).all()
+    assert np.isfinite(points[frames < 70_000]).all()
 
 
 def test_decisions_are_kept_at_once_and_taken_back(page, client):
