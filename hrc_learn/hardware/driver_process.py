@@ -93,17 +93,6 @@ def checked_velocity(
     return np.clip(velocity, -fastest, fastest)
 
 
-def opened_fraction(width: float, opening: float) -> float:
-    """Fraction of a gripper's largest opening, 0 to 1, for a requested width [m].
-
-    Raises:
-        ValueError: The width is NaN.
-    """
-    if math.isnan(width):
-        raise ValueError("width of the gripper must be a number [m], but is nan.")
-    return float(np.clip(width / opening, 0.0, 1.0))
-
-
 @final
 class DriverProcess:
     """Starts the process of a driver and calls it, from any thread.

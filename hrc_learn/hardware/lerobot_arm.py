@@ -20,12 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry.numerics import check_settings
-from hrc_learn.hardware.driver_process import (
-    ArmFaultError,
-    Connected,
-    checked_velocity,
-    opened_fraction,
-)
+from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
 from hrc_learn.hardware.lerobot_device import (
     JointUnits,
     forget_late_replies,
@@ -321,3 +316,14 @@ def led_goal(
     """
     goal = np.clip(goal, here - lag, here + lag)
     return np.clip(goal, np.minimum(lower, here), np.maximum(upper, here))
+
+
+def opened_fraction(width: float, opening: float) -> float:
+    """Fraction of a gripper's largest opening, 0 to 1, for a requested width [m].
+
+    Raises:
+        ValueError: The width is NaN.
+    """
+    if math.isnan(width):
+        raise ValueError("width of the gripper must be a number [m], but is nan.")
+    return float(np.clip(width / opening, 0.0, 1.0))

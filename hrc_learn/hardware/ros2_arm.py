@@ -18,13 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry.numerics import check_settings
-from hrc_learn.hardware.driver_process import (
-    ArmFaultError,
-    Connected,
-    checked_velocity,
-    opened_fraction,
-)
-from hrc_learn.hardware.lerobot_arm import led_goal
+from hrc_learn.hardware.driver_process import ArmFaultError, Connected, checked_velocity
+from hrc_learn.hardware.lerobot_arm import led_goal, opened_fraction
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of, start_guard
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
@@ -152,11 +147,8 @@ class Ros2Arm(Connected):
         atexit.register(self.close)
 
     def _await_state(self) -> None:
-        def complete() -> bool:
-            return self._state is not None and not math.isnan(self._state.gripper_width)
-
         with self._changed:
-            if self._changed.wait_for(complete, self.config.startup):
+            if self._changed.wait_for(lambda: self._state is not None, self.config.startup):
                 return
         why = "is its driver running, and ROS_DOMAIN_ID the same?"
         if self._seen:
@@ -188,7 +180,7 @@ class Ros2Arm(Connected):
         if math.isfinite(opened):
             travel = config.gripper_open - config.gripper_closed
             self._width = config.opening * opened / travel
-        if not {*self._names} <= position.keys():
+        if not {*self._names} <= position.keys() or math.isnan(self._width):
             return
         q, velocity = (np.array([x[name] for name in self._names]) for x in (position, speed))
         stamp = stamp_of(message) or now

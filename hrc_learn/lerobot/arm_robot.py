@@ -230,6 +230,8 @@ class ArmRobot(Device, Robot):
         judged: True if the arm's motion may be recorded: warnings of poor quality are given.
     """
 
+    in_real_time = True
+    """True if the arm keeps moving while the loop is late."""
     complement: ComplementaryMotion | None = None
     _page: RobotPage | None = None
 
@@ -348,11 +350,6 @@ class ArmRobot(Device, Robot):
     @abstractmethod
     def servo(self) -> PositionServo:
         """Position servo of the arm."""
-
-    @property
-    def in_real_time(self) -> bool:
-        """True if the arm keeps moving while the loop is late."""
-        return True
 
     @property
     def world(self) -> World | None:

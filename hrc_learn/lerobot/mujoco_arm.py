@@ -140,6 +140,7 @@ class MujocoArmRobot(ArmRobot):
 
     config_class = MujocoArmRobotConfig
     name = "mujoco_arm"
+    in_real_time = False
     run: ScenarioRun
 
     def __init__(self, config: MujocoArmRobotConfig):
@@ -150,14 +151,10 @@ class MujocoArmRobot(ArmRobot):
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        images = self.config.images
-        features = super().observation_features
-        if self.config.pixels:
-            features |= dict.fromkeys(PIXELS, float)
-        if self.config.marker:
-            features |= dict.fromkeys(MARKER, float)
-        if self.config.object_pose:
-            features |= dict.fromkeys(OBJECT, float)
+        config, images = self.config, self.config.images
+        wanted = (config.pixels, PIXELS), (config.marker, MARKER), (config.object_pose, OBJECT)
+        more = {name: float for wants, names in wanted if wants for name in names}
+        features = super().observation_features | more
         if images.kind != "none":
             features[CAMERA] = (images.height, images.width, 3)
         return features
@@ -169,10 +166,6 @@ class MujocoArmRobot(ArmRobot):
     @property
     def servo(self) -> PositionServo:
         return self.run.servo
-
-    @property
-    def in_real_time(self) -> bool:
-        return False
 
     @property
     def world(self) -> World:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.error import URLError
 from urllib.request import urlopen
 
 from hrc_learn.store import cache_home, new_file
@@ -138,8 +137,9 @@ def _fetched_viewer() -> dict[str, bytes]:
         end = time.monotonic() + _START
         while True:
             try:
-                return {name: _get(ports[0], name) for name in _VIEWER_FILES}
-            except URLError as error:
+                url = f"http://127.0.0.1:{ports[0]}"
+                return {x: urlopen(f"{url}/{x}", timeout=_START).read() for x in _VIEWER_FILES}
+            except OSError as error:
                 if server.poll() is not None or time.monotonic() > end:
                     raise ValueError(
                         f"Rerun's viewer does not start; try `python -m rerun`. {error}"
@@ -148,8 +148,3 @@ def _fetched_viewer() -> dict[str, bytes]:
     finally:
         server.kill()
         server.wait()
-
-
-def _get(port: int, name: str) -> bytes:
-    with urlopen(f"http://127.0.0.1:{port}/{name}", timeout=_START) as answer:
-        return answer.read()

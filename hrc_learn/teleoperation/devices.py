@@ -152,7 +152,9 @@ class Gamepad(Human):
         if not self._controller.attached():
             self._held = set()
             return HumanInput()
-        pressed = self._pressed()
+        buttons = (*BUTTONS, _LEFT_SHOULDER, _RIGHT_SHOULDER)
+        held = {button for button in buttons if self._controller.get_button(button)}
+        pressed, self._held = held - self._held, held
         opens = OPEN if _LEFT_SHOULDER in pressed else None
         return HumanInput(
             twist=self._twist(state),
@@ -177,13 +179,6 @@ class Gamepad(Human):
         # A stick that points forward or up reads negative; the base's y axis points left.
         stick = np.array([-y, -x, -z])
         return steering_twist(self._chain, state, deflection(stick))
-
-    def _pressed(self) -> set[int]:
-        """Buttons pressed since the last reading."""
-        buttons = (*BUTTONS, _LEFT_SHOULDER, _RIGHT_SHOULDER)
-        held = {button for button in buttons if self._controller.get_button(button)}
-        pressed, self._held = held - self._held, held
-        return pressed
 
 
 DIRECTIONS = MappingProxyType(

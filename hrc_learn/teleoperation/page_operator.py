@@ -341,29 +341,20 @@ def gizmo_command(
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
     d, velocity = np.zeros(len(chain.joint_names)), config.speed * direction
-    guided = bool(direction.any())
-    arrows = np.empty((len(gizmos), 2, 3))
+    arrows, held = np.empty((len(gizmos), 2, 3)), tuple(gizmo.joint for gizmo in gizmos)
     for k, gizmo in enumerate(gizmos):
-        point = _point_held(links, gizmo)
-        displacement = gizmo.pointer - point
+        if gizmo.joint is None:
+            point = links[-1].position.numpy() + gizmo.held_at
+            velocity += config.rate * (gizmo.pointer - point)
+        else:
+            point = links[gizmo.joint - 1].apply(torch.as_tensor(gizmo.held_at)).numpy()
+            pull = gizmo.pointer - point
+            d += gizmo_nullspace_input(chain, joint_position, gizmo.joint, point, pull, config)
         arrows[k] = point, gizmo.pointer
-        if gizmo.joint is not None:
-            d += gizmo_nullspace_input(
-                chain, joint_position, gizmo.joint, point, displacement, config
-            )
-            continue
-        guided = True
-        velocity += config.rate * displacement
+    guided = direction.any() or None in held
     return GizmoCommand(
         nullspace_input=bounded(d, config.max_nullspace_input),
         twist=guiding_twist(links[-1], velocity, config, turn) if guided else np.zeros(6),
         arrows=arrows,
-        held=tuple(gizmo.joint for gizmo in gizmos),
+        held=held,
     )
-
-
-def _point_held(links: Pose, gizmo: HeldGizmo) -> Float[np.ndarray, "3"]:
-    """Present position of the point held, in the base frame [m]."""
-    if gizmo.joint is None:
-        return links[-1].position.numpy() + gizmo.held_at
-    return links[gizmo.joint - 1].apply(torch.as_tensor(gizmo.held_at)).numpy()

@@ -21,11 +21,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
 from hrc_learn.dmp import ContinuedTrajectory, GaussianBasis, SpringDamper, response_of
-from hrc_learn.lerobot.policy.contextual_motion import (
-    ContextualMotion,
-    Primitives,
-    fit_closed_form,
-)
+from hrc_learn.lerobot.policy.contextual_motion import ContextualMotion, fit_closed_form
 from hrc_learn.lerobot.policy.observation_encoder import Observation
 from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig, Statistics
 
@@ -209,7 +205,7 @@ class DMPPolicy(MotionPolicy):
         """
         context, features = self.encoder.numbers(observation), self.encoder(observation)
         start = features.new_zeros(len(features))
-        primitives = self._primitives(context, features, features, start)
+        primitives = self.motion(context, features.repeat(1, 2), start)
         position = primitives.start
         if (self.measured >= 0).any():
             values = observation[OBS_STATE][:, None, self.measured.clamp_min(0)].to(position)
@@ -240,7 +236,8 @@ class DMPPolicy(MotionPolicy):
             time: Times after the state [s].
         """
         clock = underway.elapsed + underway.lead
-        primitives = self._primitives(underway.context, underway.features, seen, clock)
+        features = torch.cat([underway.features, seen], dim=-1)
+        primitives = self.motion(underway.context, features, clock)
         duration = primitives.duration.double()
         since = underway.elapsed.double() / duration
         motion = ContinuedTrajectory(
@@ -253,11 +250,6 @@ class DMPPolicy(MotionPolicy):
             velocity=underway.velocity.double(),
         )
         return motion.position.to(time), motion.velocity.to(time)
-
-    def _primitives(
-        self, context: Tensor, first_seen: Tensor, seen: Tensor, clock: Tensor
-    ) -> Primitives:
-        return self.motion(context, torch.cat([first_seen, seen], dim=-1), clock)
 
 
 def write_closed_form_policy(
