@@ -30,6 +30,7 @@ from hrc_learn.jacobian import (
     ImageDemonstration,
     RBFCenters,
     RBFImageJacobian,
+    cross_validate,
     maximize_evidence,
 )
 
@@ -79,6 +80,7 @@ with distributed.processes() as rank:
         "weight": network.weight,
         "covariance": network.covariance,
         "held_out": torch.tensor([state.held_out_error for state in learned.rounds]),
+        "pairs": cross_validate(demonstrations, network, learned.kept.config).error,
     }
     if rank == 0:
         save_file({name: x.detach().contiguous() for name, x in result.items()}, sys.argv[1])

@@ -9,6 +9,7 @@ successive key frames, between which image motion is compared.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -304,7 +305,7 @@ def cross_validate(
 ) -> HeldOutSamples:
     """Predict the motion of every pair by a camera and weights fitted to the other folds.
 
-    In a distributed run, each process predicts the pairs of its own demonstrations.
+    In a distributed run, each process predicts all pairs.
 
     Args:
         demonstrations: Demonstrations to which the network was fitted.
@@ -319,9 +320,10 @@ def cross_validate(
     report = network.report
     if report is None:
         raise ValueError("a loaded network has no fit report: pass the network just fitted.")
-    basis, precision = network.double().basis, prior_precision(network.centers, config)
+    network = copy.deepcopy(network).double()
+    basis, precision = network.basis, prior_precision(network.centers, config)
     K, parts = len(network.centers), recorded_parts(demonstrations)
-    seen = {i % FOLDS for i in range(min(len(parts), FOLDS)) if len(parts[i].motion(config).dx)}
+    seen = {i % FOLDS for i in range(len(parts)) if len(parts[i].motion(config).dx)}
     if len(seen) < 2:
         raise ValueError("held-out errors need pairs in at least two folds of the data.")
     pairs: list[HeldOutSamples] = []
@@ -334,9 +336,8 @@ def cross_validate(
             others, left = unexplained(others, camera), unexplained(parts, camera)
         total = reduce(add, statistics_by_fold(basis, K, others, config))
         weights, _ = solve(total, precision, report.noise**2)
-        for i, part in distributed.local_items(parts):
-            if i % FOLDS == fold:
-                pairs.append(_predicted(part, left[i], basis, weights, config))
+        for part, rest in zip(parts[fold::FOLDS], left[fold::FOLDS], strict=True):
+            pairs.append(_predicted(part, rest, basis, weights, config))
     return tree_map(lambda *columns: torch.cat(columns), *pairs)
 
 

@@ -173,6 +173,18 @@ def test_held_out_errors_by_place_add_up():
         cross_validate(one_seen, network, config)
 
 
+def test_every_pair_is_predicted_by_a_network_that_stays_as_it_is():
+    """Also pairs of a fold whose first demonstration does not show the marker."""
+    first, *others = record(7, frames=60)
+    demonstrations = [unseen(first), *others]
+    neurons, config = RBFCenters(centers=paper_grid().float(), width=0.1), KeyFrameConfig()
+    network = RBFImageJacobian.fit(demonstrations, neurons)
+    pairs = cross_validate(demonstrations, network, ImageJacobianFitConfig())
+    motions = [demonstrations[i].motion(config).dx for i in (0, 5, 1, 6, 2, 3, 4)]
+    assert_close(pairs.motion, torch.cat(motions))
+    assert network.weight.dtype == torch.float32
+
+
 def test_cells_lie_where_their_edges_say():
     """Each pair counted by a plain loop over the edges; x is the first axis, y the second."""
     rng = torch.Generator().manual_seed(5)
