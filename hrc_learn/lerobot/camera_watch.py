@@ -22,6 +22,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from hrc_learn.demos.read.dataset_folder import read_info
+from hrc_learn.demos.read.metadata import flatten_names
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     CameraCorrection,
@@ -63,8 +64,8 @@ class CameraWatchStep(ProcessorStep):
     object_height: float = 0.0
     """Height of the plane on which the object lies, from `jacobian.object_height` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
-    """Latest detected motion of the camera; None: none. `reset` clears it unless pixels are
-    corrected."""
+    """Latest detected motion of the camera; None: none, or the alarm was false. `reset` clears
+    it unless pixels are corrected."""
 
     def __post_init__(self) -> None:
         if not self.fps > 0:
@@ -73,6 +74,8 @@ class CameraWatchStep(ProcessorStep):
         reference = parse_json(text, CameraReference, "reference of the camera watch")
         self._watch = CameraCorrection(reference) if self.correct else CameraWatch(reference)
         self._calls = 0
+        # Last pixel of the marker as seen and as corrected [px].
+        self._last: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
@@ -95,7 +98,10 @@ class CameraWatchStep(ProcessorStep):
             pixel = self._watch.object(self.object_height, values[self.object_columns])
             values[self.object_columns] = pixel
         if pose is not None:
-            values[self.marker_columns[:2]] = self._watch.marker(pose, marker[:2])
+            self._last = marker[:2], self._watch.marker(pose, marker[:2])
+        # While the marker is hidden, a robot may repeat its last pixel.
+        if self._last is not None and torch.equal(marker[:2], self._last[0]):
+            values[self.marker_columns[:2]] = self._last[1]
         corrected = {**observation, OBS_STATE: values.to(state).reshape(state.shape)}
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
@@ -114,10 +120,13 @@ class CameraWatchStep(ProcessorStep):
                     "%s since the demonstrations: move it back, or record and fit again.", seen
                 )
             self.motion = seen
+        if isinstance(self._watch, CameraCorrection):
+            self.motion = self._watch.motion
         return pose
 
     def reset(self) -> None:
         self._watch.clear()
+        self._last = None
         if not self.correct:
             self.motion = None
 
@@ -160,7 +169,7 @@ def add_camera_watch(
     path = checkpoint / PREPROCESSOR
     content = read_pipeline(path, without=(CAMERA_WATCH,))
     info = read_info(dataset)
-    names = info["features"][OBS_STATE]["names"]
+    names = flatten_names(info["features"].get(OBS_STATE, {}).get("names")) or ()
     index = {f"{name.removesuffix('.pos')}.pos": i for i, name in enumerate(names)}
     if missing := [name for name in (*HAND, *MARKER) if name not in index]:
         raise ValueError(

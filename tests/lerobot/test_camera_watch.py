@@ -117,11 +117,11 @@ def object_pixel(camera):
     return pixels_and_depth(camera, from_base(camera, torch.from_numpy(OBJECT)[None]))[0][0]
 
 
-def looking(step, pose, pixels, camera):
+def looking(step, pose, pixels, camera, visible=1.0):
     """What a policy sees of the marker and of an object, both in its state, at the end."""
     seen = object_pixel(camera)
     for k, pixel in enumerate(pixels):
-        state = torch.tensor([*pose[k].vector(), *pixel, 1.0, *seen]).float()[None]
+        state = torch.tensor([*pose[k].vector(), *pixel, visible, *seen]).float()[None]
         before = state.clone()
         transition = step({TransitionKey.OBSERVATION: {"observation.state": state}})
         assert torch.equal(state, before)
@@ -162,6 +162,25 @@ def test_a_policy_sees_what_there_is_while_the_camera_stands_still(correcting):
     np.testing.assert_allclose(state[9:], object_pixel(CAMERA), rtol=1e-6)
 
 
+def test_a_hidden_marker_stays_where_it_was_corrected_to(correcting):
+    knocked = moved(CAMERA, torch.tensor([0.1, 0.02, 0.05, 0.05, -0.03, 0.02]).double())
+    pose, pixels = episode(np.random.default_rng(7), knocked, frames=3)
+    shown = looking(correcting, pose[:2], pixels[:2], knocked)[6:8]
+    assert np.abs(shown - pixels[1]).max() > 50.0
+    # A robot repeats the last pixel, or says that there is none.
+    for pixel, expected in ((pixels[1], shown), (np.zeros(2), np.zeros(2))):
+        hidden = looking(correcting, pose[2:], pixel[None], knocked, visible=0.0)
+        np.testing.assert_array_equal(hidden[6:8], expected)
+
+
+def test_a_false_alarm_is_taken_back(correcting):
+    pose, pixels = episode(np.random.default_rng(8))
+    looking(correcting, pose[:1], pixels[:1] + [150.0, -80.0], CAMERA)
+    assert correcting.motion is not None
+    looking(correcting, pose[1:], pixels[1:], CAMERA)
+    assert correcting.motion is None
+
+
 def test_an_unseen_marker_and_missing_observations_are_passed_over(step):
     pose, pixels = episode(np.random.default_rng(3))
     rollout(step, pose, np.full_like(pixels, np.nan))
@@ -190,8 +209,15 @@ def test_what_is_missing_is_named(dataset, tmp_path):
         for k in range(5):
             writer.add_frame(joint_position=[0.01 * k])
         writer.save_episode()
-    with pytest.raises(ValueError, match=r"ee\.x"):
-        add_camera_watch(tmp_path, tmp_path / "bare")
+    info = tmp_path / "bare" / "meta" / "info.json"
+    state = json.loads(info.read_text())["features"]["observation.state"]
+    # Names by group, as some converters write them, and no names.
+    for names in (state["names"], {"motors": state["names"]}, None):
+        content = json.loads(info.read_text())
+        content["features"]["observation.state"]["names"] = names
+        info.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=r"ee\.x"):
+            add_camera_watch(tmp_path, tmp_path / "bare")
 
 
 @pytest.mark.parametrize("correct", [False, True])
