@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import has_numbers, is_number, matmul
+from hrc_learn.geometry.numerics import check_settings, has_numbers, is_number, matmul
 from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import chosen, pytree
@@ -469,6 +469,10 @@ class KalmanConfig(LearningConfig):
     """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
     drift: float = 100.0
     """Random walk of the mean Jacobian [px/m/sqrt(s)]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, positive=["pixel_noise"], not_negative=["drift"])
 
 
 @pytree

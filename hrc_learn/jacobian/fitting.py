@@ -23,6 +23,7 @@ from torch.utils._pytree import tree_map
 
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.pytree import pytree
 
 # Least distance of the outer neurons from the middle neuron [m, rad]. Along a component with
@@ -48,6 +49,9 @@ class KeyFrameConfig:
     and is left out."""
     rotation_scale: float = 0.15
     """Length by which rotations are converted to motions, a typical lever arm [m/rad]."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, positive=("max_step", "rotation_scale"), not_negative=["min_step"])
 
 
 @pytree
@@ -400,6 +404,10 @@ class ImageJacobianFitConfig(KeyFrameConfig):
     """Prior standard deviation of the mean Jacobian of the workspace [px/m]."""
     weight_std: float = 500.0
     """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, positive=("pixel_noise", "bias_std", "weight_std"))
 
     @classmethod
     def of_residual(cls) -> ImageJacobianFitConfig:

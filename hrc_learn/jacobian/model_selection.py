@@ -24,6 +24,7 @@ from torch.utils._pytree import tree_map
 
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.jacobian.fitting import (
     FOLDS,
     ImageDemonstration,
@@ -60,6 +61,9 @@ class EvidenceConfig:
     """Largest number of pairs used by a process; they are evenly chosen."""
     learn_centers: bool = True
     """True if the centres are learned; width, noise and prior are always learned."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, positive=("hold_out", "max_samples"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from pinhole import Pinhole, image_demonstrations, wander
@@ -6,7 +8,9 @@ from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
+    EvidenceConfig,
     ImageJacobianFitConfig,
+    KalmanConfig,
     RBFCenters,
     RBFImageJacobian,
     grid,
@@ -266,3 +270,19 @@ def test_twist_counts_rotation_in_the_base_frame():
     predicted = network(test)[..., 5] * 0.01
     cosine = (dx * predicted).sum() / (dx.norm() * predicted.norm())
     assert float(cosine) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (ImageJacobianFitConfig, {"pixel_noise": 0.0}, "pixel_noise must be positive"),
+        (ImageJacobianFitConfig, {"weight_std": math.nan}, "weight_std must be positive"),
+        (ImageJacobianFitConfig, {"min_step": -1.0}, "min_step must not be negative"),
+        (KalmanConfig, {"pixel_noise": 0.0}, "pixel_noise must be positive"),
+        (KalmanConfig, {"max_step": 0.0}, "max_step must be positive"),
+        (EvidenceConfig, {"hold_out": 0}, "hold_out must be positive"),
+    ],
+)
+def test_settings_out_of_range_are_named(kind, settings, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**settings)

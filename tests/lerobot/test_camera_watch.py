@@ -175,7 +175,7 @@ def test_a_hidden_marker_stays_where_it_was_corrected_to(correcting):
 
 def test_a_false_alarm_is_taken_back(correcting):
     pose, pixels = episode(np.random.default_rng(8))
-    looking(correcting, pose[:1], pixels[:1] + [150.0, -80.0], CAMERA)
+    looking(correcting, pose[:1], pixels[:1] + np.array([150.0, -80.0]), CAMERA)
     assert correcting.motion is not None
     looking(correcting, pose[1:], pixels[1:], CAMERA)
     assert correcting.motion is None
