@@ -32,7 +32,6 @@ from hrc_learn.jacobian.estimators import ImageJacobianEstimator, Measurement, e
 from hrc_learn.jacobian.fitting import component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.perspective import (
-    MARKER,
     ROTATION,
     SHIFT,
     SIZE,
@@ -40,6 +39,7 @@ from hrc_learn.jacobian.perspective import (
     eye_by_step,
     eye_of,
     marker_pixels,
+    moved,
     stepped,
 )
 from hrc_learn.pytree import chosen, pytree
@@ -194,10 +194,9 @@ class CameraEstimator(ImageJacobianEstimator):
         self.register_buffer("precision", precision, persistent=False)
         self.register_buffer("residual", torch.block_diag(*[one] * 6), persistent=False)
         self.register_buffer("scale", scale, persistent=False)
-        turns = torch.arange(config.hypotheses) * (2 * math.pi / config.hypotheses)
-        rolls = camera.new_zeros(config.hypotheses, 3)
-        rolls[:, 2] = turns
-        self.register_buffer("rolls", quaternion.exp(rolls), persistent=False)
+        rolls = camera.new_zeros(config.hypotheses, 6)
+        rolls[:, 2] = -torch.arange(config.hypotheses) * (2 * math.pi / config.hypotheses)
+        self.register_buffer("rolls", rolls, persistent=False)
         self.size = 6 * K
 
     reference: Tensor
@@ -209,14 +208,14 @@ class CameraEstimator(ImageJacobianEstimator):
     scale: Tensor
     """Metres per unit of each component of a twist, (6,)."""
     rolls: Tensor
-    """Initial rotations of the hypotheses about the optical axis, (hypotheses, 4)."""
+    """Initial rotations of the hypotheses about the optical axis, as twists (hypotheses, 6)."""
 
     def initial_state(self, *batch: int) -> CameraState:
         """State with the demonstrations' camera, rotated for each hypothesis, and no frames."""
         config, like = self.config, self.reference
         frames = (*batch, config.frames)
         upright = like.new_tensor([1.0, 0, 0, 0])
-        cameras = self._rolled(like.expand(*batch, SIZE))
+        cameras = moved(like.expand(*batch, 1, SIZE), self.rolls)
         return CameraState(
             weight=self.initial_weight(*batch),
             cameras=cameras,
@@ -248,18 +247,6 @@ class CameraEstimator(ImageJacobianEstimator):
         state, kept = self._with_key_frame(state, measurement, seen)
         return chosen(seen & kept, self._searched(state), state)
 
-    def _rolled(
-        self, camera: Float[Tensor, "*batch 13"]
-    ) -> Float[Tensor, "*batch hypotheses 13"]:
-        """Copies of a camera, each rotated about its optical axis by a hypothesis' angle."""
-        turn = quaternion.multiply(
-            self.rolls, quaternion.exp(camera[..., ROTATION]).unsqueeze(-2)
-        )
-        shift = quaternion.rotate(self.rolls, camera[..., SHIFT].unsqueeze(-2))
-        whole = camera.unsqueeze(-2).expand(*camera.shape[:-1], len(self.rolls), SIZE)
-        parts = [whole[..., :4], quaternion.log(turn), shift, whole[..., MARKER]]
-        return torch.cat(parts, dim=-1)
-
     def _roll_cost(self, cameras: Float[Tensor, "*batch hypotheses 13"]) -> Tensor:
         """Small cost of rotations since the demonstrations, which decides before any motion."""
         turn = quaternion.exp(cameras[..., ROTATION])
@@ -287,8 +274,8 @@ class CameraEstimator(ImageJacobianEstimator):
         by_turn = (home @ by_turn)[..., :2, :] / config.tilt
         away = (eye_of(cameras) - eye_of(self.reference)) / config.place
         tilted = torch.cat([by_turn, torch.zeros_like(by_turn)], dim=-1)
-        moved = torch.cat([tilted, eye_by_step(cameras) / config.place], dim=-2)
-        slope = torch.nn.functional.pad(moved, (ROTATION.start, SIZE - SHIFT.stop))
+        slope = torch.cat([tilted, eye_by_step(cameras) / config.place], dim=-2)
+        slope = torch.nn.functional.pad(slope, (ROTATION.start, SIZE - SHIFT.stop))
         return torch.cat([tilt, away], dim=-1), slope
 
     def _watched(
@@ -305,16 +292,16 @@ class CameraEstimator(ImageJacobianEstimator):
         limit = config.bump + 5 * (deviation + config.pixel_noise)
         far = seen & settled & (error.norm(dim=-1) > limit)
         surprises = torch.where(far, state.surprises + 1, torch.where(seen, 0, state.surprises))
-        moved = surprises >= config.surprises
+        bumped = surprises >= config.surprises
         fresh = replace(
             state,
-            weight=self.initial_weight(*moved.shape),
-            cameras=self._rolled(state.best),
+            weight=self.initial_weight(*bumped.shape),
+            cameras=moved(state.best.unsqueeze(-2), self.rolls),
             known=torch.zeros_like(state.known),
             surprises=torch.zeros_like(surprises),
             moves=state.moves + 1,
         )
-        return chosen(moved, fresh, replace(state, surprises=surprises))
+        return chosen(bumped, fresh, replace(state, surprises=surprises))
 
     def _with_key_frame(
         self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]

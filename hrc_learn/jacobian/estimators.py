@@ -317,17 +317,10 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
             valid=valid,
         )
         # The first valid frame becomes a key frame, and so does the second frame of every pair.
-        take = (moved | (measurement.valid & ~key.present)).unsqueeze(-1)
-        here = KeyFrame(
-            pose=Pose(
-                torch.where(take, measurement.pose.position, key.pose.position),
-                torch.where(take, measurement.pose.orientation, key.pose.orientation),
-            ),
-            feature=torch.where(take, measurement.feature, key.feature),
-            theta=torch.where(take, theta, key.theta),
-            present=key.present | measurement.valid,
-        )
-        return here, pair
+        take = moved | (measurement.valid & ~key.present)
+        pose, feature = measurement.pose, measurement.feature
+        here = KeyFrame(pose=pose, feature=feature, theta=theta, present=take)
+        return chosen(take, here, key), pair
 
 
 class PaperEstimator(ImageJacobianEstimator):

@@ -522,12 +522,15 @@ def motion_jacobian(
     return torch.cat([turned, -by_point], dim=-1)
 
 
-def moved(camera: Float[Tensor, "13"], twist: Float[Tensor, "6"]) -> Float[Tensor, "13"]:
+def moved(
+    camera: Float[Tensor, "*#batch 13"], twist: Float[Tensor, "*#batch 6"]
+) -> Float[Tensor, "*batch 13"]:
     """Camera turned about its own axes [rad], then moved [m] along its axes before the turn."""
-    back = quaternion.exp(-twist[:3])
-    turn = quaternion.log(quaternion.multiply(back, quaternion.exp(camera[ROTATION])))
-    shift = quaternion.rotate(back, camera[SHIFT] - twist[3:])
-    return torch.cat([camera[:4], turn, shift, camera[MARKER]])
+    back = quaternion.exp(-twist[..., :3])
+    turn = quaternion.log(quaternion.multiply(back, quaternion.exp(camera[..., ROTATION])))
+    shift = quaternion.rotate(back, camera[..., SHIFT] - twist[..., 3:])
+    whole = camera.expand(*turn.shape[:-1], SIZE)
+    return torch.cat([whole[..., :4], turn, shift, whole[..., MARKER]], dim=-1)
 
 
 def _sampled(
