@@ -153,10 +153,9 @@ class MotionSamples:
     def thinned(self, most: int) -> MotionSamples:
         """At most `most` pairs, evenly chosen."""
         pairs = len(self.dx)
-        return self if pairs <= most else self[torch.linspace(0, pairs - 1, most).long()]
-
-    def __getitem__(self, index: Tensor) -> MotionSamples:
-        """The pairs at some indices."""
+        if pairs <= most:
+            return self
+        index = torch.linspace(0, pairs - 1, most).long()
         return tree_map(lambda values: values[index], self)
 
     def regressors(self, basis: Callable[[Pose], Tensor]) -> Float[Tensor, "pairs P"]:

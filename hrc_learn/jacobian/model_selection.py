@@ -175,7 +175,8 @@ class NegativeLogEvidence(nn.Module):
         # Variance of a difference of two measurements, each with this deviation.
         noise = 2 * (2 * self.log_noise).exp()
         # Whitened weights, independent with unit variance under the prior, are well scaled.
-        root = torch.block_diag(*[torch.linalg.cholesky(self._prior())] * 6)
+        prior = weight_covariance(self.centers, self.log_bias.exp(), self.log_weight.exp())
+        root = torch.block_diag(*[torch.linalg.cholesky(prior)] * 6)
         cross = root.mT @ total.cross / noise
         eye = torch.eye(len(root), dtype=root.dtype)
         factor = torch.linalg.cholesky(root.mT @ total.gram @ root / noise + eye)
@@ -223,9 +224,6 @@ class NegativeLogEvidence(nn.Module):
             config=config,
         )
 
-    def _prior(self) -> Float[Tensor, "K K"]:
-        return weight_covariance(self.centers, self.log_bias.exp(), self.log_weight.exp())
-
 
 def _motions(
     demonstrations: Sequence[ImageDemonstration],
@@ -243,16 +241,14 @@ def _motions(
         # i counts all demonstrations, so the choice does not depend on the number of processes.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))
-    for motions in sets:
-        pairs = torch.tensor(sum(len(motion.dx) for motion in motions))
-        if not distributed.sum_over_processes(pairs):
-            raise ValueError(
-                "no two visible key frames form a pair in the "
-                f"{'held-out' if motions is sets[1] else 'training'} demonstrations "
-                f"(every {learning.hold_out}th is held out): there is nothing to "
-                f"{'judge' if motions is sets[1] else 'learn'} from."
-            )
     training, held_out = (MotionSamples.joined(motions) for motions in sets)
+    judged = (training, "training", "learn"), (held_out, "held-out", "judge")
+    for motion, name, use in judged:
+        if not distributed.sum_over_processes(torch.tensor(len(motion.dx))):
+            raise ValueError(
+                f"no two visible key frames form a pair in the {name} demonstrations "
+                f"(every {learning.hold_out}th is held out): there is nothing to {use} from."
+            )
     return training.thinned(learning.max_samples), held_out.thinned(learning.max_samples)
 
 

@@ -167,17 +167,12 @@ class MarkerDetector:
             # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one. These
             # corners only show where to search: they may be pixels off.
             found |= self._search_near(grey, id, 2.0 * corners + 0.5)
-        if missing := self._worth_a_close_look(ids, found):
+        missing = ids.difference(found)
+        self._in_vain = {id: self._in_vain.get(id, -1) + 1 for id in missing}
+        if any(count % _CLOSE_LOOK_EVERY == 0 for count in self._in_vain.values()):
             rough = self._search(grey, missing)
             found |= {id: _refine(grey, corners) for id, corners in rough.items()}
         return found
-
-    def _worth_a_close_look(self, ids: frozenset[int], found: Iterable[int]) -> frozenset[int]:
-        """Missing markers if a full-resolution search is due; else none."""
-        missing = ids.difference(found)
-        self._in_vain = {id: self._in_vain.get(id, -1) + 1 for id in missing}
-        due = any(count % _CLOSE_LOOK_EVERY == 0 for count in self._in_vain.values())
-        return missing if due else frozenset()
 
     def _search(self, grey: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
         corners, found, _ = self._aruco.detectMarkers(np.ascontiguousarray(grey))
