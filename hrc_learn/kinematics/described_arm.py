@@ -213,10 +213,11 @@ def _shape(
         for joint in description.below(link)
         if joint.kind in MOVING and joint not in path
     ]
+    at_last = dict(places)  # a hand may carry another one
     for hand in {joint.parent for joint in roots} - {moved}:
-        pose = places[hand][1]
+        pose = to_tool @ at_last[hand][1]
         for link, within in description.rigid_subtree(hand).items():
-            places[link] = (last + 2, to_tool @ pose @ within)
+            places[link] = (last + 2, pose @ within)
     shapes = [
         (number, replace(shape, pose=pose @ shape.pose))
         for link, (number, pose) in places.items()

@@ -239,7 +239,12 @@ class _Reader:
                 other = int(model.eq_obj2id[e])
                 leader = self._joint_name(other) if other >= 0 else ""
                 offset, factor = model.eq_data[e, :2].tolist()
-                tied[int(model.eq_obj1id[e])] = (leader, factor, offset)
+                # MuJoCo couples motions from the reference positions.
+                joint = int(model.eq_obj1id[e])
+                offset += model.qpos0[model.jnt_qposadr[joint]]
+                if other >= 0:
+                    offset -= factor * model.qpos0[model.jnt_qposadr[other]]
+                tied[joint] = (leader, factor, float(offset))
         return tied
 
     def _home(self) -> dict[str, float] | None:

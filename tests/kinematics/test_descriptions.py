@@ -316,6 +316,18 @@ def test_joints_of_a_gripper_are_not_the_arms(tmp_path, kind):
     )
 
 
+def test_a_hand_on_a_hand_is_placed_once(tmp_path):
+    """Hands are found as a set, in an order that changes from one process to the next."""
+    text = ARM + TOOL
+    for k, below in enumerate(("l6", "hand1", "hand2", "hand3"), start=1):
+        text += fixed(f"h{k}", below, f"hand{k}") + jaw(f"f{k}", f"finger{k}", f"hand{k}")
+    for k, finger in enumerate(load(tmp_path, robot(text), tip="tool0").shape.gripper, 1):
+        # Each hand is 0.1 m above the one below, and the tool 0.1 m above the link.
+        height = finger.mount[2, 3] - 0.2
+        assert finger.name == f"f{k}"
+        assert height == pytest.approx(0.1 * (k - 1), abs=1e-12)
+
+
 def test_a_tip_behind_the_jaw_is_taken_at_its_word(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(robot(HANDS["one jaw"][0]))
@@ -416,6 +428,24 @@ def test_only_active_equalities_tie_joints(tmp_path):
     held = '<joint joint1="j3" polycoef="0.5 0 0 0 0"/>'
     with pytest.raises(ValueError, match=r"j3 is held at 0\.5"):
         load(tmp_path, mjcf(held), ".xml")
+
+
+def test_coupled_fingers_count_from_their_reference_positions(tmp_path):
+    fingers = "".join(
+        f'<body name="f{i}"><geom size="0.01"/><joint name="finger{i}" type="slide" '
+        f'axis="0 1 0" range="-0.1 0.1" ref="{ref}"/></body>'
+        for i, ref in ((1, 0.02), (2, 0.01))
+    )
+    tie = '<joint joint1="finger2" joint2="finger1" polycoef="0.003 -2 0 0 0"/>'
+    text = mjcf(tie).replace('<site name="tcp"', f'{fingers}<site name="tcp"')
+    _, second = load(tmp_path, text, ".xml").shape.gripper
+    leader, factor, offset = second.follows
+    assert leader == "finger1"
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    data.qpos[6:] = 0.04, factor * 0.04 + offset
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.efc_pos[: data.ne], [0.0], rtol=0, atol=1e-12)
 
 
 def test_a_home_outside_the_limits_is_moved_to_them_with_a_warning(tmp_path):
