@@ -213,7 +213,8 @@ def _described(name: str, choice: Mapping[str, Any]) -> Arm:
     path = _locate(name, source["package"], source["file"])
     kept = ("base", "tip", "limits", "ready")
     settings = {key: source[key] for key in kept if key in source}
-    if tool := source.get("tool"):
+    tool, tip = source.get("tool"), source["tip"]
+    if tool and choice.get("tip", tip) == tip:
         settings["tool"] = torch.from_numpy(turn_to(np.array(tool["approach"])))
         settings["tool"][:3, 3] = torch.tensor(tool["origin"])
     settings |= choice
@@ -279,9 +280,12 @@ def _equipped(choice: ArmChoice) -> Arm:
     found = choice.arm()
     if found.is_franka:
         return found
-    hand, mount = {}, None
-    if choice.name in registered_arms() or _registered_name(choice.name):
-        hand = _sources()[found.name].get("hand", {})
+    name, hand, mount = choice.name.partition(":")[0], {}, None
+    if name in registered_arms() or _registered_name(name):
+        source = _sources()[found.name]
+        # `hand` is given in the frame of the registered tip.
+        if (found.base, found.tip) == (source["base"], source["tip"]):
+            hand = source.get("hand", {})
     if "base" in hand:
         found = _described(found.name, {"base_turn": hand["base"]})
     if "origin" in hand:
