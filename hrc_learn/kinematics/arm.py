@@ -265,17 +265,18 @@ class Arm(SerialChain):
 
         Raises:
             UnreachableError: A pose has no solution; the message names the first such pose.
-            ValueError: `q7` was given to an arm without a closed-form inverse.
+            ValueError: `q7` was given to an arm without a closed-form inverse, or for a part of
+                the pose.
         """
-        if q7 is not None and self._closed_form is None:
-            raise ValueError(
-                f"{self.name} has no closed-form inverse, so q7 does not apply: pass near= to "
-                "choose among its solutions."
-            )
         task = task or self.task
+        if q7 is not None and (self._closed_form is None or task != self.task):
+            raise ValueError(
+                f"{self.name} has no closed-form inverse for the task {task!r}, so q7 does not "
+                "apply: pass near= to choose among its solutions."
+            )
         shapes = [pose.position.shape[:-1], pose.orientation.shape[:-1]]
         batch = np.broadcast_shapes(*shapes, () if q7 is None else as_tensor(q7).shape)
-        if near is None and batch:
+        if near is None and batch and math.prod(batch):
             q, missing = self._path(pose, q7, batch, task, samples)
         else:
             near = self.ready if near is None else near

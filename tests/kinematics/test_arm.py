@@ -254,8 +254,10 @@ def test_choices_that_an_arm_does_not_offer_are_named(monkeypatch):
         arm("panda", tip="panda_link7")
     other = installed("ur5e")
     pose = other.forward(other.ready)
-    with pytest.raises(ValueError, match=r"ur5e has no closed-form inverse, so q7 does not"):
+    with pytest.raises(ValueError, match="ur5e has no closed-form inverse for the task"):
         other.inverse(pose, q7=0.1)
+    with pytest.raises(ValueError, match=r"panda has no .* 'position', so q7 does not apply"):
+        panda.inverse(panda.forward(panda.ready), q7=0.1, task="position")
     with pytest.raises(ValueError, match="ur5e has no closed-form inverse: use `postures`"):
         other.solutions(pose)
 

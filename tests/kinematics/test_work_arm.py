@@ -191,6 +191,11 @@ def test_the_hand_of_an_so101_replaces_its_jaws():
     across = torch.linalg.cross(held.forward(q).position - axis[:3, 3], axis[:3, 2], dim=-1)
     assert float(across.norm()) < 1e-3
     assert max(c.end[2] for c in held.body.capsules if c.link == 5) <= 0.0
+    # Settings of the hand and the tool belong to the registered tip.
+    assert ArmChoice("so101:gripper_frame_link").work_arm().hand_size == held.hand_size
+    assert ArmChoice("so101:gripper_link").work_arm().hand_size == 1.0
+    other = registered("so100", tip="wrist", ready=[0.0, 0.5, -0.5, 0.0])
+    assert torch.equal(other.tcp, torch.eye(4, dtype=torch.float64))
 
 
 def test_a_choice_opens_the_same_arm_each_time():
@@ -239,6 +244,15 @@ def test_the_nearest_of_many_poses_are_those_of_each(batch, of):
     # One wish for all of them.
     same = arm.inverse(shaped, near=near[0], samples=9).reshape(count, -1)
     torch.testing.assert_close(same[-1], arm.inverse(poses[count - 1], near=near[0], samples=9))
+
+
+@pytest.mark.parametrize("of", ["panda", "cut"])
+@pytest.mark.parametrize("batch", [(0,), (3, 0), (0, 3)])
+def test_no_pose_has_no_solution(batch, of):
+    arm = panda if of == "panda" else bare().with_hand()
+    poses = Pose(torch.zeros(*batch, 3).double(), torch.zeros(*batch, 4).double())
+    for near in (None, arm.ready):
+        assert arm.inverse(poses, near=near, samples=9).shape == (*batch, arm.joints)
 
 
 @pytest.mark.parametrize("of", ["panda", "cut"])
