@@ -120,7 +120,7 @@ class JointLimits(MotionLimits):
         path keeps them already.
 
         Args:
-            path: Joint positions [rad].
+            path: Joint positions [rad]. Too few samples for a derivative keep its limit.
             dt: Time between samples [s].
             kinds: Limits to keep: velocity, acceleration, jerk, or the first of these.
 
@@ -131,6 +131,7 @@ class JointLimits(MotionLimits):
         factors = []
         for order, kind in enumerate(kinds, 1):
             rate = torch.diff(path, n=order, dim=-2).abs() / dt**order
+            rate = torch.nn.functional.pad(rate, (0, 0, 1, 0))  # a row, if there is none
             factors.append((rate / getattr(self, kind)).amax(-2) ** (1 / order))
         worst, at = torch.cat(factors, -1).max(-1)
         return worst, at

@@ -180,3 +180,7 @@ def test_a_path_that_lasts_as_many_times_longer_keeps_its_limits(order):
     assert both.tolist() == pytest.approx([8.0 ** (1 / order), 16.0 ** (1 / order)], rel=1e-6)
     resting = torch.cat([path, path[-1:].expand(5, 2)])
     assert limits.excess(resting, dt)[0] >= factor
+    # Without samples for a derivative, there is nothing to exceed.
+    assert [float(limits.excess(path[:n], dt, kinds[:order])[0]) > 0 for n in range(order)] == [
+        n > 1 for n in range(order)
+    ]
