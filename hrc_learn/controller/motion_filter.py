@@ -49,18 +49,22 @@ class MotionState:
         """State of a motion at a position, at rest by default.
 
         Raises:
-            ValueError: The position is not finite: no motion could recover from it.
+            ValueError: A value is not finite: no motion could recover from it.
         """
         position = np.asarray(position, dtype=np.float64)
-        if not np.isfinite(position).all():
-            raise ValueError(f"a motion must start at a finite position, but is at {position}")
         still = np.zeros_like(position)
+        velocity, acceleration = still + velocity, still + acceleration
+        if not np.isfinite([position, velocity, acceleration]).all():
+            raise ValueError(
+                "a motion must start at a finite position, velocity and acceleration, but "
+                f"starts at {position}, {velocity} and {acceleration}"
+            )
         return cls(
             position=position,
-            velocity=still + velocity,
-            acceleration=still + acceleration,
+            velocity=velocity,
+            acceleration=acceleration,
             reference=position,
-            reference_velocity=still + velocity,
+            reference_velocity=velocity,
             reference_acceleration=still,
         )
 

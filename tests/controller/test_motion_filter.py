@@ -140,8 +140,9 @@ def test_it_can_stop_within_a_tenth_of_the_range_and_gives_up_no_more(dt):
 
 
 def test_a_start_that_is_not_finite_is_refused():
-    with pytest.raises(ValueError, match="finite position"):
-        MotionState.moving(np.array([0.0, np.nan]))
+    for start in ([np.nan], [0.0, np.inf], [0.0, 0.0, -np.inf]):
+        with pytest.raises(ValueError, match="finite position, velocity and acceleration"):
+            MotionState.moving(*(np.array([0.0, value]) for value in start))
 
 
 @pytest.mark.parametrize("dt", [0.0, float("inf"), float("nan")])
