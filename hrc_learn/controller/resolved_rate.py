@@ -24,6 +24,7 @@ from hrc_learn.controller.interface import Goals, Observation
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import (
     Constant,
+    check_settings,
     everywhere,
     inverse_norm,
     is_number,
@@ -368,6 +369,10 @@ class BlendingConfig:
     """Time in which vision feedback fades in and out [s]; 0: it switches without fading."""
     max_feature_age: float = 0.25
     """Age above which a feature is not used; an arm that follows the feature then stops [s]."""
+
+    def __post_init__(self) -> None:
+        times = "blend_time", "max_feature_age"
+        check_settings(self, not_negative=("hysteresis", *times))
 
 
 @pytree

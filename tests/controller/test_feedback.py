@@ -54,6 +54,13 @@ def test_without_blend_time_it_switches():
     assert follow(blending, [CENTRE])[0].level == 1
 
 
+@pytest.mark.parametrize("name", ["hysteresis", "blend_time", "max_feature_age"])
+def test_settings_of_the_blending_are_not_negative(name):
+    for wrong in (-0.1, math.nan):
+        with pytest.raises(ValueError, match=f"{name} must not be negative"):
+            BlendingConfig(**{name: wrong})
+
+
 @pytest.mark.parametrize("lost", [(math.nan, 5.0), (2000.0, 500.0), (math.inf, 500.0)])
 def test_what_cannot_be_used_leaves_the_last_good_feature(lost):
     *_, last = follow(VisionBlending(), [(600, 500)] * 40 + [lost] * 3)
