@@ -48,7 +48,7 @@ from hrc_learn.controller.null_space_motion import (
 from hrc_learn.controller.path_law import PathLaw, twist_of
 from hrc_learn.controller.task_pace import TaskPace, capped_scale, closes_in, null_space_input
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.geometry.numerics import everywhere, is_number, null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
@@ -153,6 +153,7 @@ class ArmLoop:
         Returns:
             The state, and the limitations of the push.
         """
+        reading = self._known(state, reading)
         null_velocity, limitations = self._eased_push(state, reading)
         pace = state.pace.overridden(reading.pause, self.config.dt)
         state = replace(state, null_velocity=null_velocity, pace=pace)
@@ -165,6 +166,7 @@ class ArmLoop:
 
         Arguments and results are those of `step`; the state is that of `observe`.
         """
+        reading = self._known(state, reading)
         if isinstance(request, Command):
             return self._send(state, reading, request)
         if isinstance(request, FollowPath):
@@ -174,6 +176,22 @@ class ArmLoop:
         else:
             wanted, state = WantedMotion(request.joint_velocity), _without_path(state)
         return self._filtered(state, reading, wanted)
+
+    def _known(self, state: ArmLoopState, reading: ArmReading) -> ArmReading:
+        """The reading. Where joint positions or push are not finite, the arm has to stop, and
+        they are replaced by the positions that its commands lead to, and by zero.
+        """
+        q, push = reading.joint_position, reading.nullspace_input
+        located, felt = (is_number(x).all(-1, keepdim=True) for x in (q, push))
+        if everywhere(located & felt):
+            return reading
+        q = torch.where(located, q, state.safety.position)
+        push = torch.where(felt, push, 0.0)
+        pose, J = self.chain.forward_and_jacobian(q)
+        stop = ~(located & felt).squeeze(-1)
+        stop = stop if reading.stop is None else stop | reading.stop
+        measured = {"joint_position": q, "pose": pose, "jacobian": J, "nullspace_input": push}
+        return replace(reading, **measured, stop=stop)
 
     # The push on the null space.
 
@@ -273,8 +291,7 @@ class ArmLoop:
         velocity = state.pace.speed_override.unsqueeze(-1) * command.joint_velocity
         pace = state.pace.limited(torch.where(slowed, left, 1.0), self.config.dt)
         change = (velocity - state.safety.velocity) / self.config.dt
-        safety = self.safety.initial_state(q, velocity, change)
-        safety = replace(safety, counts=state.safety.counts)
+        safety = replace(state.safety, position=q, velocity=velocity, acceleration=change)
         state = replace(_without_path(state), safety=safety, pace=pace)
         report = ArmReport(command.safety)
         if reading.explain:

@@ -84,7 +84,10 @@ class WatchedPeople:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class ArmReading:
-    """One reading of the arm and of the people near it."""
+    """One reading of the arm and of the people near it.
+
+    An arm whose joint positions or push are not finite brakes to rest.
+    """
 
     joint_position: Float[Tensor, "*batch n"]
     """Measured joint positions [rad]."""

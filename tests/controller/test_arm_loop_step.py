@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from projections import null_space_projector
+from torch.utils._pytree import tree_leaves
 
 from hrc_learn.controller import Command, ConstraintConfig, Distances, SafetyConfig
 from hrc_learn.controller.arm_loop import ArmLoop
@@ -313,3 +314,23 @@ def test_a_command_of_the_controller_keeps_the_counts_of_interventions():
     torch.testing.assert_close(velocity, sent.joint_velocity)
     torch.testing.assert_close(after.safety.velocity, velocity)
     assert torch.equal(after.safety.counts, state.safety.counts)
+
+
+@pytest.mark.parametrize("name", ["joint_position", "nullspace_input"])
+def test_a_reading_that_is_not_finite_stops_the_arm_for_one_step(name):
+    law, wanted, push = loop(), MoveJoints(joint_velocity=U), reading(nullspace_input=6 * UNIT)
+    _, state, _ = law.step(moving(law), push, wanted)
+    assert state.pushed
+    broken = replace(push, **{name: torch.full_like(Q, torch.nan)})
+    velocity, after, _ = law.step(state, broken, wanted)
+    # As if the arm had to stop unpushed, or where its commands have led it.
+    expected = reading(stop=torch.tensor(True))
+    if name == "joint_position":
+        q = state.safety.position
+        pose, J = panda.forward_and_jacobian(q)
+        expected = replace(push, stop=expected.stop, joint_position=q, pose=pose, jacobian=J)
+    stopped, then, _ = law.step(state, expected, wanted)
+    torch.testing.assert_close(velocity, stopped, rtol=0, atol=0)
+    for ours, theirs in zip(tree_leaves(after), tree_leaves(then), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    assert law.step(after, push, wanted)[1].pushed
