@@ -224,7 +224,7 @@ class PathLaw:
         goal, last = paths.position[which, 0], paths.last[which].to(path.last)
         path = replace(path, goal=goal, last=last)
         aside = (goal - joint_position).norm(dim=-1) > _ASIDE
-        return replace(state, aside=aside, path=path)
+        return replace(state, aside=aside, lost=torch.zeros_like(aside), path=path)
 
     def go_on(self, state: ArmLoopState, reading: ArmReading) -> PathState:
         """Progress along the path, one step later."""

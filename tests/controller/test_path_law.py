@@ -267,7 +267,9 @@ def test_a_push_is_refused_on_the_samples_where_the_path_is_narrow(progress, nar
 def test_joints_that_begin_a_path_off_it_are_aside():
     q = Q + torch.tensor([[0.0], [0.0999], [0.1001]], dtype=torch.float64) * torch.eye(7)[2]
     request = FollowPath(paths=PATHS, path=torch.tensor([1, 0, 1]))
-    begun = law().begin(state_of(3, progress=7.0, rate=-1.0, waited=3.0), q, request)
+    before = state_of(3, progress=7.0, rate=-1.0, waited=3.0)
+    begun = law().begin(replace(before, lost=torch.tensor([True] * 3)), q, request)
+    assert begun.lost.tolist() == [False] * 3
     assert begun.aside.tolist() == [False, False, True]
     assert begun.path.last.tolist() == [SAMPLES - 1, 0, SAMPLES - 1]
     assert begun.path.progress.tolist() == begun.path.waited.tolist() == [0, 0, 0]
