@@ -293,7 +293,7 @@ class AdaptiveController(nn.Module):
                 (0, `longest_step`] of the safety settings; or the goals of the observation need
                 more joints than the arm has.
         """
-        state = self._restored(state)
+        given_safety, state = state.safety, self._restored(state)
         self.safety.joint_vector(observation.joint_position, "joint_position")
         goals = self.goals if observation.goals is None else observation.goals
         self._check_task(goals)
@@ -316,7 +316,8 @@ class AdaptiveController(nn.Module):
         motion = self._motion(state, given, task_level, feedback.s)
         numbers = (motion.joint_velocity, feedback.xi_x, feedback.xi_r)
         sound = timed & is_number(torch.cat(numbers, dim=-1)).all(-1)
-        v, safety, report = self._filtered(state.safety, given, motion, stop, stale | ~sound)
+        # The filter checks its state itself, and brakes where it is invalid.
+        v, safety, report = self._filtered(given_safety, given, motion, stop, stale | ~sound)
         pose_drift = self._next_drift(state.pose_drift, motion, v, dt, sound, safety)
         moved = torch.linalg.vecdot(J, v.unsqueeze(-2))
         command = Command(
@@ -384,7 +385,7 @@ class AdaptiveController(nn.Module):
     def _restored(self, state: ControllerState) -> ControllerState:
         """The state, with invalid values replaced by defaults."""
         if has_numbers(state):
-            return replace(state, safety=self.safety.restored(state.safety))
+            return state
         return ControllerState(
             blending=self.blending.restored(state.blending),
             task_level=state.task_level.masked_fill(~is_number(state.task_level), 0),

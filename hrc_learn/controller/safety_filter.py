@@ -179,7 +179,9 @@ class SafetyFilter(nn.Module):
         )
 
     def restored(self, state: SafetyState) -> SafetyState:
-        """The state with invalid values replaced: at rest, in the middle of the joint range."""
+        """The state with invalid values replaced: at rest, in the middle of the joint range. A
+        valid state is returned itself, where Python may branch.
+        """
         valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
         if everywhere(valid) and has_numbers(state):
             return state
@@ -325,9 +327,11 @@ class SafetyFilter(nn.Module):
         self, state: SafetyState, dt: float | Tensor
     ) -> tuple[SafetyState, float | Tensor, Tensor]:
         """A finite state, the step to compute with, and a flag where either was invalid."""
-        known = is_number(torch.cat([state.velocity, state.acceleration], dim=-1))
-        invalid, longest = ~known.all(-1, keepdim=True), self.config.longest_step
-        state = self.restored(state)
+        given, longest = state, self.config.longest_step
+        state, invalid = self.restored(state), torch.zeros_like(state.fresh).unsqueeze(-1)
+        if state is not given:
+            motion = torch.cat([given.velocity, given.acceleration], dim=-1)
+            invalid = ~is_number(motion).all(-1, keepdim=True)
         if isinstance(dt, Tensor):
             valid = (dt > 0) & (dt <= longest)
             length = torch.where(valid, dt.to(state.dt), state.dt)

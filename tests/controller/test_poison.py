@@ -177,6 +177,8 @@ def test_one_tick_of_poison_leaves_the_next_healthy(estimator):
         assert invalid[tick].any()
     for arm, case in enumerate(injected):
         assert not invalid[case.tick + 1 :, arm].any(), case
+        if case.name in ("safety.velocity", "safety.acceleration"):
+            assert invalid[case.tick, arm], case
         # Half a second later it moves as ever, and ends where the others do.
         later = case.tick + 25
         speed = velocities[later, arm].norm() / clean[later].norm()
