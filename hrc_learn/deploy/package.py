@@ -282,8 +282,9 @@ def load(path: Path) -> tuple[Callable[[list[Tensor]], object], StepLayouts, Ten
         raise FileNotFoundError(f"no compiled step {path}")
     require_unchanged(path.parent)
     metadata = read_json(path.with_name(DESCRIPTION), dict[str, str], "export it again")
-    if _LAYOUT not in metadata:
-        raise ValueError(f"{path} was not written by export_step: it has no layout")
+    keys = {_LAYOUT, _BATCH, _DTYPE, _STATE, _BUILT_FOR, LANES, WORKSPACE}
+    if missing := sorted(keys - metadata.keys()):
+        raise ValueError(f"{path} was not written by export_step: no {missing[0]}")
     if metadata[_BUILT_FOR] != machine():
         raise ValueError(
             f"{path} was built for {metadata[_BUILT_FOR]}, but this is {machine()}: export the "
