@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from hrc_learn.deploy.export import export_step
 from hrc_learn.deploy.package import (
+    IOLayout,
     PackedStep,
     StepLayouts,
     StepObservation,
@@ -102,9 +103,17 @@ class StepRunner:
         return self.joint_velocity
 
     def observe(self, observation: StepObservation) -> None:
-        """Write all fields of an observation at once."""
-        vector = self._layouts.observation.pack(tensors_of(observation))
-        self._vectors.observation.copy_(vector)
+        """Write all fields of an observation at once.
+
+        Raises:
+            ValueError: The observation has other fields than the step reads.
+        """
+        layout = self._layouts.observation
+        given = IOLayout.of(observation, layout.batch)
+        if wrong := sorted(given.rows.keys() ^ layout.rows.keys()):
+            fields = ", ".join(wrong)
+            raise ValueError(f"only the step or only the observation has the field {fields}")
+        self._vectors.observation.copy_(layout.pack(tensors_of(observation)))
 
 
 @final

@@ -261,13 +261,22 @@ def test_a_step_that_cannot_be_compiled_runs_eagerly_and_says_so(tmp_path):
     assert not list(tmp_path.glob("step-*"))
 
 
-def test_a_package_without_a_layout_is_none_of_ours(tmp_path):
-    with replacing(tmp_path / "step", EXPORT) as new:
-        new.mkdir()
-        (new / "step.o").write_bytes(b"compiled")
-        write_json(new / "step.json", {"made": "elsewhere"})
-    with pytest.raises(ValueError, match=r"step.o was not written by export_step: it has no"):
-        load(tmp_path / "step" / "step.o")
+@pytest.mark.parametrize("missing", ["batch", "built_for", "lanes", "layout", "state"])
+def test_a_package_without_a_layout_is_none_of_ours(tmp_path, missing):
+    (tmp_path / "step.o").write_bytes(b"compiled")
+    keys = ("batch", "built_for", "dtype", "lanes", "layout", "state", "workspace")
+    write_json(tmp_path / "step.json", {f"hrc_learn.{k}": "" for k in keys if k != missing})
+    message = f"step.o was not written by export_step: no hrc_learn.{missing}"
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path / "step.o")
+
+
+def test_an_observation_of_other_fields_is_refused():
+    controller, one = controller_and_observation()
+    number = one.feature[0]
+    runner = EagerRunner(controller, replace(one, feature_age=number, human_distance=None))
+    with pytest.raises(ValueError, match="the field feature_age, human_distance"):
+        runner.observe(replace(one, feature_age=None, human_distance=number))
 
 
 def test_a_damaged_package_is_refused(tmp_path):
