@@ -252,16 +252,15 @@ class _Reader:
         what: str,
         count: int = 3,
     ) -> np.ndarray:
-        text = element.get(key)
-        if text is None and default is not None:
+        if element.get(key) is None and default is not None:
             return np.array(default)
+        text = self._attribute(element, key, what)
         try:
-            values = [float(word) for word in self._attribute(element, key, what).split()]
+            values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        if "_" in (text or ""):  # allowed between digits in Python, but not in URDF
-            values = []
-        if len(values) != count or not all(map(math.isfinite, values)):
+        # Python allows "_" between digits, URDF does not.
+        if "_" in text or len(values) != count or not all(map(math.isfinite, values)):
             raise ValueError(
                 f"{self.path}: {what} has {key}={text!r}, not {count} finite number"
                 f"{'s' if count > 1 else ''}"
