@@ -65,8 +65,7 @@ def export_step(
         UnknownOperationError: The step uses an operation of PyTorch for which there is no code.
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
-    if folder is None:
-        folder = cache_home() / "hrc_learn"
+    folder = folder or cache_home() / "hrc_learn"
     step = PackedStep(controller, observation)
     try:
         key = content_hash(machine(), controller, _structure(observation))
@@ -231,7 +230,7 @@ def _parts(x: Any) -> Iterable[Any]:
     if isinstance(x, SerialChain):
         # Everything that affects a step. The arm's shape is left out: it does not affect a
         # step, and may be a function, which cannot be hashed.
-        return x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds
+        return x.description_of_chain().values()
     if library in ("hrc_learn", "torch") and hasattr(x, "__dict__"):
         return (x.__getstate__(),)
     raise UnknownCodeError(f"the code of {type(x).__qualname__} is unknown")

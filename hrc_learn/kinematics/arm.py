@@ -20,7 +20,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import MeshFile, Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor
-from hrc_learn.kinematics.capsule_fit import fit_body
+from hrc_learn.kinematics.capsule_fit import capsule_volume, fit_body
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule, link_capsules
 from hrc_learn.kinematics.description import Shape
@@ -155,15 +155,7 @@ class Arm(SerialChain):
             hand_size: Size of the hand on the flange relative to the Franka hand.
             task: Constrained part of the tool's pose.
         """
-        super().__init__(
-            joint_names=chain.joint_names,
-            mounts=chain.mounts,
-            flange=chain.flange,
-            tcp=chain.tcp,
-            limits=chain.limits,
-            ready=chain.ready,
-            kinds=chain.kinds,
-        )
+        super().__init__(**chain.description_of_chain())
         self.name = name
         self.description, self.base, self.tip = description, base, tip
         self.shape = shape or ArmShape()
@@ -227,8 +219,8 @@ class Arm(SerialChain):
             return tuple(mass or 0.0 for mass in given)
         estimated = [0.0] * count
         for capsule in self.whole.capsules:
-            length = float(np.linalg.norm(np.subtract(capsule.end, capsule.start)))
-            volume = np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius)
+            start, end = np.array([capsule.start, capsule.end])
+            volume = capsule_volume((start, end, capsule.radius))
             estimated[capsule.link] += _DENSITY * volume
         return tuple(
             guess if mass is None else mass
@@ -310,8 +302,7 @@ class Arm(SerialChain):
             raise ValueError(f"{self.name} has no closed-form inverse: use `postures`.")
         near = self.ready if near is None else as_tensor(near)
         if q7 is not None:
-            angles = q7 if isinstance(q7, float) else as_tensor(q7)
-            return self._closed_form(self, pose, angles)
+            return self._closed_form(self, pose, as_tensor(q7))
         lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
         batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
         # A margin from the limits leaves room for corrections.
@@ -368,10 +359,7 @@ class Arm(SerialChain):
         before, path, missing = self.ready.to(pose.position), [], []
         for k in range(batch[-1]):
             here, angle = pose[..., k], None if angles is None else angles[..., k]
-            q, lost = (
-                before.new_full((1,), torch.nan),
-                torch.zeros(batch[:-1], dtype=torch.bool),
-            )
+            q, lost = before.new_full((1,), torch.nan), torch.zeros(batch[:-1]).bool()
             if self._closed_form is None:
                 start = before.double().unsqueeze(-2)
                 q = solutions_from(self, here, start, task=task).squeeze(-2).to(before)

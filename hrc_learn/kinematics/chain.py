@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -199,15 +199,15 @@ class SerialChain:
             tcp: Tool centre point in the frame of the flange.
             flange: Another flange, in the frame of the last joint; None: the same.
         """
-        return SerialChain(
-            joint_names=self.joint_names,
-            mounts=self.mounts,
-            flange=self.flange if flange is None else flange,
-            tcp=tcp,
-            limits=self.limits,
-            ready=self.ready,
-            kinds=self.kinds,
-        )
+        flange = self.flange if flange is None else flange
+        return SerialChain(**self.description_of_chain() | {"tcp": tcp, "flange": flange})
+
+    def description_of_chain(self) -> dict[str, Any]:
+        """Arguments with which `SerialChain` makes the same chain: all that its motion depends
+        on.
+        """
+        names = "joint_names", "mounts", "flange", "tcp", "limits", "ready", "kinds"
+        return {name: getattr(self, name) for name in names}
 
     def with_limits(self, limits: JointLimits) -> SerialChain:
         """The same arm with other joint limits."""
@@ -335,12 +335,13 @@ class SerialChain:
         count = len(self.joint_names)
         if not 1 <= joint <= count:
             raise ValueError(f"joint must be 1 to {count}, counted from the base, not {joint}.")
+        q = self.joint_positions(q)
         if torch.compiler.is_compiling():
-            q, mounts = self.joint_positions(q)[..., :joint], self._mount_entries[:joint]
-            _, J = transform_and_jacobian(q, mounts, _NO_TOOL, self._slides[:joint])
-            return torch.nn.functional.pad(J, (0, count - joint))
-        frames = torch.stack(self._joint_frames(self.joint_positions(q), joint), dim=-3)
-        J = self._screw_jacobian(frames, frames[..., -1, :, :])
+            mounts, slides = self._mount_entries[:joint], self._slides[:joint]
+            _, J = transform_and_jacobian(q[..., :joint], mounts, _NO_TOOL, slides)
+        else:
+            frames = torch.stack(self._joint_frames(q, joint), dim=-3)
+            J = self._screw_jacobian(frames, frames[..., -1, :, :])
         return torch.nn.functional.pad(J, (0, count - joint))
 
     def _joint_frames(self, q: Tensor, count: int | None = None) -> list[Tensor]:
