@@ -30,11 +30,10 @@ from hrc_learn.kinematics.capsule_fit import (
     Hull,
     capsule_volume,
     hull_of,
-    link_capsule,
     principal_axes,
 )
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule, link_capsules
 from hrc_learn.kinematics.description import Shape
 from hrc_learn.kinematics.registry import CAPSULES
 from hrc_learn.store import write_text
@@ -90,7 +89,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
         else:
             hulls[link].append(hull_of(shape))
     for link, parts in hulls.items():
-        capsules += [link_capsule(link, *fitted) for fitted in fit_link(parts)]
+        capsules += link_capsules((link, *fitted) for fitted in fit_link(parts))
     return CapsuleArm(chain, capsules, _left_out(chain, capsules, hulls))
 
 
@@ -225,7 +224,7 @@ def _around(points: np.ndarray, axes: np.ndarray) -> list[tuple[float, tuple]]:
 def _round(link: int, shape: Shape) -> LinkCapsule:
     (radius, half), pose = shape.size, shape.pose
     start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
-    return link_capsule(link, start, end, radius)
+    return link_capsules([(link, start, end, radius)])[0]
 
 
 def _left_out(

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import mesh_points
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule, link_capsules
 from hrc_learn.kinematics.description import Shape
 
 # Margin with which capsules contain every point [m], far above rounding errors.
@@ -67,7 +67,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
         if shape.kind in ("sphere", "capsule"):
             (radius, half), pose = shape.size, shape.pose
             start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
-            capsules.append(link_capsule(link, start, end, radius))
+            capsules += link_capsules([(link, start, end, radius)])
         else:
             try:
                 hull = hull_of(shape)
@@ -76,17 +76,17 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
             else:
                 hulls[link].append(hull)
     for link, parts in hulls.items():
-        capsules += [link_capsule(link, *fitted) for fitted in fit_link(parts)]
+        capsules += link_capsules((link, *fitted) for fitted in fit_link(parts))
     steps = [step[:3, 3].numpy() for step in (*chain.mounts, chain.flange, chain.tcp)]
     lengths = [float(np.linalg.norm(step)) for step in steps]
     radius = min(_BARE_RADIUS, _BARE_FRACTION * sum(lengths))
     shown = {capsule.link for capsule in capsules}
-    capsules += [
-        link_capsule(link, np.zeros(3), step, radius)
+    capsules += link_capsules(
+        (link, np.zeros(3), step, radius)
         for link, (step, length) in enumerate(zip(steps, lengths, strict=True))
         # A link shorter than this radius lies inside its neighbours.
         if link not in shown and (length > radius or not shown)
-    ]
+    )
     return CapsuleArm(chain, capsules, _left_out(chain, capsules))
 
 
@@ -207,12 +207,6 @@ def capsule_volume(capsule: _Capsule) -> float:
 def principal_axes(points: np.ndarray) -> np.ndarray:
     """Principal axes of points (n, 3) as rows, the shortest first."""
     return np.linalg.eigh(np.cov(points.T, bias=True))[1].T
-
-
-def link_capsule(link: int, start: np.ndarray, end: np.ndarray, radius: float) -> LinkCapsule:
-    """Capsule of a link, from the ends of its axis and its radius [m]."""
-    (a, b, c), (d, e, f) = start.tolist(), end.tolist()
-    return LinkCapsule(link=link, start=(a, b, c), end=(d, e, f), radius=radius)
 
 
 def _left_out(
