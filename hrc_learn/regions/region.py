@@ -291,22 +291,16 @@ class VisionRegion(Region):
     def value(self, x: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*both"]:
         """Region function f at the feature position x [px]; the largest of several points."""
         scaled = (x - self.target) / self.half_size
-        square = scaled * scaled
-        if square.shape[-1] > 2:
-            return square.unflatten(-1, (-1, 2)).sum(-1).amax(-1) - 1
-        return square.sum(-1) - 1
+        return (scaled * scaled).unflatten(-1, (-1, 2)).sum(-1).amax(-1) - 1
 
     def feedback(
         self, x: Float[Tensor, "*batch rows"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both rows"]]:
         """Potential and its gradient with respect to x [1/px]; means over the points."""
         scaled = (x - self.target) / self.half_size
-        if scaled.shape[-1] > 2:
-            P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
-            points = P.shape[-1]
-            return P.mean(-1), gradient.flatten(-2) / (points * self.half_size)
-        P, gradient = self._steer(scaled)
-        return P, gradient / self.half_size
+        P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
+        points = P.shape[-1]
+        return P.mean(-1), gradient.flatten(-2) / (points * self.half_size)
 
     def _steer(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
         """Potential of a point, and its gradient with respect to the normalised offset."""
