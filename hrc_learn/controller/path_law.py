@@ -278,12 +278,9 @@ class PathLaw:
 
         limitations = ()
         if reading.explain:
-            limitations = (
-                *self._path_limitations(state, reading, path, target, off),
-                *tracked.limitations(),
-            )
-        later = direct.time + config.dt * state.pace.speed_override
-        later = torch.where(direct.active, later, direct.time)
+            limitations = self._path_limitations(state, reading, path, target, off)
+            limitations += tracked.limitations()
+        passed = torch.where(direct.active, config.dt * state.pace.speed_override, 0.0)
         path = replace(
             path,
             followed=~direct.active,
@@ -292,7 +289,7 @@ class PathLaw:
             twist=twist,
             blocked=tracked.blocked,
             narrow_ahead=target.narrow_ahead,
-            direct_return=replace(direct, time=later),
+            direct_return=replace(direct, time=direct.time + passed),
         )
         state = replace(
             state, return_velocity=off.back, aside=off.aside, lost=off.lost, path=path

@@ -371,8 +371,7 @@ class BlendingConfig:
     """Age above which a feature is not used; an arm that follows the feature then stops [s]."""
 
     def __post_init__(self) -> None:
-        times = "blend_time", "max_feature_age"
-        check_settings(self, not_negative=("hysteresis", *times))
+        check_settings(self, not_negative=("hysteresis", "blend_time", "max_feature_age"))
 
 
 @pytree

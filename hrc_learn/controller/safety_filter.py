@@ -134,9 +134,9 @@ class SafetyFilter(nn.Module):
         Raises:
             ValueError: The last axis does not have one value for each joint.
         """
-        vector = values
-        if not isinstance(vector, Tensor):
-            vector = as_tensor(vector, self.barrier.velocity)
+        vector = (
+            values if isinstance(values, Tensor) else as_tensor(values, self.barrier.velocity)
+        )
         n = self.barrier.velocity.shape[-1]
         if vector.dim() == 0 or vector.shape[-1] != n:
             raise ValueError(
@@ -536,13 +536,13 @@ class SafetyFilter(nn.Module):
         """The next state, and the report."""
         before = given.state
         too_fast = torch.where(excess > _REPORTED, before.too_fast + before.dt, 0.0)
-        state = SafetyState(
+        state = replace(
+            before,
             velocity=v,
             # From the rounded velocities, so errors do not add up and a check finds the same
             # value.
             acceleration=(v - before.velocity) / given.dt,
             position=given.joint_position + v * given.dt,
-            dt=before.dt,
             fresh=torch.zeros_like(before.fresh),
             too_fast=too_fast,
             counts=before.counts + flags,

@@ -75,9 +75,9 @@ class TaskPace:
             dt: Control step [s].
         """
         scale = torch.minimum(people_scale, self.people_scale + dt / CHANGE_OF_RATE)
-        pace = replace(self, people_scale=scale)
+        time = self.time + scale * self.speed_override * dt
         blocked_for = torch.where(scale < _BLOCKED, self.blocked_for + dt, 0.0)
-        return replace(pace, time=self.time + pace.scale * dt, blocked_for=blocked_for)
+        return replace(self, people_scale=scale, time=time, blocked_for=blocked_for)
 
     def overridden(self, pause: Bool[Tensor, "*batch"], dt: float) -> TaskPace:
         """Pace one step later, slowed down smoothly during a pause.

@@ -144,10 +144,9 @@ class IOLayout:
 
     def shared_rows(self) -> Int[Tensor, " rows"]:
         """Rows of the fields that have one value for the whole batch."""
-        rows = [self.rows[field.name] for field in self.fields if not field.batched]
-        return torch.tensor(
-            [row for part in rows for row in range(part.start, part.stop)]
-        ).long()
+        every = torch.arange(self.size)
+        shared = [every[self.rows[field.name]] for field in self.fields if not field.batched]
+        return torch.cat([every[:0], *shared])
 
     def arrays(self, vector: Float[Tensor, "rows *batch"]) -> Mapping[str, np.ndarray]:
         """Views of a vector by field name, for reading and writing."""

@@ -62,7 +62,7 @@ def multiply(
 ) -> Float[Tensor, "*batch 4"]:
     """Hamilton product: rotate by q, then by p."""
     if torch.compiler.is_compiling():
-        return _written_out_product(p, q)
+        return torch.stack(product_of_components(p.unbind(-1), q.unbind(-1)), dim=-1)
     # Sums instead of a matmul: TF32 tensor cores would round the product to three digits.
     left = p[..., _PRODUCT_INDEX.like(p)].unflatten(-1, (4, 4)) * _PRODUCT_SIGN.like(p)
     return (left * q[..., None, :]).sum(-1)
@@ -302,11 +302,6 @@ def _k(square: Tensor) -> Tensor:
 # Compilers turn the functions below into one loop over the batch, while the indexing above
 # costs a lookup per number. Also, inductor of torch 2.11 generates C++ for the `gather` in
 # `from_matrix` that does not compile for a batch.
-
-
-def _written_out_product(p: Tensor, q: Tensor) -> Tensor:
-    """`multiply` component by component."""
-    return torch.stack(product_of_components(p.unbind(-1), q.unbind(-1)), dim=-1)
 
 
 def product_of_components[T: (Tensor, float)](p: Sequence[T], q: Sequence[T]) -> list[T]:

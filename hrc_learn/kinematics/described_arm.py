@@ -274,11 +274,8 @@ def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transfor
         for value in np.linspace(closed, opened, _FINGER_POSTURES).tolist()
     ]
     kind = "prismatic" if joint.kind == "prismatic" else "revolute"
-    follows = joint.follows
     x, y, z = joint.axis.tolist()
-    finger = FingerJoint(
-        joint.name, kind, closed=closed, opened=opened, follows=follows, axis=(x, y, z)
-    )
+    finger = FingerJoint(joint.name, kind, closed, opened, joint.follows, axis=(x, y, z))
     return finger, poses
 
 

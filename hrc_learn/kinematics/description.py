@@ -195,7 +195,7 @@ class Description:
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in self.links:
                 raise ValueError(f"{where} has the {role} {link!r}, but there is no such link")
-        if before := self.above(joint.child):
+        if before := self._above.get(joint.child):
             raise ValueError(
                 f"{self.path}: link {joint.child} has two parents, by the joints {before.name} "
                 f"and {joint.name}: a robot is a tree"
@@ -218,10 +218,6 @@ class Description:
     def below(self, link: str) -> Sequence[Joint]:
         """Joints that have a link as their parent."""
         return self._below.get(link, ())
-
-    def above(self, link: str) -> Joint | None:
-        """Joint that carries a link; None for the root."""
-        return self._above.get(link)
 
     def subtree(self, link: str) -> list[str]:
         """A link and all that it carries, parents first."""
@@ -271,7 +267,7 @@ class Description:
             tip = self._only_tip(base, ends, fingers)
         joints, link = [], tip
         while link != base:
-            joint = self.above(link)
+            joint = self._above.get(link)
             if joint is None:
                 raise ValueError(
                     f"{self.path}: link {tip!r} does not hang on {base!r}, but on {link!r}: "
