@@ -308,14 +308,13 @@ class MotionHead(nn.Module):
     def _timing(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Duration and delay [s], without a batch axis if they are fixed."""
         fraction = parameters[..., self.n_linear :].sigmoid()
-        duration = delay = None
+        duration, delay = parameters.new_tensor([self.shortest, 0.0]).unbind()
         if self.longest > self.shortest:
             ratio = math.log(self.longest / self.shortest)
             duration = self.shortest * (ratio * fraction[..., 0]).exp()
         if self.latest > 0:
             delay = self.latest * fraction[..., -1]
-        fixed = parameters.new_tensor([self.shortest, 0.0])
-        return fixed[0] if duration is None else duration, fixed[1] if delay is None else delay
+        return duration, delay
 
     def _normalised(self, time: Times, plan: "_Plan") -> tuple[Tensor, Tensor | None]:
         """Normalised times since the end of the delay, and a mask of times during the delay."""
@@ -368,17 +367,10 @@ class PlannedTrajectory(ContinuedTrajectory):
         response: Response,
     ):
         """Describe the motion of a plan, at rest while `waiting`."""
-        super().__init__(
-            coordinates=plan.coordinates,
-            s=s,
-            duration=plan.duration,
-            response=response,
-            since=plan.since,
-            position=plan.position,
-            velocity=plan.velocity,
-        )
-        self.delay = plan.delay
+        motion = dict(vars(plan))
+        self.delay: Tensor = motion.pop("delay")
         """Delay before the motion begins [s]."""
+        super().__init__(s=s, response=response, **motion)
         self._waiting = waiting
 
     @output

@@ -183,32 +183,26 @@ class ContinuedTrajectory(Trajectory):
     def __init__(
         self,
         *,
-        coordinates: Float[Tensor, "*#batch D M"],
-        s: Float[Tensor, "*#batch T"],
-        duration: Float[Tensor, "*#batch"],
-        response: Response,
         since: Float[Tensor, "*#batch"] | None,
         position: Float[Tensor, "*#batch D"],
+        **motion: Any,
         velocity: Float[Tensor, "*#batch D"],
     ):
-        """Describe a motion that passes a state; other arguments as for `Trajectory`.
+        """Describe a motion that passes a state.
 
         Args:
-            coordinates: x of the whole motion.
-            s: Normalised times, not before `since`.
-            duration: Duration of the whole motion [s].
-            response: Response of the primitive.
             since: Normalised time s_0 of the state; None: the motion is H x from its start.
             position: Position at s_0.
+            motion: Arguments of `Trajectory` for the whole motion; no time in `s` is before
+                `since`.
             velocity: Velocity at s_0 [1/s].
         """
-        motion: Any = {"coordinates": coordinates, "duration": duration, "response": response}
-        super().__init__(s=s, **motion)
+        super().__init__(**motion)
         self._since = since
         if since is not None:
-            reached = Trajectory(s=since[..., None], **motion)
+            reached = Trajectory(**motion | {"s": since[..., None]})
             off = position - reached.position[..., 0, :]
-            off_rate = (velocity - reached.velocity[..., 0, :]) * duration[..., None]
+            off_rate = (velocity - reached.velocity[..., 0, :]) * self.duration[..., None]
             self._off = torch.stack([off, off_rate], dim=-1)
 
     @full_precision

@@ -77,8 +77,7 @@ class FittedModel:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints; empty without a primitive of the joints."""
-        joint = self.joint
-        if joint is None:
+        if (joint := self.joint) is None:
             return ()
         names = joint.joint_names or [f"joint{i + 1}" for i in range(len(joint.start))]
         return tuple(name.removesuffix(".pos") for name in names)
