@@ -109,7 +109,8 @@ def repulsion(
     d = distance.clamp_min(TOUCH)
     # Obstacles farther than `reach` have no effect.
     strength = gain * (1 / d - 1 / reach).clamp_min(0) / d**2
-    return (strength * away / d).sum(-2)
+    # At the point itself no direction leads away, so the term is zero there.
+    return (strength * away / torch.where(distance > 0, distance, 1.0)).sum(-2)
 
 
 def velocity_coupling(

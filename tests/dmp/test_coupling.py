@@ -149,7 +149,16 @@ def test_repulsion_is_constant_within_a_millimetre(distance):
     found = repulsion(torch.from_numpy(distance * direction), torch.zeros(1, 3), reach=0.1)
     d = max(distance, 1e-3)
     strength = 1e-3 * (1 / d - 1 / 0.1) / d**2
-    np.testing.assert_allclose(found, strength * direction * distance / d, rtol=1e-6)
+    np.testing.assert_allclose(found, strength * direction, rtol=1e-6)
+
+
+@pytest.mark.gradients
+def test_repulsion_is_finite_at_the_obstacle_and_so_is_its_gradient():
+    position = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    found = repulsion(position, torch.zeros(1, 3), reach=0.1)
+    assert found.tolist() == [0.0, 0.0, 0.0]
+    found.sum().backward()
+    assert position.grad.isfinite().all()
 
 
 def test_repulsion_of_several_obstacles_adds_up_and_ends_at_the_reach():
