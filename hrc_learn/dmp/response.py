@@ -156,7 +156,7 @@ class TimeGrid:
         # Reading another device would wait for its queue, and transforms refuse it.
         if not s.is_cpu or transforming():
             return s is self.s and s._version == self.version
-        same = s.dtype == self.s.dtype and self.s.is_cpu
+        same = s.dtype == self.s.dtype and s.shape == self.s.shape and self.s.is_cpu
         return same and s.numpy().tobytes() == self.content
 
 

@@ -14,6 +14,7 @@ from hrc_learn.dmp import (
     PoseDMP,
     fit_rhythmic,
     fit_rhythmic_pose,
+    stack,
 )
 from hrc_learn.dmp.exported_dmp import export_dmp, resting_inputs, state_tensors
 from hrc_learn.geometry import Pose, quaternion
@@ -138,3 +139,15 @@ def test_outputs_that_require_gradients_can_be_plotted(kind):
     assert first.requires_grad
     first.square().sum().backward()
     assert dmp.motion.weights.grad.abs().max() > 0
+
+
+def test_times_in_another_shape_are_another_grid():
+    """The matrices of one grid are kept; a batch of times may hold the same bytes."""
+    dmp, time = KINDS["joint"](), TIME - TIME[0]
+    for some in (dmp, stack([dmp, dmp])):
+        whole = some.rollout(time).position
+        parts = some.rollout(time.view(2, 60)).position
+        assert parts.shape == (2, 60, 5)
+        expected = whole.view(-1, 2, 60, 5)
+        expected = expected[0] if some is dmp else expected[[0, 1], [0, 1]]
+        torch.testing.assert_close(parts, expected, rtol=0, atol=1e-9)
