@@ -23,7 +23,7 @@ class PlottableTensor(Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self.detach().cpu().numpy(), dtype=dtype)
+        return np.array(self.detach().cpu().numpy(), dtype=dtype, copy=copy)
 
     def __getitem__(self, index: Any) -> Tensor:
         return plottable(super().__getitem__(index))

@@ -151,3 +151,13 @@ def test_times_in_another_shape_are_another_grid():
         expected = whole.view(-1, 2, 60, 5)
         expected = expected[0] if some is dmp else expected[[0, 1], [0, 1]]
         torch.testing.assert_close(parts, expected, rtol=0, atol=1e-9)
+
+
+def test_an_array_of_an_output_is_a_copy():
+    motion = KINDS["joint"]().rollout()
+    before = motion.numpy()["position"].copy()
+    array = np.array(motion.position)
+    array += 1.0
+    np.testing.assert_array_equal(motion.numpy()["position"], before)
+    assert np.shares_memory(np.asarray(motion.position), motion.position.detach().numpy())
+    assert np.asarray(motion.position, dtype=np.float32).dtype == np.float32
