@@ -272,13 +272,14 @@ def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[T
     if not (math.isfinite(dt) and dt > 0):
         raise ValueError(f"dt must be positive, got {dt}")
     # The tolerance keeps rounding from adding a sample past the end.
-    last = math.ceil(duration.max().item() / dt * (1 - 1e-7))
+    longest = duration.max().item() if duration.numel() else 0.0
+    last = math.ceil(longest / dt * (1 - 1e-7))
     return dt * torch.arange(last + 1, dtype=torch.float64, device=duration.device)
 
 
 def _collapse_identical(values: Tensor, ndim: int) -> Tensor:
     """First tensor of a batch of `ndim`-dimensional tensors if all are equal, or the batch."""
-    if values.ndim == ndim:
+    if values.ndim == ndim or not values.numel():
         return values
     first = values[(0,) * (values.ndim - ndim)]
     return first if bool((values == first).all()) else values

@@ -117,15 +117,12 @@ def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
             "'none' to average them"
         )
     x, count = motions.coordinates().detach(), motions.timestamps.shape[-1]
-    batch = x.ndim - 2
-
-    def mean(tensor: Tensor) -> Tensor:
-        return tensor.flatten(0, batch - 1).mean(dim=0) if batch else tensor
-
+    if not x.numel():
+        raise ValueError("there are no primitives to average")
     return motions.with_coordinates(
-        mean(x),
-        mean(motions.duration.log()).exp(),
-        amplitude=mean(motions.amplitude),
+        x.reshape(-1, *x.shape[-2:]).mean(0),
+        motions.duration.log().mean().exp(),
+        amplitude=motions.amplitude.reshape(-1, x.shape[-2]).mean(0),
         timestamps=torch.linspace(0, 1, count, dtype=torch.float64).to(motions.timestamps),
     )
 
@@ -164,7 +161,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             ValueError: Fewer than two primitives, or a scaling other than `"none"`.
         """
         batch = primitives.motion.weights.shape[:-2]
-        if batch.numel() < 2 or not batch:
+        if batch.numel() < 2:
             raise ValueError("a distribution needs a batch of at least 2 primitives")
         one_mode = torch.ones(batch.numel(), 1).double().to(primitives.motion.start.device)
         return gaussians_of_modes(primitives, one_mode, slack)[0]

@@ -207,7 +207,7 @@ def _rows(
     B, D, _ = coordinates.shape
     matrix = table.matrix if pieces is None else table.matrix[:, : pieces * table.size]
     rows = product(coordinates, matrix)
-    return rows.view(B, D, -1, table.size).permute(0, 2, 3, 1)
+    return rows.view(B, D, rows.shape[-1] // table.size, table.size).permute(0, 2, 3, 1)
 
 
 def _flat_pieces(piece: Int[Tensor, "B T"]) -> tuple[Int[Tensor, "BT"], int]:
@@ -246,10 +246,10 @@ def blocks(s: Float[Tensor, "B T"], most: int) -> Iterator[tuple[slice, slice]]:
 
 
 def chunks(s: Float[Tensor, "B T"], most: int | None = None) -> Iterator[slice]:
-    """Slices of the batch with about `most` samples each; None: `CHUNK`."""
+    """Slices of the batch with about `most` samples each (None: `CHUNK`), if there are any."""
     most = most or CHUNK.get(s.device.type, CHUNK["cpu"])
     size = max(1, most // max(s.shape[1], 1))
-    return (slice(i, i + size) for i in range(0, s.shape[0], size))
+    return (slice(i, i + size) for i in range(0, s.shape[0] if s.numel() else 0, size))
 
 
 def _motion(s: Tensor, coordinates: Tensor, response: Response, order: int) -> Tensor:
@@ -287,7 +287,7 @@ def _adjoint(s: Tensor, grad: Tensor, response: Response, order: int) -> Tensor:
     """Gradient with respect to coordinates, from the gradient with respect to the motion."""
     table = _table(response, order, grad)
     B, _, D = grad.shape
-    by_x = grad.new_empty(B, D, len(table.matrix))
+    by_x = grad.new_zeros(B, D, len(table.matrix))
     for part in chunks(s):
         g = grad[part]
         piece, powers = table.locate(s[part], g.dtype)

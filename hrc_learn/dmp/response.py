@@ -109,8 +109,8 @@ class PiecewisePolynomial:
         piece = x.detach().long().clamp(max=pieces - 1)
         powers = powers_of(2 * (x - piece) - 1, P).unsqueeze(-2)
         # `index_select`, because a tracer reads a single index in brackets as a number.
-        c = self.coefficients.view(pieces, -1).index_select(0, piece.reshape(-1))
-        return (powers @ c.view(*s.shape, P, -1)).view(*s.shape, *shape)
+        c = self.coefficients.flatten(2).index_select(0, piece.reshape(-1))
+        return (powers @ c.view(*s.shape, *c.shape[1:])).view(*s.shape, *shape)
 
     def at(self, s: float) -> np.ndarray:
         """Value at the number `s`, (rows, columns), in NumPy."""
@@ -403,12 +403,12 @@ def product(
         if small and D >= MINIMUM_ROWS and torch.get_num_threads() == 1:
             return torch.from_numpy(np.matmul(X.numpy(), H.numpy()))
         y = empty_in_large_pages(X, *X.shape[:-1], H.shape[-1])
-        torch.mm(X.flatten(0, -2), H, out=y.view(-1, H.shape[-1]))
+        torch.mm(X.flatten(0, -2), H, out=y.flatten(0, -2))
         return y
     if single:
         return X @ H
     # One flat product: PyTorch's batched product with a common matrix is ten times slower.
-    return (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
+    return (X.flatten(0, -2) @ H).view(*X.shape[:-1], H.shape[-1])
 
 
 def empty_in_large_pages(like: Tensor, *shape: int) -> Tensor:

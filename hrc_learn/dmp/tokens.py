@@ -335,7 +335,7 @@ class MotionTokenizer(nn.Module):
             for k, sign, low, _ in self._code.decode(row)[0]:
                 found[k] = sign * low
         integers = torch.from_numpy(integers).to(self.levels)
-        return integers.reshape(*batch, -1)
+        return integers.reshape(*batch, self._code.size)
 
     def _stepped(self, jumps: Tensor, s: Tensor, start: Tensor) -> Float[Tensor, "*batch T S"]:
         """Columns of steps at normalised times."""

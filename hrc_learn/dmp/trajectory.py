@@ -148,13 +148,12 @@ class Trajectory(ArrayOutputs):
         s, (D, M) = self.s.double(), X.shape[-2:]
         if X.ndim == 2:
             # All times of the batch belong to the one motion.
-            y = motion(self._response, s.reshape(1, -1), X[None], order)
-            y = y.view(*s.shape, D)
+            y = motion(self._response, s.reshape(1, -1), X[None], order).view(*s.shape, D)
         else:
             batch = broadcast_shapes(X.shape[:-2], s.shape[:-1])
-            s = s.expand(*batch, -1).reshape(-1, s.shape[-1])
-            y = motion(self._response, s, X.expand(*batch, D, M).reshape(-1, D, M), order)
-            y = y.view(*batch, -1, D)
+            s = s.expand(*batch, -1).flatten(0, -2)
+            y = motion(self._response, s, X.expand(*batch, D, M).flatten(0, -3), order)
+            y = y.view(*batch, *y.shape[1:])
         return y.expand(*self._batch, -1, -1)
 
     @cached_property
@@ -185,17 +184,17 @@ class ContinuedTrajectory(Trajectory):
         *,
         since: Float[Tensor, "*#batch"] | None,
         position: Float[Tensor, "*#batch D"],
-        **motion: Any,
         velocity: Float[Tensor, "*#batch D"],
+        **motion: Any,
     ):
         """Describe a motion that passes a state.
 
         Args:
             since: Normalised time s_0 of the state; None: the motion is H x from its start.
             position: Position at s_0.
+            velocity: Velocity at s_0 [1/s].
             motion: Arguments of `Trajectory` for the whole motion; no time in `s` is before
                 `since`.
-            velocity: Velocity at s_0 [1/s].
         """
         super().__init__(**motion)
         self._since = since

@@ -170,7 +170,7 @@ class UdeMotion(Trajectory):
         size = min(MAXIMUM_STEP, self._response.forced.interval / 2)
         s = self.s.expand(*self._batch, -1) if self.s.ndim > 1 else self.s
         knot = (s.detach() / size).floor()
-        z = self._deviations(int(knot.max()), size)
+        z = self._deviations(int(knot.max()) if knot.numel() else 0, size)
         index = knot.long()[..., None, None].expand(*self._batch, -1, 2, 3)
         z = z.expand(*self._batch, *z.shape[-3:]).gather(-3, index)
         h = s - knot * size

@@ -173,7 +173,7 @@ def _knots(
     s: Float[Tensor, "*batch n"], window: tuple[float, float]
 ) -> tuple[Float[Tensor, "*batch n_and_2"], Int[Tensor, "*batch n_and_2"]]:
     """Ends of the window and via points in order, and the permutation that sorts them."""
-    first, last = (torch.full_like(s[..., :1], end) for end in window)
+    first, last = (s.new_full((*s.shape[:-1], 1), end) for end in window)
     knots, order = torch.cat([first, s, last], dim=-1).sort(dim=-1, stable=True)
     ends_first = (order[..., 0] == 0) & (order[..., -1] == s.shape[-1] + 1)
     if not (knots.diff() > 0).all() or not ends_first.all():

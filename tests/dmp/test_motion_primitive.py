@@ -14,6 +14,7 @@ from hrc_learn.dmp import (
     PoseDMP,
     fit_rhythmic,
     fit_rhythmic_pose,
+    mean_primitive,
     stack,
 )
 from hrc_learn.dmp.exported_dmp import export_dmp, resting_inputs, state_tensors
@@ -139,6 +140,29 @@ def test_outputs_that_require_gradients_can_be_plotted(kind):
     assert first.requires_grad
     first.square().sum().backward()
     assert dmp.motion.weights.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("kind", {**KINDS, **RHYTHMS})
+def test_no_motions_and_no_times_give_empty_results(kind):
+    dmp = {**KINDS, **RHYTHMS}[kind]()
+    none, T = stack([dmp, dmp])[:0], len(ROUND)
+    for arguments, count in (
+        ({}, T),
+        ({"time": ROUND}, T),
+        ({"time": ROUND.expand(0, -1)}, T),
+        ({"dt": 0.1}, 1),
+    ):
+        for name, values in none.rollout(**arguments).numpy().items():
+            assert values.shape[:2] == (0, count), name
+    state = none.step(none.step(none.initial_state(), 0.1), 0.1, phase_stopping=1.0)
+    assert len(state.position if hasattr(state, "position") else state.orientation) == 0
+    for some in (dmp, stack([dmp, dmp])):
+        for name, values in some.rollout([]).numpy().items():
+            assert values.shape[:-1] == (*some.duration.shape, 0)[: values.ndim - 1], name
+    # A grid without times has as many bytes as any other, which must not mix them up.
+    assert dmp.rollout(ROUND).numpy()["time"].shape == (T,)
+    with pytest.raises(ValueError, match="no primitives to average"):
+        mean_primitive(none)
 
 
 def test_times_in_another_shape_are_another_grid():

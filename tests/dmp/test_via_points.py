@@ -46,6 +46,13 @@ def test_via_points_are_passed_exactly_with_the_velocity_kept():
     torch.testing.assert_close(there.position[:, 1], plain.position[:, 1])
 
 
+def test_no_via_points_leave_the_motion_as_it_is():
+    time, position = arm_motion(n_joints=2)
+    dmp = JointDMP.fit(time, position, 20)
+    same = dmp.condition([], torch.zeros(0, 2))
+    torch.testing.assert_close(same.weights, dmp.weights, rtol=0, atol=0)
+
+
 def test_ends_stay_with_their_velocity():
     dmp = JointDMP.fit(*arm_motion(n_joints=2, moving_start=True))
     bent = dmp.condition([1.0], [[2.0, -1.0]])
