@@ -22,6 +22,7 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     broadcast_shapes,
+    checked_vector,
     fits_numpy,
     to_tensor,
 )
@@ -206,7 +207,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         demonstrated = demonstrated * (motion.duration / duration)[..., None]
         twist, omega = given.start_velocity, None
         if twist is not None:
-            twist = to_tensor(twist, like.dtype, like.device)
+            twist = checked_vector("start_velocity", twist, like[..., : E.stop])
             omega = twist[..., P.stop :]
         error, rate, reference = self._error_boundary(
             demonstrated[..., E], rotation, goal_rotation, omega
@@ -279,8 +280,10 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
                 moved = self._to_reference(columns, frame, new, filtered), new
             columns, frame = moved
             if position is not None:
+                position = checked_vector("position of goal", position, target[..., P])
                 target = _with_columns(target, P, position)
         if goal_body is not None:
+            goal_body = checked_vector("goal_body", goal_body, target[..., B])
             target = _with_columns(target, B, goal_body)
         return columns, frame, target
 
@@ -340,6 +343,8 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """
         values, E, (P, _) = columns.position, self.error_columns, self._others
         coupling = to_tensor(coupling, values.dtype, values.device)
+        if coupling.shape[-1:] != (P.stop,):  # not a linear acceleration alone
+            checked_vector("coupling", coupling, values[..., : E.stop])
         push = torch.zeros_like(values)
         if P.stop:
             push = _with_columns(push, P, coupling[..., P])
@@ -443,7 +448,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
     def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
         if isinstance(self.motion, UdePrimitive):
             # The rate in this formulation is minus the angular velocity.
-            return -to_tensor(coupling, frame.dtype, frame.device)
+            return -checked_vector("coupling", coupling, columns.position)
         return super()._acceleration(columns, frame, coupling)
 
     @classmethod

@@ -124,7 +124,7 @@ class Stepper:
         check_not_negative("phase_stopping", phase_stopping)
         s, y, before, scale, start, target, displacement, duration, _ = state
         if goal is not None:
-            target = _finite("goal", goal)
+            target = _checked("goal", goal, start)
             scale = self._scale(start, target)
         pace = 1.0 / (1.0 + phase_stopping)
         ds = dt * pace / duration
@@ -143,9 +143,8 @@ class Stepper:
         rest = target
         if coupling is not None:
             # At the equilibrium the spring balances the push.
-            rest = target + _finite("coupling", coupling) * (
-                duration**2 / self._spring.stiffness
-            )
+            push = _checked("coupling", coupling, start)
+            rest = target + push * (duration**2 / self._spring.stiffness)
         y = numpy_step(E, y, before, after, rest)
         return StepperState(now, y, forced, scale, start, target, displacement, duration, pace)
 
@@ -166,9 +165,10 @@ def _array(x: Tensor) -> Float64[np.ndarray, "..."]:
     return x.detach().cpu().to(torch.float64, copy=True).numpy()
 
 
-def _finite(name: str, values: np.ndarray) -> np.ndarray:
-    if values.dtype.kind not in "fiu":
-        raise ValueError(f"{name} must hold real numbers, got {values.dtype}")
+def _checked(name: str, values: Any, like: Vector) -> np.ndarray:
+    values = np.asarray(values)
+    if values.dtype.kind not in "fiu" or values.shape != like.shape:
+        raise ValueError(f"{name} must hold {len(like)} real numbers, got {values}")
     # For so few numbers Python's sum takes a third of the time.
     if not math.isfinite(sum(values.tolist())):
         raise ValueError(f"{name} must be finite, got {values}")

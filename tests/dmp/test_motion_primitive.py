@@ -185,3 +185,42 @@ def test_an_array_of_an_output_is_a_copy():
     np.testing.assert_array_equal(motion.numpy()["position"], before)
     assert np.shares_memory(np.asarray(motion.position), motion.position.detach().numpy())
     assert np.asarray(motion.position, dtype=np.float32).dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("kind", "use", "message"),
+    [
+        ("pose", {"coupling": [1.0] * 4}, r"coupling must have shape \(..., 6\), got \(4,\)"),
+        ("pose", {"coupling": [1.0]}, r"coupling must have shape \(..., 6\), got \(1,\)"),
+        ("pose", {"coupling": 1.0}, r"coupling must have shape \(..., 6\), got \(\)"),
+        ("pose", {"goal_body": [1.0]}, r"goal_body must have shape \(..., 2\), got \(1,\)"),
+        (
+            "orientation",
+            {"coupling": [1.0]},
+            r"coupling must have shape \(..., 3\), got \(1,\)",
+        ),
+        ("ude", {"coupling": [1.0]}, r"coupling must have shape \(..., 3\), got \(1,\)"),
+    ],
+)
+@shapes_unchecked()
+def test_steps_refuse_other_numbers_of_columns(kind, use, message):
+    ude = {"ude": lambda: OrientationDMP.fit(TIME, TURN, 12, formulation="ude")}
+    dmp = (KINDS | ude)[kind]()
+    with pytest.raises(ValueError, match=message):
+        dmp.step(dmp.initial_state(), 0.1, **use)
+
+
+@shapes_unchecked()
+def test_steps_refuse_a_goal_with_one_coordinate():
+    dmp, goal = KINDS["pose"](), Pose(torch.ones(1), TURN[0])
+    with pytest.raises(ValueError, match=r"position of goal must have shape \(..., 3\)"):
+        dmp.step(dmp.initial_state(), 0.1, goal=goal)
+
+
+@pytest.mark.parametrize(("kind", "size"), [("pose", 6), ("orientation", 3)])
+@pytest.mark.parametrize("given", [1, 4])
+@shapes_unchecked()
+def test_rollouts_refuse_start_velocities_of_another_size(kind, size, given):
+    message = rf"start_velocity must have shape \(..., {size}\), got \({given},\)"
+    with pytest.raises(ValueError, match=message):
+        KINDS[kind]().rollout(start_velocity=torch.ones(given))
