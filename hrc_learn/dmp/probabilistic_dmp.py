@@ -24,8 +24,8 @@ from hrc_learn.dmp._arguments import (
     to_tensor,
 )
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import MotionPrimitive
+from hrc_learn.dmp.linear_primitive import LinearPrimitive
+from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES, MotionPrimitive
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
 from hrc_learn.dmp.pose_dmp import PoseDMP
@@ -94,12 +94,14 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
         return primitives
     if motion.basis.periodic:
         raise ValueError("rhythms about different centres have no distribution")
+    s = torch.linspace(0, 1, REFIT_SAMPLES * motion.basis.count + 1).to(middle).double()
     with torch.no_grad():
-        shown: Any = primitives.rollout()
-        errors = motion.rollout_columns(Boundary(), motion.duration).position[..., columns]
-    errors = nearest_turn(to_error(shown.orientation, middle), errors)
+        shown: Any = primitives.rollout(s * motion.duration[..., None])
+    errors = nearest_turn(
+        to_error(shown.orientation, middle), shown.motion.position[..., columns]
+    )
     x = motion.coordinates().detach().clone()
-    x[..., columns, :] = motion.refit(shown.time, errors).coordinates().detach()
+    x[..., columns, :] = motion.refit(s, errors).coordinates().detach()
     motion = motion.with_coordinates(x, motion.duration)
     return primitives.with_motion(motion, middle.expand_as(own))
 

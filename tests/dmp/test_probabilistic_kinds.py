@@ -47,6 +47,18 @@ def test_goals_of_their_own_are_taken_about_one_reference(distribution):
     torch.testing.assert_close(deviation, error.std(0), rtol=0, atol=1e-3)
 
 
+def test_demonstrations_may_differ_in_length(distribution):
+    """Ten samples more or less of the same motions; timestamps are padded."""
+    _, q = turns()
+    kept = [torch.linspace(0, 199, 200 - 10 * i).round().long() for i in range(len(q))]
+    ragged = OrientationDMP.fit(
+        [2 * S[k] for k in kept], [x[k] for x, k in zip(q, kept, strict=True)], n_basis=15
+    )
+    found = ProbabilisticDMP.fit(ragged)
+    for own, other in zip(found.position(2 * S), distribution.position(2 * S), strict=True):
+        torch.testing.assert_close(own, other, rtol=0, atol=1e-3)
+
+
 def test_via_orientations_are_passed_by_either_sign_and_velocities_too():
     distribution = ProbabilisticDMP.fit(OrientationDMP.fit(*turns(), n_basis=15), slack=0.3)
     via = orientation(0.4, -0.2, 0.1)[None]
