@@ -176,18 +176,19 @@ def padded(time: Any, mask: Mask | None, *columns: Any) -> tuple[Any, Mask | Non
     if not isinstance(time, list | tuple) or not hasattr(time[0], "shape"):
         time = [time] * len(first)
     parts.append([to_tensor(row) for row in time])
-    for part in parts:
-        if part is not None and [len(row) for row in part] != lengths:
-            raise ValueError(
-                f"demonstrations have {lengths} samples, but time or another column has "
-                f"{[len(row) for row in part]}"
-            )
     valid = [torch.ones(n, dtype=torch.bool) for n in lengths]
     if mask is not None:
         valid = [to_tensor(row).bool() for row in mask]
+    parts.append(valid)
+    for part in parts:
+        if part is not None and [len(row) for row in part] != lengths:
+            raise ValueError(
+                f"demonstrations have {lengths} samples, but time, mask or another column has "
+                f"{[len(row) for row in part]}"
+            )
     joined = [
         None if part is None else torch.nn.utils.rnn.pad_sequence(part, batch_first=True)
-        for part in (*parts, valid)
+        for part in parts
     ]
     complete = mask is None and len(set(lengths)) == 1
     return joined[-2], None if complete else joined[-1], joined[:-2]

@@ -57,8 +57,15 @@ def test_what_is_no_list_of_arrays_stays():
     np.testing.assert_array_equal(one_grid, np.stack([times[0]] * 2))
     for columns in ([], [1.0, 2.0], np.stack(motions), [np.float64(1), np.float64(2)]):
         assert padded(times, None, columns)[2][0] is columns
-    with pytest.raises(ValueError, match=r"have \[5, 5\] samples, but time or another"):
+    with pytest.raises(ValueError, match=r"have \[5, 5\] samples, but time, mask or another"):
         padded(times, None, motions, [motions[0], motions[1][:4]])
+
+
+def test_a_mask_that_is_too_short_is_refused():
+    """Padded like a demonstration, it would silently leave out the last samples."""
+    times, motions = ragged(lengths=(5, 8))
+    with pytest.raises(ValueError, match=r"mask or another column has \[4, 8\]"):
+        padded(times, [np.ones(4, bool), np.ones(8, bool)], motions)
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 2)])
