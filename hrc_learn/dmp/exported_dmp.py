@@ -31,8 +31,6 @@ from hrc_learn.geometry import Pose, quaternion
 
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
-FRAMES = "reference", "goal_velocity"
-"""State fields with the frame of the columns: for orientations and for moving goals."""
 TRACED_BATCH = 3
 """Batch size during tracing: any but 0 and 1, which the tracer would treat as constants."""
 ROUNDINGS = 8
@@ -143,8 +141,9 @@ def _named(state: Any) -> Tensors:
 def _restored_state(dmp: MotionPrimitive, tensors: Tensors) -> Any:
     """State from its tensors; the inverse of `state_tensors`."""
     columns = DMPState(**{name: tensors[name] for name in STATE})
-    frames = [tensors[name] for name in FRAMES if name in tensors]
-    return dmp.state_of(columns, frames[0] if frames else None)
+    # The frame of orientations, of moving goals, or None for joints.
+    frame = tensors.get("reference", tensors.get("goal_velocity"))
+    return dmp.state_of(columns, frame)
 
 
 def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:

@@ -236,9 +236,9 @@ def check_samples(
         mask = _expand("mask", mask, (*batch, T), position)
         complete = bool(mask.all())
     if position.numel() == 0:
-        raise ValueError(f"position has shape {(*batch, T, D)}: there is nothing to fit")
+        raise ValueError(f"{name} has shape {(*batch, T, D)}: there is nothing to fit")
     time, mask = time.reshape(-1, T), mask.reshape(-1, T)
-    _check_count(mask, complete, batch)
+    _check_count(mask, batch)
     _check_finite("time", time[:, None], mask, batch)
     # Time comes last from here on, because all computations run along it.
     position = _check_finite(name, position.reshape(-1, T, D).mT.contiguous(), mask, batch)
@@ -295,9 +295,7 @@ def _expand(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor)
         ) from None
 
 
-def _check_count(mask: Bool[Tensor, "B T"], complete: bool, batch: Sequence[int]) -> None:
-    if complete and mask.shape[-1] >= MINIMUM_SAMPLES:
-        return
+def _check_count(mask: Bool[Tensor, "B T"], batch: Sequence[int]) -> None:
     few = mask.sum(-1) < MINIMUM_SAMPLES
     if few.any():
         i = int(few.nonzero()[0])
