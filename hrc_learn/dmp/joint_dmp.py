@@ -287,7 +287,7 @@ def select_basis_count(
         raise ValueError(f"needs candidates and at least 2 folds, got {candidates}, {n_folds}")
     folds = [_held_out(samples.mask, fold, n_folds) for fold in range(n_folds)]
     elapsed = (samples.s * samples.duration[:, None]).reshape(*samples.batch, -1)
-    errors = []
+    span, errors = samples.span.amax() or 1.0, []
     for count in candidates:
         square, weight = torch.zeros((), dtype=torch.float64), 0
         for held in folds:
@@ -295,7 +295,7 @@ def select_basis_count(
             dmp = JointDMP.fit(time, position, count, mask=kept, scaling=scaling, **options)
             with torch.no_grad():
                 reproduction = dmp.rollout(elapsed).position.mT.reshape(samples.position.shape)
-                error = (reproduction - samples.position).double() / samples.span.amax()
+                error = (reproduction - samples.position).double() / span
             square = square + error.mT[held].square().sum()
             weight += int(held.sum()) * error.shape[1]
         errors.append((square / weight).sqrt())

@@ -84,3 +84,10 @@ def test_eight_numbers_up_to_a_hundred_are_compared_by_default():
     chosen = select_basis_count(*arm_motion(n_samples=210, n_joints=1), n_folds=2)
     assert chosen.candidates == (10, 15, 20, 30, 40, 50, 70, 100)
     assert len(chosen.error) == 8
+
+
+def test_a_motion_that_rests_needs_the_fewest():
+    time = torch.linspace(0, 1, 30, dtype=torch.float64)
+    chosen = select_basis_count(time, torch.ones(30, 2).double(), (5, 10))
+    assert chosen.count == 5
+    assert chosen.error.tolist() == pytest.approx([0.0, 0.0], abs=1e-12)
