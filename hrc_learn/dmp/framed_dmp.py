@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Points, Times
+from hrc_learn.dmp._arguments import Mask, Points, Times, finite
 from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive
@@ -45,6 +45,8 @@ class Frames:
     b: Float[Tensor, "*batch F D"]
 
     def __post_init__(self):
+        finite("A of frames", self.A)
+        finite("b of frames", self.b)
         if self.A.shape != (*self.b.shape, self.b.shape[-1]) or self.b.ndim < 2:
             raise ValueError(
                 f"frames must have A (..., F, D, D) and b (..., F, D), got "

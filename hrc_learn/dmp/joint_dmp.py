@@ -373,7 +373,7 @@ def _accumulate(
     """Sums over all processes: products, rows (start, goal, range, duration), sample count."""
     D, rows, products, sums = 0, 0, None, None
     for i, (time, position) in distributed.local_items(demonstrations):
-        samples = _checked(i, time, position)
+        samples = _checked(i, time, position, D)
         D, rows = samples.position.shape[1], rows + samples.s.shape[1]
         ends = torch.stack([samples.first, samples.last], 1).double()
         own = normal_products(response, samples, ends)
@@ -390,11 +390,13 @@ def _accumulate(
     return total(products), total(sums), int(total(torch.tensor(rows)))
 
 
-def _checked(index: int, time: Times, position: Points) -> Samples:
+def _checked(index: int, time: Times, position: Points, D: int) -> Samples:
+    """Samples of one demonstration; D: number of coordinates of those before it, or 0."""
     try:
         samples = check_samples(time, position)
     except ValueError as error:
         raise ValueError(f"demonstration {index}: {error}") from None
-    if samples.batch:
-        raise ValueError(f"demonstration {index}: position must be (T, D), without a batch")
+    if samples.batch or D not in (0, samples.position.shape[1]):
+        wanted = f"(T, {D or 'D'}), without a batch"
+        raise ValueError(f"demonstration {index}: position must be {wanted}")
     return samples

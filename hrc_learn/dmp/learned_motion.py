@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import contexts_of, to_tensor
+from hrc_learn.dmp._arguments import contexts_of, finite, to_tensor
 from hrc_learn.dmp.framed_dmp import FramedDMP, Frames
 from hrc_learn.dmp.joint_dmp import JointDMP, select_basis_count
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
@@ -266,6 +266,7 @@ class LearnedMotion:
             raise ValueError(
                 f"context must have {self.context.shape[-1]} numbers, got {context.shape[-1]}"
             )
+        finite("context", context)
         w = _weights(self.chosen.family, self.chosen.strength, self.context, context)
         x = torch.einsum("qn,ndm->qdm", w, _coordinates(self.each))
         return self._primitives(x, w)

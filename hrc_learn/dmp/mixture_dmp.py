@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Points, Times, Vectors, contexts_of, to_tensor
+from hrc_learn.dmp._arguments import Points, Times, Vectors, contexts_of, finite, to_tensor
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.probabilistic_dmp import (
     PATH_TIMES,
@@ -106,7 +106,7 @@ class MixtureDMP[P: MotionPrimitive]:
 
     def at(self, context: Vectors) -> "MixtureDMP[P]":
         """Mixture given a context, (C,): modes with similar contexts become more likely."""
-        c = to_tensor(context, torch.float64)
+        c = finite("context", to_tensor(context, torch.float64))
         if c.shape != self.contexts.shape[1:]:
             raise ValueError(
                 f"context must be {tuple(self.contexts.shape[1:])}, got {tuple(c.shape)}"

@@ -9,7 +9,9 @@ from demo_motions import arm_motion, turning_motion
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
+    Frames,
     JointDMP,
+    MixtureDMP,
     MotionHead,
     OrientationDMP,
     PoseDMP,
@@ -17,6 +19,7 @@ from hrc_learn.dmp import (
     Stepper,
     fit_rhythmic_orientation,
     fit_shared,
+    learn,
 )
 from hrc_learn.geometry import Pose, quaternion
 
@@ -120,6 +123,20 @@ def rhythms_about_different_centres():
     ProbabilisticDMP.fit(fit_rhythmic_orientation(turn, torch.stack([wave, away]), period=6.2))
 
 
+def unknown_context():
+    both = torch.stack([POSITION, 1.1 * POSITION])
+    return MixtureDMP.fit(JointDMP.fit(TIME, both, 8))
+
+
+def learned():
+    return learn([(TIME, POSITION), (TIME, 1.1 * POSITION)], context=[1.0, 2.0], n_basis=8)
+
+
+def stepped(**inputs):
+    stepper = Stepper(JointDMP.fit(TIME, POSITION, 8))
+    stepper.step(stepper.initial_state(), 0.01, **inputs)
+
+
 def distribution():
     both = torch.stack([POSITION, 1.1 * POSITION])
     return ProbabilisticDMP.fit(JointDMP.fit(TIME, both, 8))
@@ -154,8 +171,31 @@ REFUSED = [
     (
         lambda: fit_shared([(TIME, POSITION), (TIME, torch.stack([POSITION] * 2))], 8),
         ValueError,
-        r"demonstration 1: position must be \(T, D\), without a batch",
+        r"demonstration 1: position must be \(T, 3\), without a batch",
     ),
+    (
+        lambda: fit_shared([(TIME, POSITION), (TIME, POSITION[:, :2])], 8),
+        ValueError,
+        r"demonstration 1: position must be \(T, 3\)",
+    ),
+    (lambda: unknown_context().at([math.nan] * 6), ValueError, "context must be finite"),
+    (
+        lambda: learned().at(context=[math.nan]),
+        ValueError,
+        "context must be finite, but contains nan",
+    ),
+    (
+        lambda: Frames(torch.eye(3)[None], torch.full((1, 3), math.nan)),
+        ValueError,
+        "b of frames must be finite",
+    ),
+    (
+        lambda: Frames(math.inf * torch.ones(1, 3, 3), torch.zeros(1, 3)),
+        ValueError,
+        "A of frames must be finite",
+    ),
+    (lambda: stepped(goal=np.ones(1)), ValueError, r"goal must hold 3 real numbers"),
+    (lambda: stepped(coupling=np.ones(1)), ValueError, r"coupling must hold 3 real numbers"),
 ]
 
 
