@@ -141,8 +141,7 @@ class FramedDMP:
         seen = Frames(frames.A.detach().double(), frames.b.detach().double()).inwards(x)
         mean = seen.mean(0)
         off = seen - mean
-        least = dmps.amplitude.max().item() / 1000 if tolerance is None else tolerance
-        smooth = _smooth_deviations(dmps, off, least)
+        smooth = _smooth_deviations(dmps, off, tolerance)
         # The smooth deviations have the weight of one more demonstration.
         shown = off.permute(1, 2, 3, 0) * math.sqrt(n / (n + 1) / (n - 1))
         precision = _precision(torch.cat([shown, smooth], dim=-1))
@@ -184,18 +183,22 @@ def _precision(root: Float[Tensor, "F D M columns"]) -> Float[Tensor, "F DM DM"]
 
 
 def _smooth_deviations(
-    dmps: JointDMP, off: Float[Tensor, "n F D M"], least: float
+    dmps: JointDMP, off: Float[Tensor, "n F D M"], least: float | None
 ) -> Float[Tensor, "F D M columns"]:
     """Square root of the covariance of smooth deviations, equal in all directions.
 
     Args:
         dmps: Primitives of the demonstrations.
         off: Deviations of their coordinates from the mean in each frame.
-        least: Smallest standard deviation of a motion at any time.
+        least: Smallest standard deviation of a motion at any time; None: 0.1 % of the largest
+            range.
     """
     n, F, D, _ = off.shape
     s = torch.linspace(0, 1, REFIT_SAMPLES * dmps.basis.count + 1).to(off)
     rows = dmps.response.evaluate(s)[:, 0]
+    if least is None:
+        shown = dmps.coordinates().detach().double() @ rows.mT
+        least = float((shown.amax(-1) - shown.amin(-1)).max()) / 1000 or 1e-3
     # Variance along the motion, averaged over all directions.
     variance = (off @ rows.mT).square().sum(0).mean(-2) / (n - 1)
     size = (variance / (n + 1) + least**2).sqrt()

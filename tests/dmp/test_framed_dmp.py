@@ -104,6 +104,22 @@ def test_a_frame_knows_what_was_shown_in_it():
     assert expected[0] > 10 * expected[-1]
 
 
+def test_the_default_tolerance_is_a_thousandth_of_the_largest_range():
+    """A column that never moves, such as a height over a table, has no range."""
+    frames = situations(5)
+    time, position = motions(frames)
+    flat = torch.cat([position, torch.ones_like(position[..., :1])], -1)
+    A = torch.eye(3).double().repeat(5, 2, 1, 1)
+    A[..., :2, :2] = frames.A
+    level = Frames(A, torch.nn.functional.pad(frames.b, (0, 1)))
+    least = (position.amax(1) - position.amin(1)).max().item() / 1000
+    found, wanted = (
+        FramedDMP.fit(time, flat, level, 20, tolerance=tolerance).precision
+        for tolerance in (None, least)
+    )
+    torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3 * wanted.abs().max().item())
+
+
 def test_motions_move_with_their_frames(model):
     frames = situations(2, seed=3)
     R, p = turned(torch.tensor(2.0).double()), torch.tensor([3.0, -1.0]).double()
