@@ -63,7 +63,8 @@ def fit_rhythmic(
         samples.s, samples.duration, samples.position.double(), samples.mask, strict=True
     ):
         elapsed, y = (s * duration)[valid], y[:, valid].mT
-        tau = elapsed.new_tensor(period) if period else find_period(elapsed, y, response)
+        tau = find_period(elapsed, y, response) if period is None else period
+        tau = torch.as_tensor(tau, dtype=elapsed.dtype, device=elapsed.device)
         if not 0 < tau <= duration:
             raise ValueError(
                 f"a rhythm needs a whole period of {tau:.3f} s, got {duration.item():.3f} s"

@@ -159,6 +159,8 @@ def test_what_cannot_be_a_rhythm_is_refused():
     time, y = rhythm()
     with pytest.raises(ValueError, match=r"a whole period of 9\.000 s, got 4\.200 s"):
         fit_rhythmic(time, y, period=9.0)
+    with pytest.raises(ValueError, match=r"a whole period of 0\.000 s"):
+        fit_rhythmic(time, y, period=0.0)
     with pytest.raises(ValueError, match="no period found"):
         fit_rhythmic(time, torch.zeros(500, 2, dtype=torch.float64))
 
