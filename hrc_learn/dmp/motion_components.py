@@ -105,7 +105,7 @@ class MotionComponents(nn.Module):
         varying = bool(((samples.duration / duration).log().abs() > SAME_DURATION).any())
         known = (1 if start_velocity is None else KNOWN_STATE) if start_known else 0
         config = {"known": known, "duration": float(duration), "varying": int(varying)}
-        units = units | {"start": samples.columns[:, 0].mean(0)}
+        units = units | {"start": samples.first.mean(0)}
         for points in POINTS:
             found = cls(config | {"points": points}, units)
             features, free, C = found._splines(samples, start_velocity)

@@ -746,3 +746,13 @@ class TestCode:
             Interval(0, 1, 1, 5),
             Interval(0, -1, 1, 5),
         )
+
+
+def test_batches_of_any_shape_are_learned_and_no_sequences_decode_to_no_motions(tokenizer):
+    time, (y, _) = TIME, motions(12)
+    flat, nested = (MotionTokenizer.fit(time, x) for x in (y, y.unflatten(0, (3, 4))))
+    assert nested.columns == flat.columns == 3
+    torch.testing.assert_close(nested.components.start, flat.components.start)
+    assert flat.encode(time, y).tolist() == nested.encode(time, y).tolist()
+    none = tokenizer.decode(np.zeros((0, 4), int), time)
+    assert none.shape == (0, len(time), 3)
