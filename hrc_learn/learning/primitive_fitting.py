@@ -190,10 +190,9 @@ class Motions:
         The angle is continuous over time, and its first value is continuous from each
         demonstration to the next.
         """
-        franka = {arm.joint_names: arm for arm in (panda, fr3)}
-        if self.demos.joint_position is None or self.joint_names not in franka:
+        chain = {arm.joint_names: arm for arm in (panda, fr3)}.get(self.joint_names)
+        if chain is None or self.demos.joint_position is None or self.joint_unit != "rad":
             return None
-        chain = franka[self.joint_names]
         angle = np.unwrap(arm_angle(chain, self.demos.joint_position).numpy(), axis=1)
         start = np.unwrap(angle[:, :1], axis=0) - angle[:, :1]
         return torch.from_numpy(angle + start)[..., None]

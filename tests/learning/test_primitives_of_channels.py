@@ -233,7 +233,9 @@ def test_an_fr3_or_another_arm_has_no_pose_of_the_panda():
         motions = Motions.of(demos)
         assert motions.missing("pose") == ["position", "orientation"]
         assert (motions._body_shape() is not None) == body
-    assert Motions.of(DemonstrationSet(list(panda_demos()), joint_unit="1")).missing("pose")
+    fractions = Motions.of(DemonstrationSet(list(panda_demos()), joint_unit="1"))
+    assert fractions.missing("pose")
+    assert fractions._body_shape() is None
 
 
 def test_arm_angles_are_continuous_and_start_in_one_turn(monkeypatch):
