@@ -103,6 +103,8 @@ def play_path(
             time=time, joints=joints.numpy(), planned_duration=lasting, goal_errors=error
         )
     pose = _pose_path(model, start, goal, lasting)
+    if kind == "position":  # its orientation is not part of the motion
+        goal = Target(position=goal.position)
     return PlayedMotion(
         time=time,
         position=pose.position.numpy(),

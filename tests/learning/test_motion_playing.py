@@ -192,6 +192,9 @@ def test_positions_alone_are_played_from_any_start(positions):
     off = np.linalg.norm(motion.position[-1] - goal.position.numpy())
     assert off < 1e-3
     assert motion.goal_errors["goal_position_error_mm"] == pytest.approx(1e3 * off, abs=1e-6)
+    # The orientation of a goal is not part of such a motion, so it has no error.
+    turned = at(GOALS["panda"], orientation=torch.tensor([0.0, 1.0, 0.0, 0.0]).double())
+    assert play_path(positions, start, turned, 1.5).goal_errors == motion.goal_errors
 
 
 def test_positions_alone_move_an_arm(positions):
