@@ -194,17 +194,18 @@ DIRECTIONS = MappingProxyType(
 """Direction of each key in the base frame: i away from the robot, j to its left, u up."""
 
 
-_KEY_HOLDS = 0.3
-"""Time for which a key press counts [s]."""
+_FIRST, _REPEATED, _TAP = 0.7, 0.3, 0.4
+"""`_FIRST`: time for which a first press counts [s]; keyboards begin to repeat a held key after
+0.25 to 0.66 s. `_REPEATED`: time for which a repeat counts [s]. `_TAP`: fraction of the speed
+until the key repeats, at which a tap moves the end effector by 7 cm."""
 
 
 class KeyboardState:
     """Keys held down, and the direction that they request.
 
-    Terminals report presses and repeats but no releases. A press therefore counts for a short
-    time (`_KEY_HOLDS`). A held key repeats every 30 ms, but for the first time only after a
-    quarter to half a second, so that the motion may pause once. A keyboard that falls silent
-    requests no motion.
+    Terminals report presses and repeats but no releases. A press or repeat therefore counts for
+    a limited time. A first press moves slowly until a repeat shows that the key is held. A
+    keyboard that falls silent requests no motion.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
@@ -214,18 +215,22 @@ class KeyboardState:
             clock: Monotonic clock [s].
         """
         self._clock = clock
-        self._until = dict.fromkeys(DIRECTIONS, float("-inf"))
+        # Time until which each key counts [s], and its fraction of the speed.
+        self._held = dict.fromkeys(DIRECTIONS, (float("-inf"), 0.0))
 
     def press(self, key: str) -> None:
         """Note a press or repeat; keys that are not in `DIRECTIONS` have no effect."""
-        if key in self._until:
-            self._until[key] = self._clock() + _KEY_HOLDS
+        if key in self._held:
+            now = self._clock()
+            repeats = now < self._held[key][0]
+            self._held[key] = (now + _REPEATED, 1.0) if repeats else (now + _FIRST, _TAP)
 
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Direction requested now: a unit vector, or zero."""
+        """Direction requested now, as a fraction of the largest speed."""
         now = self._clock()
-        held = [DIRECTIONS[key] for key, until in self._until.items() if now < until]
-        return capped(np.sum([(0.0, 0.0, 0.0), *held], axis=0), 1.0)
+        speeds = {key: speed for key, (until, speed) in self._held.items() if now < until}
+        held = [speed * np.array(DIRECTIONS[key]) for key, speed in speeds.items()]
+        return capped(np.sum([np.zeros(3), *held], axis=0), 1.0)
 
 
 KEYS: MappingProxyType[str, Request] = MappingProxyType(

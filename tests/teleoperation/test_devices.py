@@ -180,14 +180,30 @@ def test_keys_count_for_a_moment_and_together():
     keys = KeyboardState(clock)
     keys.press("i")
     keys.press("x")
-    assert keys.direction().tolist() == [1.0, 0.0, 0.0]
+    assert keys.direction().tolist() == [0.4, 0.0, 0.0]
     clock.time = 0.15
     keys.press("u")
-    np.testing.assert_allclose(keys.direction(), np.array([1, 0, 1]) / 2**0.5)
-    clock.time = 0.3
-    assert keys.direction().tolist() == [0.0, 0.0, 1.0]
-    clock.time = 0.46
+    np.testing.assert_allclose(keys.direction(), [0.4, 0, 0.4])
+    clock.time = 0.7
+    assert keys.direction().tolist() == [0.0, 0.0, 0.4]
+    clock.time = 0.86
     assert not keys.direction().any()
+
+
+@pytest.mark.parametrize(("delay", "period"), [(0.25, 0.03), (0.5, 0.033), (0.66, 0.1)])
+def test_a_held_key_moves_without_a_pause_and_soon_ends(delay, period):
+    clock = Clock()
+    keys, speeds = KeyboardState(clock), []
+    presses = [0.0, *np.arange(delay, 2.0, period)]
+    for clock.time in np.arange(0.0, 2.5, 0.01):
+        while presses and presses[0] <= clock.time:
+            keys.press("j")
+            presses.pop(0)
+        speeds.append(keys.direction()[1])
+    first, end = round(100 * delay) + 2, round(100 * (2.0 + 0.31))
+    np.testing.assert_array_equal(speeds[: first - 3], 0.4)
+    np.testing.assert_array_equal(speeds[first:200], 1.0)
+    np.testing.assert_array_equal(speeds[end:], 0.0)
 
 
 def test_opposite_keys_cancel():
@@ -204,9 +220,9 @@ def test_what_is_typed_leads_grips_and_asks():
     keyboard = TerminalKeyboard(panda, lambda: next(typed), KeyboardState(clock))
     assert isinstance(keyboard, Human)
     asked = keyboard.read(STATE)
-    np.testing.assert_allclose(asked.twist[:3], [SPEED, 0, 0])
+    np.testing.assert_allclose(asked.twist[:3], [0.4 * SPEED, 0, 0])
     assert asked.gripper is None
-    clock.time = 0.4
+    clock.time = 0.8
     assert not keyboard.read(STATE).twist.any()
     asked = keyboard.read(STATE)
     assert asked.requests == ("start", "save")

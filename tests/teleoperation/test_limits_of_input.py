@@ -381,16 +381,17 @@ def test_a_key_counts_for_a_while_after_its_press():
     now = [5.0]
     keys = KeyboardState(lambda: now[0])
     assert keys.direction().tolist() == [0, 0, 0]
-    for key in "iuxi":
+    for key in "iuxi":  # i is held, u was tapped
         keys.press(key)
-    np.testing.assert_allclose(keys.direction(), np.array([1, 0, 1]) / math.sqrt(2))
+    np.testing.assert_allclose(keys.direction(), np.array([1, 0, 0.4]) / math.hypot(1, 0.4))
     now[0] = 5.29
     assert keys.direction()[0] > 0
     now[0] = 5.31
+    assert keys.direction().tolist() == [0, 0, 0.4]
+    now[0] = 5.71
     assert keys.direction().tolist() == [0, 0, 0]
-    keys.press("k")
-    keys.press("l")
-    keys.press("o")
+    for key in "kloklo":
+        keys.press(key)
     np.testing.assert_allclose(keys.direction(), -np.ones(3) / math.sqrt(3))
 
 

@@ -141,7 +141,7 @@ def test_keys_move_the_end_effector(made, server, key):
     (command,) = [c for c in commands if c.hotkey == key.upper()]
     for callback in command._impl.trigger_cb:
         asyncio.run(callback(SimpleNamespace()))
-    np.testing.assert_allclose(panel.keys.direction(), DIRECTIONS[key])
+    np.testing.assert_allclose(panel.keys.direction(), 0.4 * np.array(DIRECTIONS[key]))
     words = {"i": "away", "k": "back", "j": "left", "l": "right", "u": "up", "o": "down"}
     assert command.label == f"Move the end effector {words[key]}"
 
