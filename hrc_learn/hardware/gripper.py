@@ -130,17 +130,17 @@ class GripperThread(Connected):
             raise failure
 
     def move(self, width: float) -> None:
-        """Request an opening [m]; below 5 mm, the fingers squeeze.
+        """Request an opening [m]; below 5 mm, and at negative values, the fingers squeeze.
 
         A loop may repeat a request in every step: it is executed once. A failed request is not
         retried until another opening is requested: fingers that move by themselves after a
         reconnection would surprise a person nearby.
 
         Raises:
-            ValueError: The opening is not finite, or negative.
+            ValueError: The opening is not finite.
         """
-        if not 0 <= width < float("inf"):
-            raise ValueError(f"width must be finite and not negative [m], but is {width}.")
+        if not abs(width) < float("inf"):
+            raise ValueError(f"width must be finite [m], but is {width}.")
         with self._news:
             if self._last is not None and abs(width - self._last) < _NARROW:
                 return

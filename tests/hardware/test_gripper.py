@@ -177,10 +177,16 @@ def test_a_gripper_that_tells_no_width_is_not_waited_for_for_ever():
         GripperThread(Silent, startup=0.1)
 
 
-@pytest.mark.parametrize("width", [-0.01, float("nan"), float("inf")])
+@pytest.mark.parametrize("width", [float("nan"), float("inf"), float("-inf")])
 def test_an_opening_must_be_a_width(gripper, width):
-    with pytest.raises(ValueError, match="width must be finite and not negative"):
+    with pytest.raises(ValueError, match="width must be finite"):
         gripper.move(width)
+
+
+def test_a_policy_that_closes_by_a_little_less_than_zero_squeezes(driver, gripper):
+    gripper.move(-1e-4)
+    assert driver.begun.acquire(timeout=PATIENCE)
+    assert driver.calls == [("squeeze",)]
 
 
 def test_its_threads_end_with_it(driver):
