@@ -39,6 +39,8 @@ _RECENT = 500
 """Number of newest commands whose latency the diagnostics report."""
 _HISTORY = 500
 """Number of joint states kept, to find the one at the time of an image."""
+_PUSH = 0.25
+"""Time for which a push counts [s], as at the page: the message that ends it may be lost."""
 _PATH = 500
 """Number of points of the tool path in the markers."""
 
@@ -86,7 +88,8 @@ class ControllerNode:
         self._runner: StepRunner
         self._active, self.stopped = threading.Event(), ""
         self._thread: threading.Thread | None = None
-        self._heard, self._shown, self._diagnosed = 0.0, 0.0, 0.0
+        self._heard = self._shown = self._diagnosed = self._pushed = 0.0
+        self._taken = 0.0  # time of the joint state at the newest feature's exposure [s]
         self._states = deque[tuple[float, np.ndarray]](maxlen=_HISTORY)
         self._path = deque[np.ndarray](maxlen=_PATH)
         stages = ManagedEntity()
@@ -234,7 +237,10 @@ class ControllerNode:
         if last:
             values["dt"][...] = min(max(state.time - last, 1e-3), self._config.silence)
         values["joint_position"][:] = state.joint_position
+        if now - self._pushed > _PUSH:
+            values["nullspace_input"][:] = 0
         with self._seeing:
+            values["feature_age"][...] = state.time - self._taken
             command = self._runner.step()
             values["feature_new"][...] = 0
             self._states.append((state.time, state.joint_position))
@@ -303,16 +309,15 @@ class ControllerNode:
             visible = len(self._states) > 0 and np.isfinite(pixel).all()
             values["feature_visible"][...] = values["feature_new"][...] = visible
             if visible:
-                newest = self._states[-1][0]
-                at = min(self._states, key=lambda one: abs(one[0] - (stamp or newest)))
-                values["feature"][:], values["image_joint_position"][:] = pixel, at[1]
-                values["feature_age"][...] = newest - at[0]
+                wanted = stamp or self._states[-1][0]
+                self._taken, q = min(self._states, key=lambda one: abs(one[0] - wanted))
+                values["feature"][:], values["image_joint_position"][:] = pixel, q
 
     def _on_push(self, message: Any) -> None:
         effort, values = np.array(message.data), self._runner.observation["nullspace_input"]
         if effort.shape != values.shape or not np.isfinite(effort).all():
             raise ValueError(f"a push is refused: give {len(values)} finite numbers")
-        values[:] = effort
+        values[:], self._pushed = effort, time.monotonic()
 
     def _on_heartbeat(self, _message: Any) -> None:
         self._heard = time.monotonic()

@@ -252,6 +252,22 @@ def test_messages_that_cannot_be_used_are_refused_and_do_not_end_the_thread(grap
     assert len(graph.log) == 2
 
 
+def test_a_camera_that_falls_silent_stops_the_arm_that_follows_its_feature(
+    graph, arm, node, values
+):
+    graph.takers["~/target"](marked(350.0, 260.0))
+    for _ in range(40):
+        arm.turn()
+        graph.takers["~/feature"](marked(310.0, 220.0, arm.time))
+    assert np.abs(arm.velocity).max() > 1e-3
+    ages = []
+    for _ in range(60):
+        arm.turn()
+        ages.append(float(values["feature_age"]))
+    np.testing.assert_allclose(ages, DT * np.arange(1, 61))
+    np.testing.assert_allclose(arm.velocity, 0, atol=1e-9)
+
+
 def test_a_feature_that_comes_during_a_step_counts_in_the_next(graph, arm, node, values):
     step, came = node.runners[-1].step, []
 
@@ -292,9 +308,11 @@ def test_a_feature_is_paired_with_the_posture_of_its_image(graph, arm, node, val
         graph.takers["~/feature"](marked(310.0, 220.0, at))
         assert values["feature_visible"] == values["feature_new"] == 1
         np.testing.assert_array_equal(values["feature"], [310.0, 220.0])
-        assert values["feature_age"] == pytest.approx(age)
         posture = postures[round(arm.time - age, 3)]
         np.testing.assert_array_equal(values["image_joint_position"], posture)
+        arm.turn()
+        postures[round(arm.time, 3)] = arm.q
+        assert values["feature_age"] == pytest.approx(age + DT)
     graph.takers["~/feature"](marked(np.nan, 220.0))
     assert values["feature_visible"] == values["feature_new"] == 0
     np.testing.assert_array_equal(values["feature"], [310.0, 220.0])
@@ -320,6 +338,18 @@ def test_a_target_switches_vision_on_and_none_off_and_pushes_have_their_size(
     graph.takers["~/push"](Float64MultiArray(data=[*push[:6].tolist(), np.nan]))
     assert graph.log == ["a push is refused: give 7 finite numbers"] * 2
     np.testing.assert_array_equal(values["nullspace_input"], push)
+
+
+def test_a_push_that_is_not_renewed_ends(graph, arm, node, values):
+    from std_msgs.msg import Float64MultiArray
+
+    for _ in range(3):
+        graph.takers["~/push"](Float64MultiArray(data=[2.0] * 7))
+        for _ in range(12):  # 0.24 s
+            arm.turn()
+            assert (values["nullspace_input"] == 2.0).all()
+    arm.turn()
+    assert not values["nullspace_input"].any()
 
 
 @pytest.mark.parametrize("marker", [7.0, 0.0, -1.0])
