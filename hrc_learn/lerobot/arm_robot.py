@@ -48,15 +48,11 @@ EPISODE = 1.0
 class Device:
     """Mix-in for devices without calibration; precedes LeRobot's own class among the bases."""
 
-    _connected = False
+    _connected, is_calibrated = False, True
 
     @property
     def is_connected(self) -> bool:
         return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
 
     def calibrate(self) -> None:
         """Nothing to do."""

@@ -15,6 +15,7 @@ from lerobot.utils.decorators import check_if_not_connected
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
@@ -111,9 +112,7 @@ class MujocoArmRobotConfig(WorkplaceConfig, ArmRobotConfig):
         check_scenario(self.scenario, self.shelf, self.pixels)
         if not 5 <= self.fps <= 500:
             raise ValueError(f"fps must be from 5 to 500, but is {self.fps}.")
-        for name in ("episode_time", "imperfections"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative.")
+        check_settings(self, not_negative=("episode_time", "imperfections"))
 
     def work_arm(self) -> ArmModel:
         """The arm with the two-finger hand of our work cell.
