@@ -151,6 +151,8 @@ def test_what_is_not_connected_says_so(tmp_path):
         ({"shelf": "attic"}, "no shelf 'attic'"),
         ({"pixels": True}, "object in the gripper"),
         ({"fps": 1.0}, "fps must be"),
+        ({"imperfections": float("nan")}, "imperfections must not be negative"),
+        ({"episode_time": -1.0}, "episode_time must not be negative"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, message):
