@@ -483,6 +483,11 @@ def object_height(
 class CameraCorrection:
     """Estimates the motion of a camera and corrects pixels for it.
 
+    `CameraEstimator` does not replace it: it allows any rotation about the optical axis. One
+    image after a motion by 10 cm and 10 degrees, it misplaces objects by 110 px even if it has
+    converged (240 px after its one step an image), this class by 8 to 10 px; from 25 images on
+    they agree within 1 px.
+
     Attributes:
         motion: Motion of the camera since the demonstrations; None if none was detected.
     """

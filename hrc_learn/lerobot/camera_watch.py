@@ -86,7 +86,7 @@ class CameraWatchStep(ProcessorStep):
         if state.ndim > 1 and len(state) > 1:
             raise ValueError(
                 f"a camera is watched in one environment at a time, but this batch has "
-                f"{len(state)}: set eval.batch_size to 1."
+                f"{len(state)}: set eval.batch_size to 1, or train before adding the watch."
             )
         values = state.reshape(-1).double().cpu()
         marker = values[self.marker_columns]
