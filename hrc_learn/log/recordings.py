@@ -114,7 +114,8 @@ class StepLog(LoggedSteps):
         super().__init__(blocks=(), length=0, events=())
         self._block = block
         self._dtype: np.dtype | None = None
-        self._columns: list[tuple[str, np.ndarray]] = []  # of the last block
+        # Name, shape of a value, and values of each column of the last block.
+        self._columns: list[tuple[str, tuple[int, ...], np.ndarray]] = []
         self._first = 0  # rows before the last block
 
     def snapshot(self, rows: int | None = None) -> LoggedSteps:
@@ -140,13 +141,14 @@ class StepLog(LoggedSteps):
         if i == self._block:
             self._extend()
             i = 0
-        try:
-            for name, column in self._columns:
-                column[i] = values[name]
-        except (KeyError, ValueError, TypeError) as error:
-            raise self._mismatch(values) from error
         if len(values) != len(self._columns):
             raise self._mismatch(values)
+        for name, shape, column in self._columns:
+            value = values.get(name)
+            # NumPy would repeat a single number over the whole column.
+            if value is None or shape != (() if type(value) is float else np.shape(value)):
+                raise self._mismatch(values)
+            column[i] = value
         self._length += 1
 
     def event(self, time: float, text: str) -> None:
@@ -179,7 +181,7 @@ class StepLog(LoggedSteps):
         assert self._dtype is not None
         rows = np.zeros(self._block, dtype=self._dtype)
         self._blocks.append(rows)
-        self._columns = [(name, rows[name]) for name in self.names]
+        self._columns = [(name, rows[name].shape[1:], rows[name]) for name in self.names]
         self._first = (len(self._blocks) - 1) * self._block
 
 

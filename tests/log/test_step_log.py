@@ -43,6 +43,9 @@ def test_a_column_is_a_copy():
     [
         ({"joint": np.zeros(6)}, r"row 2 .*joint is \(6,\), not \(7,\)"),
         ({"time": np.zeros(3)}, r"time is \(3,\), not \(\)"),
+        ({"joint": 0.5}, r"joint is \(\), not \(7,\)"),
+        ({"J": np.zeros(6)}, r"J is \(6,\), not \(2, 6\)"),
+        ({"time": np.zeros(1)}, r"time is \(1,\), not \(\)"),
         ({"joint": None}, "joint is missing"),
         ({"speed": 1.0}, r"speed is \(\), not a column"),
     ],
