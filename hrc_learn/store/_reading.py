@@ -115,7 +115,9 @@ def _complaint(error: Exception) -> str:
     """Text for an error of parsing: field and problem."""
     if isinstance(error, RecursionError):
         return "nested too deeply"
-    if isinstance(error, UnicodeError) or type(error) is msgspec.DecodeError:
+    if isinstance(error, UnicodeError):
+        return f"not text in UTF-8 ({error})"
+    if type(error) is msgspec.DecodeError:
         return f"not valid JSON ({error})"
     text, _, place = str(error).partition(" - at `$")
     text = text.replace("`", "").replace("Object missing required field", "lacks the field")

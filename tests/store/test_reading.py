@@ -100,10 +100,12 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, text):
             read_json(path, schema)
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path):
-    (tmp_path / "offset.json").write_bytes(b'{"angle_rad": "\xff\xfe"}')
-    with pytest.raises(ValueError, match="not valid JSON"):
-        read_json(tmp_path / "offset.json")
+@pytest.mark.parametrize(("read", "suffix"), [(read_json, "json"), (read_toml, "toml")])
+def test_text_in_another_encoding_is_called_so(tmp_path, read, suffix):
+    file = tmp_path / f"offset.{suffix}"
+    file.write_bytes('{"name": "Ärmel"}'.encode("latin-1"))
+    with pytest.raises(ValueError, match=rf"offset\.{suffix}: not text in UTF-8"):
+        read(file)
 
 
 def test_only_files_of_a_sensible_size_are_read(tmp_path):
