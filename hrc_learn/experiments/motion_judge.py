@@ -153,22 +153,23 @@ class SceneJudge:
         self.succeeded, self._widest = _function(config.success), widest or 1.0
         self._steps = max(1, round(1 / fps / model.opt.timestep))
         known = {model.joint(i).name: i for i in range(model.njnt)}
+        # Joint that each actuator moves; tendons and sites have numbers of their own.
+        joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
+        direct = np.isin(model.actuator_trntype, joint)
+        at = np.where(direct, model.actuator_trnid[:, 0], -1)
         # The force of a position actuator falls with the position.
-        servo = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
-            model.actuator_biasprm[:, 1] < 0
-        )
-        drives = {int(model.actuator_trnid[a, 0]): int(a) for a in np.flatnonzero(servo)}
+        servos = np.flatnonzero(direct & (model.actuator_biasprm[:, 1] < 0))
+        drives = {int(at[a]): int(a) for a in servos}
         names = robot.arm().joint_names
         if missing := [name for name in names if known.get(name) not in drives]:
             raise ValueError(f"{config.scene}: no position actuator moves {', '.join(missing)}")
         ids = [known[name] for name in names]
         self._q, self._arm = model.jnt_qposadr[ids], [drives[i] for i in ids]
-        at = [int(model.actuator_trnid[a, 0]) for a in range(model.nu)]
-        rest = [a for a in range(model.nu) if at[a] not in ids]
+        rest = np.flatnonzero(~np.isin(at, ids)).tolist()
         self._hand = [model.actuator(name).id for name in config.gripper] or rest
         self._range = model.actuator_ctrlrange[self._hand].copy()
         for k, a in enumerate(self._hand):
-            if not model.actuator_ctrllimited[a]:
+            if direct[a] and not model.actuator_ctrllimited[a]:
                 self._range[k] = model.jnt_range[at[a]]
 
     def begin(self, trial: Trial) -> None:

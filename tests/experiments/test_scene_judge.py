@@ -104,6 +104,35 @@ def test_a_quarter_of_the_opening_is_a_quarter_of_each_actuators_range(
         assert control[name] == pytest.approx(value)
 
 
+def test_a_gripper_that_closes_by_a_tendon_is_driven(tmp_path):
+    # As the Franka hand of MuJoCo Menagerie: the tendon has the number of the first joint.
+    text = """
+    <mujoco>
+      <worldbody>
+        <body><joint name="turn" axis="0 0 1"/><geom size="0.1" mass="1"/>
+          <body pos="1 0 0"><joint name="bend" axis="0 1 0"/><geom size="0.1" mass="1"/>
+            <body><joint name="finger" type="slide"/><geom size="0.01" mass="1"/></body>
+          </body>
+        </body>
+      </worldbody>
+      <tendon><fixed name="split"><joint joint="finger" coef="1"/></fixed></tendon>
+      <actuator>
+        <position name="bender" joint="bend" kp="50"/>
+        <position name="turner" joint="turn" kp="50"/>
+        <general name="grip" tendon="split" ctrlrange="0 255" ctrllimited="true"/>
+      </actuator>
+    </mujoco>
+    """
+    file = tmp_path / "scene.xml"
+    file.write_text(text, encoding="utf-8")
+    found = SceneJudge(JudgeConfig(scene=str(file), success="builtins:bool"), ARM, 20.0, 0.08)
+    assert found.model.tendon("split").id == found.model.joint("turn").id == 0
+    found.begin(trial())
+    found.command(np.array([0.7, -0.6]), 0.02)
+    control = {found.model.actuator(k).name: found.data.ctrl[k] for k in range(3)}
+    assert control == pytest.approx({"bender": -0.6, "turner": 0.7, "grip": 255 / 4})
+
+
 @pytest.mark.parametrize(("fps", "steps"), [(20.0, 12), (50.0, 5), (1000.0, 1)])
 def test_a_frame_takes_its_time_in_steps_of_the_scene(judge, fps, steps):
     found = judge(fps=fps)
