@@ -329,6 +329,12 @@ def _standing(run: CollaborationRun) -> list[str]:
 
 def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
     """Unwanted contacts, by the object that was hit."""
-    names = [pick.item.name for pick in run.picks if pick.release is not None]
     begun = [start for start, _ in spans(run.cell.log, RELEASE)]
-    return unwanted_contacts(run.world, run.cell.log, dict(zip(names, begun, strict=True)))
+    released = {
+        pick.item.name: start
+        for pick in run.picks
+        for start in begun
+        # A person may stop the arm while it lowers an object.
+        if pick.release is not None and pick.span[0] <= start < pick.span[1]
+    }
+    return unwanted_contacts(run.world, run.cell.log, released)

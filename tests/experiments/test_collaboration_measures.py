@@ -195,6 +195,12 @@ def test_the_worst_object_that_was_released_counts(run):
     assert "not a" not in faults
 
 
+def test_an_object_that_was_lowered_but_not_released_is_still_carried(run):
+    run.picks[0] = replace_pick(run.picks[0], release=None)
+    evaluated(run)
+    assert run.world.released[0] == {"b": 15.0}
+
+
 def test_nothing_that_was_released_has_no_errors(run):
     run.picks = [replace_pick(p, release=None) for p in run.picks]
     run.cell.log.events[:] = []
