@@ -166,7 +166,7 @@ class ArmRun(CellRun):
     """Result of a task on a real arm; its world is that of the assumed surroundings."""
 
     def save(self, folder: Path, title: str, configuration: dict[str, Any]) -> None:
-        """Write `run.rrd`, `log.npz`, `result.json` and `configuration.json`.
+        """Write `run.rrd`, `log.npz` and `result.json`.
 
         Args:
             folder: Folder of the run; an existing one is replaced.
@@ -182,7 +182,8 @@ class ArmRun(CellRun):
         }
         with new_folder(folder, configuration, overwrite=True) as part:
             log.save(part / "log.npz")
-            record_run(part / "run.rrd", record(title, self.cell, self.world, self.motion))
+            if len(log):  # a task may fail before the first step
+                record_run(part / "run.rrd", record(title, self.cell, self.world, self.motion))
             write_json(part / "result.json", result)
 
 

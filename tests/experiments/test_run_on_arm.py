@@ -89,13 +89,17 @@ def test_a_task_moves_the_arm_and_the_world_that_is_believed_follows(world, tmp_
 
 
 @pytest.mark.parametrize("error", [TaskFailedError, CameraError])
-def test_a_task_that_fails_says_why(world, error):
+def test_a_task_that_fails_says_why(world, error, tmp_path):
     def task(cell, check):
         raise error("lost its way")
 
     run = run_on_arm(SITE, WORKPLACE, task)
     assert run.failure == "lost its way"
     assert len(run.cell.log) == 0
+    # Nothing has moved yet, so that there is nothing to draw.
+    run.save(tmp_path / "run", "a task", {"ip": "arm"})
+    written = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert (written["failure"], written["duration"]) == ("lost its way", 0.0)
 
 
 def test_a_site_bounds_what_its_arm_may_do():
