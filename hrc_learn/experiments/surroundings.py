@@ -14,7 +14,7 @@ from hrc_learn.controller.contact_limits import ContactLimits, region_numbers
 from hrc_learn.dmp import InteractionPrimitive
 from hrc_learn.geometry import Box, Pose, minimum_jerk, quaternion
 from hrc_learn.jacobian.perspective import MARKER
-from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, panda, separation
+from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.log import LoggedSteps
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import (
@@ -103,8 +103,6 @@ _ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
 # Distance that people keep from a resting arm that they see, the thickness of a sleeve [m];
 # time between checks of this distance [s]; and workers drawn until one can reach and keep it.
 _KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 200
-# Joints at the ends of the forearm, from 0.
-_FOREARM = slice(3, 5)
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
 # push creep.
 _AT_REST = 0.01
@@ -220,8 +218,11 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
     # -x is there. Then they are turned back.
     table = workplace.scene.table
     arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
-    elbow, wrist = panda.joint_origins(waiting)[_FOREARM].tolist()
-    x, y = (elbow[0] + wrist[0]) / 2, (elbow[1] + wrist[1]) / 2
+    origins = workplace.robot.joint_origins(waiting)
+    lengths = (origins[1:] - origins[:-1]).norm(dim=-1)
+    # The forearm is the last long link.
+    elbow = int((lengths > lengths.max() / 2).nonzero()[-1])
+    x, y, _ = origins[elbow : elbow + 2].mean(dim=0).tolist()
     (a, b, c), (half_a, half_b, half_c) = table.centre, table.half_size
     bench = replace(table, centre=(b, -a, c), half_size=(half_b, half_a, half_c))
     for _ in range(_DRAWS):

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from hrc_learn.controller import SeparationConfig
+from hrc_learn.experiments import surroundings
 from hrc_learn.experiments.surroundings import (
     draw_visit,
     near_worker,
     worker_contacts,
 )
 from hrc_learn.kinematics import panda, separation
+from hrc_learn.kinematics.registry import arm
 from hrc_learn.log import StepLog
 from hrc_learn.sim import (
     MotionLog,
@@ -23,6 +25,7 @@ from hrc_learn.sim import (
     random_visit,
     whole_arm,
 )
+from hrc_learn.sim.arm_model import ArmModelConfig
 from hrc_learn.sim.worker import PARTS, REGIONS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
@@ -163,3 +166,22 @@ def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits():
     beside = np.abs(visit.markers[:, :2] - (elbow + wrist) / 2)
     assert beside.max() < 0.25
     assert 2.0 < visit.reaches[0, 0] - visit.begin < 9.0
+
+
+def test_a_worker_reaches_under_the_forearm_of_any_arm(monkeypatch):
+    robot, seen = arm("ur5e"), []
+
+    def random_visit(worker, rng, *, under, **_):
+        seen.append(under)
+        raise ValueError("not needed here")
+
+    monkeypatch.setattr(surroundings, "random_visit", random_visit)
+    monkeypatch.setattr(Workplace, "hover_joints", lambda place: robot.ready)
+    scene = replace(WORKPLACE.scene, arm=ArmModelConfig(robot=robot))
+    with pytest.raises(ValueError, match="none of 200 workers"):
+        draw_visit(replace(WORKPLACE, scene=scene), np.random.default_rng(0))
+    world = World(scene)
+    world.reset(robot.ready.numpy())
+    # The forearm of a UR5e goes from its third to its fourth joint.
+    x, y, _ = (world.data.body("link3").xpos + world.data.body("link4").xpos) / 2
+    assert seen[0] == pytest.approx((y, -x), abs=1e-9)
