@@ -1,7 +1,7 @@
 """`hrc fit`: movement primitives from demonstrations."""
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -122,31 +122,43 @@ def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
     Raises:
         DatasetError: The dataset cannot be read, or a unit is doubtful.
     """
+    source, notes = open_moving(
+        args.dataset,
+        args.episodes,
+        mapping=columns(args.mapping),
+        units=args.units,
+        joint_names=args.joint_names or None,
+        refuse_doubt=True,
+    )
+    if "gripper" in source.units:
+        notes.append("no primitive is fitted to the gripper (--as-lerobot-policy includes it)")
+    return source, notes
+
+
+def open_moving(
+    dataset: Path, episodes: Sequence[int], **options: Any
+) -> tuple[DemonstrationSource, list[str]]:
+    """Demonstrations of the given episodes, or of all that have two frames at least.
+
+    Args:
+        dataset: Folder of the dataset.
+        episodes: Episodes to read; empty: all.
+        options: Further arguments of `open_demos`.
+
+    Returns:
+        The demonstrations, and notes on what is left out.
+    """
     left_out: list[int] = []
 
     def moves(entry: EpisodeEntry) -> bool:
-        if entry.length < 2 and not args.episodes:
+        if entry.length < 2 and not episodes:
             left_out.append(entry.index)
             return False
         return True
 
-    source = open_demos(
-        args.dataset,
-        args.episodes or None,
-        columns(args.mapping),
-        args.units,
-        args.joint_names or None,
-        where=moves,
-        refuse_doubt=True,
-    )
-    notes = []
-    if left_out:
-        notes.append(
-            f"episodes of a single frame are left out: {', '.join(map(str, left_out))}"
-        )
-    if "gripper" in source.units:
-        notes.append("no primitive is fitted to the gripper (--as-lerobot-policy includes it)")
-    return source, notes
+    source = open_demos(dataset, episodes or None, where=moves, **options)
+    listed = ", ".join(map(str, left_out))
+    return source, [f"episodes of a single frame are left out: {listed}"] if left_out else []
 
 
 def _fit_streamed(args: FitPrimitives) -> None:

@@ -13,8 +13,9 @@ from rich.text import Text
 
 from hrc_learn.cli._run import refuse_repeats, write_values
 from hrc_learn.cli.arguments import Evaluate, FitPrimitives, Smooth, columns
-from hrc_learn.cli.fit_command import fit_silently
-from hrc_learn.demos import DemonstrationSet, open_demos
+from hrc_learn.cli.fit_command import fit_silently, open_moving
+from hrc_learn.cli.tokens_command import held_out
+from hrc_learn.demos import DemonstrationSet
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.model_choice import best_models, predict
 from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, sampled
@@ -60,18 +61,16 @@ def _fit_most(args: Evaluate, model: Path) -> None:
     Raises:
         ValueError: All demonstrations are held out.
     """
-    source = open_demos(args.dataset)
-    count = len(source)
-    # Every fifth is held out, or the last one of fewer than five.
-    held_out = set(args.episodes or range(count)[4::5] or range(count)[1:][-1:])
-    episodes = tuple(i for i in range(count) if i not in held_out)
-    if not episodes and count > 1:
+    every = [entry.index for entry in open_moving(args.dataset, ())[0].entries]
+    unseen = args.episodes or held_out(every, 5)
+    episodes = tuple(i for i in every if i not in unseen)
+    if not episodes and len(every) > 1:
         raise ValueError(
-            f"--episodes names all {count} episodes of {args.dataset} and leaves none to fit: "
-            f"name fewer, or give --model"
+            f"--episodes names all {len(every)} episodes of {args.dataset} and leaves none to "
+            f"fit: name fewer, or give --model"
         )
     wanted = FitPrimitives(dataset=args.dataset, out=model, episodes=episodes)
-    with Console().status(f"Fitting {len(episodes) or count} demonstrations"):
+    with Console().status(f"Fitting {len(episodes) or 1} demonstrations"):
         fit_silently(wanted)
 
 
@@ -133,7 +132,9 @@ def _demonstrations(args: Evaluate, model: Path, console: Console) -> Demonstrat
     episodes = list(args.episodes)
     if Path(made_by["dataset"]).resolve() == args.dataset.resolve():
         if not episodes and learned:
-            every = range(len(open_demos(args.dataset, **wanted)))
+            every = [
+                entry.index for entry in open_moving(args.dataset, (), **wanted)[0].entries
+            ]
             episodes = [i for i in every if i not in learned]
             if episodes:
                 console.print(f"note: {len(episodes)} episodes that were not learned from")
@@ -141,7 +142,10 @@ def _demonstrations(args: Evaluate, model: Path, console: Console) -> Demonstrat
                 console.print("note: all of these demonstrations were learned from")
         elif not learned or set(episodes) & learned:
             console.print("note: some of these demonstrations were learned from")
-    return sampled(open_demos(args.dataset, episodes=episodes or None, **wanted))
+    source, notes = open_moving(args.dataset, episodes, **wanted)
+    for note in notes:
+        console.print(f"note: {note}")
+    return sampled(source)
 
 
 def as_fitted(made_by: Mapping[str, Any]) -> dict[str, Any]:

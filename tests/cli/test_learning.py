@@ -67,6 +67,11 @@ def test_an_episode_of_one_frame_is_left_out_of_a_fit_with_a_note(tmp_path):
     output = done(*fit, "--out", tmp_path / "model").output
     assert "episodes of a single frame are left out: 1, 3" in " ".join(output.split())
     assert "demonstrations │ 2" in " ".join(output.replace("│", " │ ").split())
+    # The evaluation leaves them out as well, with and without that model.
+    for model in ((), ("--model", tmp_path / "model")):
+        done("evaluate", "--dataset", root, *model, "--json", tmp_path / "f.json")
+        figures = json.loads((tmp_path / "f.json").read_text())
+        assert figures["demonstrations"] == (2 if model else 1)
 
 
 def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):

@@ -198,7 +198,9 @@ def test_figures_and_recording_hold_the_motion():
 )
 def test_every_fifth_demonstration_is_held_out(monkeypatch, tmp_path, count, named, fitted):
     wanted = []
-    monkeypatch.setattr(model_commands, "open_demos", lambda dataset: range(count))
+    entries = [SimpleNamespace(index=i) for i in range(count)]
+    opened = SimpleNamespace(entries=entries), []
+    monkeypatch.setattr(model_commands, "open_moving", lambda dataset, episodes: opened)
     monkeypatch.setattr(model_commands, "fit_silently", wanted.append)
     args = Evaluate(dataset=tmp_path, episodes=named)
     if fitted is None:
@@ -226,11 +228,11 @@ def test_an_evaluation_prefers_what_was_not_learned(
 ):
     opened = []
 
-    def open_demos(dataset, **more):
-        opened.append(more)
-        return range(4)
+    def open_moving(dataset, episodes, **more):
+        opened.append(more | {"episodes": episodes})
+        return SimpleNamespace(entries=[SimpleNamespace(index=i) for i in range(4)]), []
 
-    monkeypatch.setattr(model_commands, "open_demos", open_demos)
+    monkeypatch.setattr(model_commands, "open_moving", open_moving)
     monkeypatch.setattr(model_commands, "sampled", lambda demos: demos)
     dataset = tmp_path / "set"
     made_by = {
@@ -244,7 +246,7 @@ def test_an_evaluation_prefers_what_was_not_learned(
     with console.capture() as said:
         args = Evaluate(dataset=dataset, episodes=named)
         model_commands._demonstrations(args, Path("model"), console)
-    assert opened[-1]["episodes"] == read
+    assert opened[-1]["episodes"] == (read or [])
     assert opened[-1]["joint_names"] == ("a",)
     assert opened[-1]["units"] == {"position": "mm"}
     assert said.get().strip() == (f"note: {note}" if note else "")
