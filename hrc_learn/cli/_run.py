@@ -181,14 +181,17 @@ def gathered_settings(words: Sequence[str]) -> list[str]:
         option, assigned, value = word.partition("=")
         device, _, name = option.partition(".")
         if device in _DEVICES and name:
-            value = value if assigned else next(remaining, "")
+            value = value if assigned else next(remaining, "--")
+            if value.startswith("--"):
+                raise ValueError(f"{option} needs a value, such as {option}=VALUE")
             settings.append(f"{_DEVICES[device]}.{name}={value}")
             continue
         if word.startswith("--"):
-            in_settings = word == "--config"
+            in_settings = option == "--config"
+            word = value if in_settings else word  # the value of --config=VALUE
         if not in_settings:
             rest.append(word)
-        elif word != "--config":
+        elif word:
             settings.append(word)
     return [*rest, "--config", *settings] if settings else rest
 

@@ -22,11 +22,19 @@ from hrc_learn.cli import _run as run
         (["--robot.port", "/dev/x", "--teleop.id", "me"],
          ["--config", "site.device.port=/dev/x", "site.leader.id=me"]),
         (["--robot", "panda"], ["--robot", "panda"]),
-        (["--robot.port"], ["--config", "site.device.port="]),
+        (["--robot.id="], ["--config", "site.device.id="]),
+        (["--config=a=1", "b=2", "--seed", "1", "--config", "c=3"],
+         ["--seed", "1", "--config", "a=1", "b=2", "c=3"]),
     ],
 )  # fmt: skip
 def test_settings_are_gathered_behind_one_option(words, gathered):
     assert run.gathered_settings(words) == gathered
+
+
+@pytest.mark.parametrize("more", [[], ["--robot.port=/dev/x"]])
+def test_a_setting_of_a_device_does_not_take_the_next_option_for_its_value(more):
+    with pytest.raises(ValueError, match=r"--robot\.id needs a value"):
+        run.gathered_settings(["--robot.id", *more])
 
 
 @dataclass(frozen=True, kw_only=True)
