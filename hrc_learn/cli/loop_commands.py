@@ -19,7 +19,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from hrc_learn.cli._run import configuration, with_settings, write_values
-from hrc_learn.cli.arguments import Serve, ServePage, WithDriver
+from hrc_learn.cli.arguments import Serve, ServePage, WithDriver, refuse_given
 from hrc_learn.controller import (
     GRIPPER_DOWN,
     INITIAL_IMAGE_JACOBIAN,
@@ -39,7 +39,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.hardware import DriverError, ending_at_rest
 from hrc_learn.hardware.ros2_topics import found_description, ros2_origin
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import ArmChoice, SerialChain
+from hrc_learn.kinematics import Arm, ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.workplace import Workplace
@@ -67,6 +67,12 @@ CENTRE = (0.35, 0.35, 0.35)
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
+def _arm_of(args: WithDriver, site: ArmSite) -> Arm:
+    """The arm, which `--robot` or, for a Franka arm, `site.robot` names."""
+    named = site.robot if args.robot == "panda" else found_description(args.robot)
+    return ArmChoice(named).work_arm()
+
+
 def _access(
     args: WithDriver, site: ArmSite, world: World, safety: SafetyConfig
 ) -> tuple[Callable[[], AbstractContextManager[OpenedArm]], SafetyConfig]:
@@ -75,10 +81,13 @@ def _access(
     Returns:
         Function that connects, and the configuration of the safety filter for this arm.
     """
-    if args.arm == "lerobot" or args.arm == "ros2" or args.drives_real_arm():
+    robot = world.arm.robot
+    if args.drives_real_arm():
+        if args.arm in ("franky", "franka"):
+            access_by(args.arm, robot)  # refuses other arms
         site = replace(site, driver=args.arm, ip=args.ip)
-        return partial(_real_arm, site, world, world.arm.robot.chain), site.cell_config().safety
-    access = access_by(args.arm, world.arm.robot)
+        return partial(_real_arm, site, world, robot), site.cell_config().safety
+    access = access_by(args.arm, robot)
     delay = safety.delay + access.delay
     braking = min(safety.braking, access.dynamics)
     return partial(access.open, world), replace(safety, delay=delay, braking=braking)
@@ -113,7 +122,7 @@ def page(args: ServePage) -> None:
     guiding = settings.session.guiding
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    robot, console = ArmChoice(args.robot).work_arm(), Console()
+    robot, console = _arm_of(args, settings.site), Console()
     workplace = Workplace.of(robot)
     world = World(workplace.scene)
     connect, safety = _access(args, settings.site, world, guiding.safety)
@@ -217,8 +226,8 @@ class _ServeSettings:
 def serve(args: Serve) -> None:
     """Run the loop, or a node of ROS 2, and print the latencies."""
     duration = 8.0 if args.duration is None else args.duration
-    if not (duration > 0 and args.rate > 0):
-        raise ValueError("--duration and --rate must be positive")
+    if not (0 < duration < np.inf and 0 < args.rate < np.inf):
+        raise ValueError("--duration and --rate must be positive and finite")
     if args.rate < (slowest := SafetyConfig().rate):
         raise ValueError(
             f"--rate must be at least {slowest:g}, the minimum of the safety filter"
@@ -227,9 +236,10 @@ def serve(args: Serve) -> None:
     dt = 1 / args.rate
     settings = with_settings(args.config, _ServeSettings())
     if args.ros2:
+        refuse_given(args, ["rate", "arm"], "is not used by --ros2: leave it out")
         _serve_node(args, settings)
         return
-    robot = ArmChoice(found_description(args.robot)).work_arm()
+    robot = _arm_of(args, settings.site)
     # `hand_size` also scales the workspace: smaller arms have smaller hands.
     centre = robot.hand_size * np.array(CENTRE)
     camera = _camera(centre)
@@ -245,7 +255,7 @@ def serve(args: Serve) -> None:
         runner = open_step(controller, observation)
     opened = time.perf_counter() - began
     with connect() as arm:
-        steps = round(duration * args.rate)
+        steps = max(1, round(duration * args.rate))
         measured = _run_serve(runner, arm, robot.chain, camera, dt, steps)
     figures = {"open_s": opened} | measured
     counts = runner.state["safety.counts"]

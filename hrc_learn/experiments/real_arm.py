@@ -129,24 +129,25 @@ def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[Stop
 
     Args:
         site: Arm and driver.
-        chain: Kinematics of a robot of LeRobot or ROS 2; None: a Franka arm's.
+        chain: Kinematics of the arm; None: those of the site's Franka arm.
 
     Raises:
         ValueError: If the site has no address.
         DriverError: If the arm cannot be reached; says why.
     """
     opened: Callable[[], StoppableArm]
+    chain = chain or site.chain
     if site.driver == "lerobot":
-        opened = partial(LeRobotArm, site.device, chain or site.chain, site.lerobot)
+        opened = partial(LeRobotArm, site.device, chain, site.lerobot)
     elif site.driver == "ros2":
         print(ros2_origin(), file=sys.stderr)
-        opened = partial(Ros2Arm, chain or site.chain, site.ros2)
+        opened = partial(Ros2Arm, chain, site.ros2)
     elif not site.ip:
         raise ValueError("ip is empty: give the address of the control box of the arm.")
     # Only one driver is imported: both register the same types, which fails the second time.
     elif site.driver == "franka":
         loop = FrankaConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
-        with FrankaArm(site.ip, site.chain, loop) as arm:
+        with FrankaArm(site.ip, chain, loop) as arm:
             yield arm
         return
     else:

@@ -214,17 +214,16 @@ def test_a_page_that_has_died_and_ctrl_c_end_the_loop_at_rest(timeless, capsys):
 def test_the_safety_filter_allows_for_the_driver_of_the_arm(monkeypatch, arm):
     access = SimpleNamespace(delay=0.02, dynamics=0.4, open=lambda world: ("opened", world))
     monkeypatch.setattr(loop_commands, "access_by", lambda driver, robot: access)
-    robot = SimpleNamespace(chain="chain")
-    world: Any = SimpleNamespace(arm=SimpleNamespace(robot=robot))
-    for real in (False, True):
+    world: Any = SimpleNamespace(arm=SimpleNamespace(robot="arm"))
+    for real in (True,) if arm in ("lerobot", "ros2") else (False, True):
         args: Any = SimpleNamespace(arm=arm, ip="10.0.0.1", drives_real_arm=lambda r=real: r)
         safety = SafetyConfig(delay=0.03, braking=0.5)
         site = ArmSite(dynamics=0.2)
         connect, allowed = loop_commands._access(args, site, world, safety)
-        if real or arm in ("lerobot", "ros2"):
+        if real:
             expected = replace(site, driver=arm if arm != "sim" else "sim", ip="10.0.0.1")
             assert allowed == expected.cell_config().safety
-            assert connect.args == (expected, world, "chain")
+            assert connect.args == (expected, world, "arm")
         else:
             assert allowed == replace(safety, delay=0.05, braking=0.4)
             assert connect() == ("opened", world)

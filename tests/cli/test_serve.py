@@ -12,6 +12,10 @@ from commands import hrc
 from unchecked import shapes_unchecked
 from urdf_text import to_urdf
 
+from hrc_learn.cli.arguments import Serve
+from hrc_learn.cli.loop_commands import _arm_of
+from hrc_learn.experiments.real_arm import ArmSite
+
 
 @pytest.fixture(autouse=True)
 def _unchecked():
@@ -69,13 +73,38 @@ def test_a_driver_of_another_arm_is_bad_input(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rate", "why"),
-    [("0", "--duration and --rate must be positive"), ("4", "--rate must be at least 5")],
+    ("options", "why"),
+    [
+        (("--rate", "0"), "--duration and --rate must be positive"),
+        (("--rate", "inf"), "--duration and --rate must be positive and finite"),
+        (("--duration", "inf"), "--duration and --rate must be positive and finite"),
+        (("--rate", "4"), "--rate must be at least 5"),
+        (("--ros2", "--rate", "100"), "--rate is not used by --ros2"),
+        (("--arm", "lerobot", "--ip", "sim"), "--ip is for Franka arms"),
+        (
+            ("--arm", "franky", "--ip", "192.0.2.1", "--robot", "ur5e"),
+            "--arm franky drives Franka arms only, not the ur5e",
+        ),
+    ],
 )
-def test_a_rate_too_low_is_bad_input(rate, why):
-    outcome = hrc("serve", "--rate", rate)
+def test_options_that_do_not_fit_are_bad_input(options, why):
+    outcome = hrc("serve", *options)
     assert outcome.status == 2
     assert why in outcome.error
+
+
+def test_the_shortest_run_has_one_step(tmp_path):
+    options = ("--config", "step=eager", "--duration", 1e-6, "--json", tmp_path / "j")
+    assert hrc("serve", *options).status == 0
+    assert json.loads((tmp_path / "j").read_text())["steps"] == 1
+
+
+@pytest.mark.parametrize(
+    ("robot", "site", "name"),
+    [("panda", "panda", "panda"), ("fr3", "panda", "fr3"), ("panda", "fr3", "fr3")],
+)
+def test_a_franka_arm_may_be_named_by_option_or_setting(robot, site, name):
+    assert _arm_of(Serve(robot=robot), ArmSite(robot=site)).name == name
 
 
 @pytest.mark.slow
