@@ -1,9 +1,10 @@
 """`hrc record`: demonstrations by a scripted expert in simulation, or by a leader arm."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,11 @@ import torch
 from rich.progress import Progress, track
 
 from hrc_learn.cli._run import configuration, with_settings, write_values
-from hrc_learn.cli.arguments import Record
+from hrc_learn.cli.arguments import Record, refuse_of_others
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
 from hrc_learn.experiments.real_arm import ArmSite, opened_arm
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.lerobot_device import GRIPPER, LeaderArm
@@ -45,6 +47,13 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 _DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0), "leader": (5, 0)}
 """Number of episodes and seed by kind of demonstration."""
+_APPLIES = {
+    "shelf": ("placing", "expert"),
+    "scenario": ("expert",),
+    "overwrite": ("placing", "servoing"),
+    "seed": ("placing", "servoing", "expert"),
+}
+"""Kinds of demonstrations that have an option."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +72,7 @@ def record(args: Record) -> int:
     seed = usual_seed if args.seed is None else args.seed
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {episodes}.")
+    refuse_of_others(args, _APPLIES, args.demonstration, "hrc record")
     args = replace(args, episodes=episodes, seed=seed)
     recorders = {
         "placing": _record_placing,
@@ -136,11 +146,9 @@ def _film_servoing(
     # The markerless search needs fewer images than a marker tracker.
     config = replace(config, record_every=2 * config.record_every)
 
-    def demonstrate() -> Iterator[dict[str, Any]]:
-        return film_servoing(world, workplace, sensor, camera, config, rng)
-
     width, height = IMAGE_SIZE
     cameras = {FILM: (height, width)}
+    demonstrate = partial(film_servoing, world, workplace, sensor, camera, config, rng)
     _write(args, workplace, demonstrate, "servo to the box", config.fps, cameras=cameras)
     print(f"{episodes} demonstrations with video in {args.out}")
     write_values(args.json, {"episodes": episodes})
@@ -232,6 +240,9 @@ class _LeaderConfig:
     fps: int = 50
     """Frames per second, which is also the rate of the loop."""
 
+    def __post_init__(self) -> None:
+        check_settings(self, finite=["duration", "fps"], not_negative=["pause"])
+
 
 @dataclass(frozen=True, kw_only=True)
 class _LeaderSettings:
@@ -244,8 +255,8 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
     settings = with_settings(args.config, _LeaderSettings())
     config = settings.demonstration
     frames = round(config.duration * config.fps)
-    if frames < 2 or config.pause < 0:
-        raise ValueError("demonstration.duration must be positive, and pause not negative.")
+    if frames < 2:
+        raise ValueError(f"demonstration.duration={config.duration:g} has less than two frames")
     site = replace(settings.site, driver="lerobot")
     robot = ArmChoice(args.robot).arm()
     names, lerobot = robot.chain.joint_names, site.lerobot
@@ -258,7 +269,6 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
         frames={"base": f"{robot.name} base", "ee": f"{robot.name} tool centre point"},
         details={"demonstrated by": "a leader arm", "recorded with": configuration(args)},
     )
-    rate = Rate(1 / config.fps)
     with (
         writer,
         closing(
@@ -268,6 +278,7 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
         ending_at_rest(arm.stop),
     ):
         follow = _follower(robot, arm, leader, site, 1 / config.fps)
+        rate = Rate(1 / config.fps)
         for episode in range(episodes):
             print(
                 f"demonstration {episode + 1} of {episodes} in {config.pause:g} s", flush=True
