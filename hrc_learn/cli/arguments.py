@@ -41,6 +41,25 @@ def refuse_given(args: Any, names: Iterable[str], reason: str) -> None:
             raise ValueError(f"--{field_.name.replace('_', '-')} {reason}")
 
 
+def refuse_of_others(
+    args: Any, kinds: Mapping[str, Sequence[str]], kind: str, command: str
+) -> None:
+    """Refuse options that a kind of a command does not have.
+
+    Args:
+        args: Arguments of a command.
+        kinds: Kinds that have an option, by the name of its field.
+        kind: Chosen kind.
+        command: The command, for the message.
+
+    Raises:
+        ValueError: An option of another kind was given.
+    """
+    for name, having in kinds.items():
+        if kind not in having:
+            refuse_given(args, [name], f"is an option of {command} {', '.join(having)}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measured:
     """A command that measures something."""

@@ -12,7 +12,7 @@ from typing import Any, cast, get_args
 
 from rich.console import Console
 
-from hrc_learn.cli._run import command_line, refuse_existing, with_settings
+from hrc_learn.cli._run import command_line, refuse_existing, with_settings, write_values
 from hrc_learn.cli.arguments import (
     Demo,
     FitImageJacobian,
@@ -22,6 +22,7 @@ from hrc_learn.cli.arguments import (
     WithImperfections,
     WithRobot,
     refuse_given,
+    refuse_of_others,
 )
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment, Pulls
 from hrc_learn.experiments.collaboration_trial import Disturbances
@@ -42,7 +43,10 @@ MODELS = Path("outputs/demo")
 """Folder of the demo, whose models are used if none are given."""
 _APPLIES: dict[str, list[str]] = read_toml(Path(__file__).with_name("option_experiments.toml"))
 """Experiments that an option belongs to."""
-_SIMULATED = ("markerless", "trials", "serve", "page", "camera_moved", "worker", "handover")
+_SIMULATED = (
+    *("robot", "imperfections", "ideal", "seed", "trials", "markerless", "serve", "page"),
+    *("pulls", "camera_moved", "worker", "handover"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +65,14 @@ def run(args: Run) -> int:
     """Run an experiment, in simulation or on a real arm."""
     folder = args.out or Path("outputs") / args.experiment
     args = replace(args, out=folder)
-    for name, experiments in _APPLIES.items():
-        if args.experiment not in experiments:
-            refuse_given(args, [name], f"is an option of hrc run {' and '.join(experiments)}")
+    refuse_of_others(args, _APPLIES, args.experiment, "hrc run")
     refuse_existing(folder, args.overwrite)
     is_real = args.drives_real_arm(_SIMULATED)
+    if args.experiment == "placing":
+        if not is_real:
+            refuse_given(args, ["shelf"], "is for a real arm here: all shelves are simulated")
+        elif len(args.shelf) > 1:
+            raise ValueError("hrc run placing places one object: give one --shelf")
     if args.arm == "lerobot":
         raise ValueError(
             "hrc run does not support --arm lerobot: use hrc page to guide the arm, or hrc "
@@ -170,7 +177,9 @@ def _run_on_arm(
     done.save(folder, f"{args.arm} at {args.ip or 'its topics'}", asdict(args))
     console.print(done.failure or "done", style="red" if done.failure else "green")
     print(f"Dashboard: {show_command(folder)}")
-    return int(bool(done.failure))
+    failed = int(bool(done.failure))
+    write_values(args.json, {"duration_s": done.duration, "failed": failed})
+    return failed
 
 
 def _models(args: Run) -> dict[str, Path]:

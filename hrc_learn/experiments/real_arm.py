@@ -166,6 +166,11 @@ a failure, or an empty string."""
 class ArmRun(CellRun):
     """Result of a task on a real arm; its world is that of the assumed surroundings."""
 
+    @property
+    def duration(self) -> float:
+        """Duration of the run [s]."""
+        return float(np.ptp(self.log["time"])) if len(self.log) else 0.0
+
     def save(self, folder: Path, title: str, configuration: dict[str, Any]) -> None:
         """Write `run.rrd`, `log.npz` and `result.json`.
 
@@ -177,7 +182,7 @@ class ArmRun(CellRun):
         log = self.cell.log
         result = {
             "failure": self.failure,
-            "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
+            "duration": self.duration,
             "phases": [{"phase": event.text, "start": event.time} for event in log.events],
             "remarks": [{"text": said.text, "time": said.time} for said in self.cell.remarks],
         }

@@ -157,11 +157,29 @@ def test_choices_are_those_of_the_package(alias, known):
             ("run", "grasping", "--placing", "x"),
             "--placing is an option of hrc run placing",
         ),
+        (
+            ("run", "grasping", "--shelf", "upper"),
+            "--shelf is an option of hrc run",
+        ),
+        (("run", "placing", "--shelf", "upper"), "--shelf is for a real arm here"),
+        (
+            ("record", "leader", "--out", "new", "--overwrite"),
+            "hrc record placing, servoing",
+        ),
+        (("record", "servoing", "--out", "new", "--shelf", "upper"), "--shelf is an option of"),
         (("run", "placing", "--arm", "franky"), "--arm franky needs --ip"),
         (("run", "grasping", "--ip", "172.16.0.2"), "needs a driver: --arm franky"),
         (
             ("run", "placing", "--arm", "franka", "--ip", "172.16.0.2", "--trials", 3),
             "--trials is for simulated",
+        ),
+        (
+            ("run", "grasping", "--arm", "ros2", "--robot", "ur5e"),
+            "--robot is for simulated arms",
+        ),
+        (
+            ("run", "placing", "--arm", "ros2", "--shelf", "lower", "upper"),
+            "hrc run placing places one object: give one --shelf",
         ),
         (("page", "--out", "x", "--arm", "franky"), "--arm franky needs --ip"),
         (("serve", "--arm", "franky"), "--arm franky needs --ip"),

@@ -177,7 +177,7 @@ def test_a_real_arm_gets_task_camera_and_address(
         assert calls["closed"] == 0
         on_phase("approach", 12.345)
         save = lambda *given: calls.update(saved=given)  # noqa: E731
-        return SimpleNamespace(failure=failure, save=save)
+        return SimpleNamespace(failure=failure, save=save, duration=4.5)
 
     def task_of(experiment, shelf):
         calls["shelf"] = shelf
@@ -191,15 +191,19 @@ def test_a_real_arm_gets_task_camera_and_address(
         out=tmp_path / "run",
         arm="franky",
         ip="1.2.3.4",
-        shelf=("upper",),
         config=("site.camera_delay=0.03",),
+        json=tmp_path / "values.json",
     )
     if experiment == "grasping":
         args = replace(args, camera=camera)
+    else:
+        args = replace(args, shelf=("upper",))
     assert experiment_commands.run(args) == (1 if failure else 0)
     assert ran == []
     assert calls["given"] == ("workplace", "task")
-    assert calls["shelf"] == "upper"
+    assert calls["shelf"] == ("middle" if experiment == "grasping" else "upper")
+    values = json.loads((tmp_path / "values.json").read_text())
+    assert values == {"duration_s": 4.5, "failed": int(bool(failure))}
     assert (calls["site"].driver, calls["site"].ip) == ("franky", "1.2.3.4")
     if experiment == "grasping":
         assert calls["camera"] == ("0" if camera == "auto" else camera, 0.03)
