@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hrc_learn.cli._run import has_screen, write_values
-from hrc_learn.cli.arguments import Report, Show
+from hrc_learn.cli.arguments import Report, Show, refuse_given
 from hrc_learn.store import write_text
 from hrc_learn.viz.evidence import evidence_page
 from hrc_learn.viz.report import read_report, reports_page
@@ -25,11 +25,9 @@ def show(args: Show) -> int:
     if not args.dataset.exists():
         raise FileNotFoundError(f"there is nothing at {args.dataset}")
     if recordings := recordings_in(args.dataset):
-        if args.out is not None:
-            raise ValueError(
-                f"--out records a dataset, but {args.dataset} holds recordings: "
-                f"{', '.join(map(str, recordings))}."
-            )
+        listed = ", ".join(map(str, recordings))
+        text = f"is for datasets, but {args.dataset} holds recordings: {listed}."
+        refuse_given(args, ["out", "episodes", "robot"], text)
         return _open(recordings, args.web)
     if args.out is not None:
         return _record(args, args.out)

@@ -417,6 +417,17 @@ def test_a_lerobot_arm_needs_its_type_and_no_address(tmp_path):
     assert "hrc run does not support --arm lerobot" in asked.error
 
 
+@pytest.mark.parametrize(
+    ("option", "value"), [("--out", "new.rrd"), ("--episodes", 1), ("--robot", "ur5e")]
+)
+def test_a_recording_is_shown_as_it_is(tmp_path, option, value):
+    (tmp_path / "run.rrd").write_bytes(b"")
+    asked = done("show", tmp_path, option, value, status=2)
+    assert (
+        f"{option} is for datasets, but {tmp_path} holds recordings: {tmp_path}" in asked.error
+    )
+
+
 def test_settings_of_several_config_options_count_together():
     words = [
         "--config",
