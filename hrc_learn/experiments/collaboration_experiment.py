@@ -17,7 +17,7 @@ from hrc_learn.experiments.collaboration_trial import (
 from hrc_learn.experiments.experiment import RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recorder import record, region_of_vision
-from hrc_learn.experiments.run_report import run_sections
+from hrc_learn.experiments.run_report import SUMMARIES, run_sections, worded
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.experiments.surroundings import unmarked_for, workplace_for
 from hrc_learn.kinematics import ArmChoice
@@ -38,15 +38,6 @@ object, at random moments of the whole job, or never."""
 # Time for the elbow to come to rest after the last drag [s], the same as without a worker.
 _AFTER_DRAGS = 1.0
 
-_NO_NULL_SPACE = (
-    "The pose of the tool needs all of them: a push at the elbow would move the tool, so the "
-    "simulated person does not push."
-)
-_FEWER_JOINTS = (
-    "They set the tool's position, its pitch and its rotation about the approach direction; "
-    "its yaw follows from the position. The table has targets for pitch and yaw. "
-)
-
 
 @dataclass(frozen=True, kw_only=True)
 class _FitMetrics:
@@ -58,12 +49,7 @@ class CollaborationExperiment(CollaborationScenario):
     """Grasp each object near a person, carry it to the cabinet, place it on its shelf."""
 
     title: ClassVar[str] = "Collaboration: grasping and placing near a person"
-    summary: ClassVar[str] = (
-        "An arm grasps objects with an uncalibrated camera. If it has a null space, a person "
-        "pushes its elbow aside meanwhile to reach under it. It then carries each object to a "
-        "cabinet along a motion learned from demonstrations, and places it on a shelf. "
-        "The run is simulated in MuJoCo, whose contacts decide on success."
-    )
+    summary: ClassVar[str] = SUMMARIES["collaboration"]
 
     aiming: Path
     """Folder of the visual-servoing skill."""
@@ -95,10 +81,8 @@ class CollaborationExperiment(CollaborationScenario):
             config=self._job(),
             cell=replace(self.cell, keep_image_every=keep_every),
         )
-        skill, workplace = (
-            VisualServoSkill.load(self.aiming),
-            workplace_for(self.shelves, robot),
-        )
+        skill = VisualServoSkill.load(self.aiming)
+        workplace = workplace_for(self.shelves, robot)
         if self.look is not None:
             workplace = unmarked_for(workplace, skill, self.look, seed)
             scenario = replace(scenario, camera="egl")
@@ -145,9 +129,9 @@ class CollaborationExperiment(CollaborationScenario):
         robot = run.workplace.robot
         sections = run_sections(recordings["run"], spans, notes)
         if robot.null_space == "none":
-            text = _FEWER_JOINTS if robot.task == "nearest pose" else ""
-            text = f"The {robot.name} has {robot.joints} joints. {text}{_NO_NULL_SPACE}"
-            sections.append(Section(heading="No null space", text=text))
+            topic = "nearest_pose" if robot.task == "nearest pose" else "no_null_space"
+            more = f" The {robot.name} has {robot.joints} joints."
+            sections.append(worded(topic, {}, more))
         return sections
 
     def study(self) -> Study:

@@ -1,6 +1,5 @@
 """Experiment 2 of the paper: an object grasped with an uncalibrated camera, and its metrics."""
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,7 +27,7 @@ from hrc_learn.experiments.run_measures import (
     unwanted_contacts,
 )
 from hrc_learn.experiments.run_recorder import record, region_of_vision
-from hrc_learn.experiments.run_report import run_sections
+from hrc_learn.experiments.run_report import SUMMARIES, run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.experiments.surroundings import unmarked_for
 from hrc_learn.experiments.trials import Trial
@@ -203,7 +202,7 @@ def held_out_grid(
         torch.linspace(float(a), float(b), points, dtype=torch.float64)
         for a, b in zip(low, high, strict=True)
     ]
-    grid = torch.tensor(list(itertools.product(*axes)), dtype=torch.float64)
+    grid = torch.cartesian_prod(*axes)
     inside = torch.cdist(grid, demonstrated).amin(dim=1) < REACH
     grid = grid[inside]
     rng = torch.Generator().manual_seed(seed)
@@ -251,15 +250,7 @@ class GraspingExperiment:
     """Grasp an object once with a camera that was moved since the demonstrations."""
 
     title: ClassVar[str] = "Grasping with an uncalibrated camera"
-    summary: ClassVar[str] = (
-        "The arm starts far from the table and has to grasp an object that it sees with one "
-        "fixed camera. The camera was moved, tilted or turned since the demonstrations from "
-        "which the image Jacobian was learned, in a manner unknown to the controller. The end "
-        "effector first approaches in joint space. A region in Cartesian space then brings it "
-        "into the camera's view, and visual servoing moves it above the object. It descends, "
-        "grasps the object and carries it home. The run is simulated in MuJoCo, whose contacts "
-        "and poses decide on success."
-    )
+    summary: ClassVar[str] = SUMMARIES["grasping"]
 
     aiming: Path
     """Folder of the visual-servoing skill."""
@@ -286,10 +277,8 @@ class GraspingExperiment:
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> GraspingRun:
         """Grasp once; the seed draws the scene, the imperfections and the image noise."""
         rng = np.random.default_rng(seed)
-        workplace, skill = (
-            Workplace.of(self.robot.work_arm()),
-            VisualServoSkill.load(self.aiming),
-        )
+        workplace = Workplace.of(self.robot.work_arm())
+        skill = VisualServoSkill.load(self.aiming)
         camera, placed = self.camera, self.camera
         if self.look is not None:
             workplace = unmarked_for(workplace, skill, self.look, seed)

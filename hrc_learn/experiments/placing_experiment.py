@@ -32,7 +32,12 @@ from hrc_learn.experiments.placing_trial import (
     taught_correction,
 )
 from hrc_learn.experiments.run_recorder import record
-from hrc_learn.experiments.run_report import placing_joints_figure, placing_paths_figure
+from hrc_learn.experiments.run_report import (
+    SUMMARIES,
+    placing_joints_figure,
+    placing_paths_figure,
+    worded,
+)
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import ArmChoice
@@ -41,7 +46,7 @@ from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill, PlanningSpace
 from hrc_learn.store import read_made_by
-from hrc_learn.viz.report import Picture, Section
+from hrc_learn.viz.report import Section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,16 +54,7 @@ class PlacingExperiment:
     """Place the object on every shelf, planned in both spaces."""
 
     title: ClassVar[str] = "Placing: demonstrated once, reproduced faster, on other shelves"
-    summary: ClassVar[str] = (
-        "An expert guides the end effector of an arm into a cabinet and at the same time moves "
-        "its elbow around the open door. A movement primitive learned from this demonstration "
-        "reproduces the motion faster and more smoothly, and adapts it to the shelves above "
-        "and below: in task space with the learned null-space posture, and, for comparison, in "
-        "joint space with a shifted goal, as in the paper.\n\n"
-        "Everything runs in MuJoCo with the object held by friction; contacts, poses and the "
-        "place of the object are read from the simulator. Values are for task space and the "
-        "worst shelf unless stated otherwise."
-    )
+    summary: ClassVar[str] = SUMMARIES["placing"]
 
     placing: Path
     """Folder of the placing skill."""
@@ -168,24 +164,11 @@ class PlacingExperiment:
         self, run: PlacingRun, recordings: Mapping[str, RunRecording]
     ) -> Sequence[Section]:
         """Report section: paths and joints on the way to all shelves."""
-        paths = Picture(
-            "paths",
-            placing_paths_figure(run, self._shelves),
-            "Paths of the end effector. A shifted goal bends the joint-space motion; in task "
-            "space the approach keeps its shape.",
-        )
-        joints = Picture(
-            "joints",
-            placing_joints_figure(run, self._shelves),
-            "Joints, planned in task space: the demonstration, and the faster motions to three "
-            "goals.",
-        )
-        text = (
-            "One demonstration on one shelf, three goals. Goals in joint space come from the "
-            "analytic inverse kinematics. The paper keeps joint 7 fixed. This arm would then "
-            "not reach all shelves, so joint 7 is free here."
-        )
-        return [Section(heading="Other shelves", text=text, figures=(paths, joints))]
+        figures = {
+            "paths": placing_paths_figure(run, self._shelves),
+            "joints": placing_joints_figure(run, self._shelves),
+        }
+        return [worded("shelves", figures)]
 
     def study(self) -> Study:
         """Trials from random starts."""

@@ -4,8 +4,8 @@ Each figure takes the recording of the run and the time interval of each object,
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.resources import as_file, files
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -51,19 +51,36 @@ _SHELVES = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)
 class _SectionText:
     heading: str
     text: str
-    captions: dict[str, str]
+    captions: dict[str, str] = field(default_factory=dict)
     """Captions of the figures, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Texts:
+    summary: dict[str, str]
     section: dict[str, _SectionText]
+
+
+_TEXTS = read_toml(Path(__file__).with_name("run_report.toml"), _Texts)
+SUMMARIES = _TEXTS.summary
+"""Description of each experiment; blank lines separate paragraphs."""
+
+
+def worded(topic: str, figures: Mapping[str, Figure], more: str = "") -> Section:
+    """Section with the heading, the text and the captions of `run_report.toml`.
+
+    Args:
+        topic: Name of the section there.
+        figures: Figures by the names of their captions.
+        more: End of the text.
+    """
+    said = _TEXTS.section[topic]
+    pictures = [Picture(name, drawn, said.captions[name]) for name, drawn in figures.items()]
+    return Section(heading=said.heading, text=said.text + more, figures=pictures)
 
 
 def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -> list[Section]:
     """Report sections: timeline, servoing, person and worker if present, motion.
-
-    `run_report.toml` holds their texts.
 
     Args:
         run: Recording of a run that servoed with a camera.
@@ -85,17 +102,8 @@ def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -
         "trajectories": trajectories_figure(run, objects),
         "joints": joints_figure(run),
     }
-    with as_file(files(__package__) / "run_report.toml") as path:
-        texts = read_toml(path, _Texts).section
     recoveries = {"job": f" {' '.join(notes) or 'No recovery was needed.'}"}
-    return [
-        Section(
-            heading=texts[topic].heading,
-            text=texts[topic].text + recoveries.get(topic, ""),
-            figures=[Picture(n, f, texts[topic].captions[n]) for n, f in figures.items()],
-        )
-        for topic, figures in shown.items()
-    ]
+    return [worded(topic, drawn, recoveries.get(topic, "")) for topic, drawn in shown.items()]
 
 
 def person_figure(run: RunRecording) -> Figure:
@@ -208,9 +216,7 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
             bar = (event.time, max(end - event.time, 0.15))
             axes.broken_barh([bar], (names.index(event.text) - 0.38, 0.76), color=colour)
         effort = run.nullspace_input
-        pushed = np.zeros(len(run.time), bool)
-        if effort is not None:
-            pushed = np.linalg.norm(effort, axis=1) > 0
+        pushed = np.zeros(len(run.time), bool) if effort is None else effort.any(axis=1)
         rows = {
             "person pushes": (pushed, palette.PURPLE),
             "marker occluded": (_out_of_sight(run), _HIDDEN),
