@@ -34,9 +34,8 @@ def refuse_given(args: Any, names: Iterable[str], reason: str) -> None:
         ValueError: An option was given.
     """
     for field_ in fields(args):
-        default = field_.default
-        if field_.default_factory is not MISSING:
-            default = field_.default_factory()
+        made = field_.default_factory
+        default = field_.default if made is MISSING else made()
         if field_.name in names and getattr(args, field_.name) != default:
             raise ValueError(f"--{field_.name.replace('_', '-')} {reason}")
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
 from hrc_learn.experiments.run_recorder import film, record
-from hrc_learn.experiments.simulated_cell import UNOBSERVED, LiveView, Observer, no_live_view
+from hrc_learn.experiments.simulated_cell import UNOBSERVED, LiveView, Observer
 from hrc_learn.experiments.trials import Trial, TrialRun, repeat
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import MotionLog, PhysicsError, World
@@ -181,15 +181,17 @@ def run_experiment[Run: ExperimentRun](
     if options.trials < 0:
         raise ValueError(f"--trials must not be negative, but is {options.trials}.")
     configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
-    console, study, view = Console(), experiment.study(), no_live_view
+    console, study = Console(), experiment.study()
+    observer = Observer(tell=console.print)
     if options.serve:
         view = live_view(experiment.title, lambda at: console.print(f"Dashboard at {at}"))
+        observer = replace(observer, view=view)
     # Next to the folder, which exists only after the run, so that interrupted trials resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
     try:
         with new_folder(options.out, configuration, options.overwrite) as folder:
             with console.status(f"{experiment.title}: running"):
-                run = experiment.run(options.seed, Observer(view=view, tell=console.print))
+                run = experiment.run(options.seed, observer)
             trials = _run_trials(study, trial_file, options) if options.trials else []
             results = evaluate_all(experiment, run, options.seed, trials)
             with console.status("Writing recordings and report"):

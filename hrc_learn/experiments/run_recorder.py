@@ -7,8 +7,8 @@ and with it the computing time, is bounded.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from importlib.resources import as_file, files
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,8 +60,7 @@ LONGEST = 16.0
 _EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
 _FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
 
-with as_file(files(__package__) / "film_captions.toml") as _path:
-    _CAPTIONS: dict[str, str] = read_toml(_path)
+_CAPTIONS: dict[str, str] = read_toml(Path(__file__).with_name("film_captions.toml"))
 """Captions of the phases."""
 
 _CARRYING = (HOME, TRANSFER, RELEASE, "retreat")

@@ -118,16 +118,11 @@ type LiveView = Callable[[WorkCell, World, MotionLog], AbstractContextManager[No
 """Context entered when a cell is ready to start and left when the run is over."""
 
 
-def no_live_view(*_: object) -> AbstractContextManager[None]:
-    """Live view that shows nothing."""
-    return nullcontext()
-
-
 @dataclass(frozen=True, kw_only=True)
 class Observer:
     """Outputs during a run; by default none."""
 
-    view: LiveView = no_live_view
+    view: LiveView = lambda *_: nullcontext()
     """Live dashboard."""
     tell: Callable[[str], None] = lambda text: None
     """Shows a line about the next step."""

@@ -296,9 +296,6 @@ def _turned(
     orientation: Float[np.ndarray, "4"], turn: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4"]:
     """A unit quaternion (wxyz) followed by a rotation vector in its own frame [rad]."""
-    angle = float(np.linalg.norm(turn))
-    by, turned = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
-    if angle > 0:
-        mujoco.mju_axisAngle2Quat(by, turn / angle, angle)
-    mujoco.mju_mulQuat(turned, np.array(orientation, dtype=float), by)
+    turned = np.array(orientation, dtype=float)
+    mujoco.mju_quatIntegrate(turned, turn, 1.0)
     return turned

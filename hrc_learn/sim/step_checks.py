@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool
 
 from hrc_learn.protocols import Touch
 
@@ -43,6 +42,7 @@ class ContactMonitor:
     """Records every touch between two groups of geoms.
 
     Attributes:
+        watched: Watched pairs of geoms, (geoms, geoms), bool.
         touches: Finished and running touches, in order of their start.
     """
 
@@ -58,7 +58,7 @@ class ContactMonitor:
         mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
         self._mover, self._obstacle = mover, obstacle
         # With one look-up for each contact, most steps need no further work.
-        self._matters = np.outer(mover, obstacle) | np.outer(obstacle, mover)
+        self.watched = np.outer(mover, obstacle) | np.outer(obstacle, mover)
         self.touches: list[Touch] = []
         self._running: dict[tuple[int, int], int] = {}
 
@@ -66,11 +66,6 @@ class ContactMonitor:
         """Forget all touches."""
         self.touches = []
         self._running = {}
-
-    @property
-    def watched(self) -> Bool[np.ndarray, "geoms geoms"]:
-        """Watched pairs of geoms."""
-        return self._matters
 
     def update(self, data: mujoco.MjData) -> None:
         """Record the watched contacts of one step."""
@@ -96,7 +91,7 @@ class ContactMonitor:
 
     def _current(self, data: mujoco.MjData) -> dict[tuple[int, int], float]:
         geoms = data.contact.geom
-        matters = self._matters[geoms[:, 0], geoms[:, 1]]
+        matters = self.watched[geoms[:, 0], geoms[:, 1]]
         found: dict[tuple[int, int], float] = {}
         for i in np.flatnonzero(matters & (data.contact.dist < 0)):
             a, b = geoms[i].tolist()

@@ -292,7 +292,8 @@ class World:
             if other in pads:
                 # MuJoCo's normals point from the first geom to the second.
                 out = 1 if pair[0] == item else -1
-                pads[other].add(_face(out * float(contact.frame[:3] @ axis)))
+                along = out * float(contact.frame[:3] @ axis)
+                pads[other].add(0 if abs(along) < _FLAT else int(math.copysign(1, along)))
         return sorted(tuple(faces) for faces in pads.values()) == [(-1,), (1,)]
 
     def rests_on(self, name: str, board: str) -> bool:
@@ -364,15 +365,6 @@ class World:
             for monitor in monitors:
                 monitor.update(data)
         return [touch for monitor in monitors for touch in monitor.touches]
-
-
-def _face(along: float) -> int:
-    """Face on which a contact lies: 1 or -1 along an axis, or 0 for neither.
-
-    Args:
-        along: Cosine of the angle between the contact's normal and the axis.
-    """
-    return 0 if abs(along) < _FLAT else int(math.copysign(1, along))
 
 
 def _put(

@@ -5,7 +5,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any
 
 from hrc_learn.store import read_toml
@@ -38,8 +38,7 @@ class _Clauses:
 
 def clauses() -> list[Clause]:
     """All requirements."""
-    with as_file(files(__package__) / "evidence.toml") as path:
-        return read_toml(path, _Clauses).clause
+    return read_toml(Path(__file__).with_name("evidence.toml"), _Clauses).clause
 
 
 def evidence_page(reports: Sequence[Report]) -> str:
@@ -63,7 +62,7 @@ def evidence_page(reports: Sequence[Report]) -> str:
             title="Work near people: requirements and evidence",
             reports=reports,
             clauses=[_filled(clause, reports) for clause in clauses()],
-            style=(files(__package__) / "report.css").read_text(encoding="utf-8"),
+            style=Path(__file__).with_name("report.css").read_text(encoding="utf-8"),
         )
     )
 

@@ -5,7 +5,7 @@ plots that the dashboards show (`panels.py`).
 """
 
 from collections.abc import Sequence
-from importlib.resources import as_file, files
+from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -25,11 +25,11 @@ from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, single
 
-with as_file(files(__package__) / "figures.mplstyle") as _path:
-    STYLE: dict[Any, Any] = {
-        **matplotlib.rc_params_from_file(_path, use_default_template=False),
-        "axes.prop_cycle": cycler(color=palette.SERIES),
-    }
+_FILE = Path(__file__).with_name("figures.mplstyle")
+STYLE: dict[Any, Any] = {
+    **matplotlib.rc_params_from_file(_FILE, use_default_template=False),
+    "axes.prop_cycle": cycler(color=palette.SERIES),
+}
 """Settings of matplotlib for every figure."""
 
 WIDTH = 7.2
@@ -46,14 +46,6 @@ def active_intervals(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]
     """First and last index of every run of true samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def shade(
-    axes: Axes, time: Float[np.ndarray, " time"], active: Bool[np.ndarray, " time"]
-) -> None:
-    """Shade the intervals in which something was active."""
-    for first, last in active_intervals(active):
-        axes.axvspan(time[first], time[last], color=palette.PERSON, alpha=0.13, lw=0)
 
 
 def draw_limits(axes: Axes, lower: float, upper: float) -> None:
@@ -229,8 +221,8 @@ def plots_figure(
                     look = palette.on_white(colour)
                     at = time if curves.time is None else curves.time
                     axes.plot(at, values, color=look, lw=0.8 * curves.width, label=name)
-            if shaded is not None:
-                shade(axes, time, shaded)
+            for first, last in () if shaded is None else active_intervals(shaded):
+                axes.axvspan(time[first], time[last], color=palette.PERSON, alpha=0.13, lw=0)
             axes.set_title(plot.title, fontsize=10 if columns == 1 else 8)
             axes.set_ylim(plot.range)
             axes.margins(x=0)

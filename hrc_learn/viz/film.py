@@ -11,7 +11,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from hrc_learn.geometry import Box, quaternion
@@ -155,7 +155,8 @@ def draw_run(
     """
     shown = [line for box in run.boxes for line in _edges(box)]
     for body in run.bodies:
-        R, origin = _matrix(body.orientation[step]), body.position[step]
+        R = quaternion.to_matrix(torch.from_numpy(body.orientation[step])).numpy()
+        origin = body.position[step]
         parts = [line for box in body.boxes for line in _edges(box)]
         parts += [
             Line(
@@ -198,7 +199,3 @@ def _edges(box: Box) -> list[Line]:
 def _depth(line: Line, camera: CameraModel) -> float:
     """Distance of the middle of a line in front of the camera [m]."""
     return float(camera.to_camera((line.start + line.end) / 2)[2])
-
-
-def _matrix(orientation: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    return quaternion.to_matrix(torch.from_numpy(orientation)).numpy()
