@@ -134,7 +134,7 @@ def test_an_arm_without_null_space_is_not_pulled(ran, capsys):
     ("given", "message"),
     [
         ({"experiment": "placing", "worker": True}, "hrc run collaboration"),
-        ({"experiment": "placing", "camera": "egl"}, "hrc run grasping and collaboration"),
+        ({"experiment": "placing", "camera": "egl"}, "hrc run grasping, collaboration"),
         ({"experiment": "grasping", "pulls": "none"}, "hrc run collaboration"),
         ({"experiment": "grasping", "imperfections": -0.1}, "not be negative, but is -0.1"),
         (
