@@ -89,7 +89,9 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
         else:
             hulls[link].append(hull_of(shape))
     for link, parts in hulls.items():
-        capsules += link_capsules((link, *fitted) for fitted in fit_link(parts))
+        capsules += link_capsules(
+            (link, a.tolist(), b.tolist(), r) for a, b, r in fit_link(parts)
+        )
     return CapsuleArm(chain, capsules, _left_out(chain, capsules, hulls))
 
 
@@ -224,7 +226,7 @@ def _around(points: np.ndarray, axes: np.ndarray) -> list[tuple[float, tuple]]:
 def _round(link: int, shape: Shape) -> LinkCapsule:
     (radius, half), pose = shape.size, shape.pose
     start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
-    return link_capsules([(link, start, end, radius)])[0]
+    return link_capsules([(link, start.tolist(), end.tolist(), radius)])[0]
 
 
 def _left_out(

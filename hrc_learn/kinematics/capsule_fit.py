@@ -67,7 +67,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
         if shape.kind in ("sphere", "capsule"):
             (radius, half), pose = shape.size, shape.pose
             start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
-            capsules += link_capsules([(link, start, end, radius)])
+            capsules += link_capsules([(link, start.tolist(), end.tolist(), radius)])
         else:
             try:
                 hull = hull_of(shape)
@@ -76,13 +76,15 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
             else:
                 hulls[link].append(hull)
     for link, parts in hulls.items():
-        capsules += link_capsules((link, *fitted) for fitted in fit_link(parts))
+        capsules += link_capsules(
+            (link, a.tolist(), b.tolist(), r) for a, b, r in fit_link(parts)
+        )
     steps = [step[:3, 3].numpy() for step in (*chain.mounts, chain.flange, chain.tcp)]
     lengths = [float(np.linalg.norm(step)) for step in steps]
     radius = min(_BARE_RADIUS, _BARE_FRACTION * sum(lengths))
     shown = {capsule.link for capsule in capsules}
     capsules += link_capsules(
-        (link, np.zeros(3), step, radius)
+        (link, (0.0, 0.0, 0.0), step.tolist(), radius)
         for link, (step, length) in enumerate(zip(steps, lengths, strict=True))
         # A link shorter than this radius lies inside its neighbours.
         if link not in shown and (length > radius or not shown)

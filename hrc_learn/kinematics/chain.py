@@ -199,8 +199,8 @@ class SerialChain:
             tcp: Tool centre point in the frame of the flange.
             flange: Another flange, in the frame of the last joint; None: the same.
         """
-        flange = self.flange if flange is None else flange
-        return SerialChain(**self.description_of_chain() | {"tcp": tcp, "flange": flange})
+        new: dict[str, Any] = {"tcp": tcp, "flange": self.flange if flange is None else flange}
+        return SerialChain(**self.description_of_chain() | new)
 
     def description_of_chain(self) -> dict[str, Any]:
         """Arguments with which `SerialChain` makes the same chain: all that its motion depends

@@ -46,9 +46,7 @@ class LinkCapsule(Capsule):
 def link_capsules(rows: Iterable[Sequence[Any]]) -> tuple[LinkCapsule, ...]:
     """Capsules from rows: link, both ends of the axis and radius [m]."""
     return tuple(
-        LinkCapsule(
-            link=link, start=tuple(map(float, start)), end=tuple(map(float, end)), radius=radius
-        )
+        LinkCapsule(link=link, start=tuple(start), end=tuple(end), radius=radius)
         for link, start, end, radius in rows
     )
 
