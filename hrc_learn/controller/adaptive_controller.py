@@ -477,8 +477,7 @@ class AdaptiveController(nn.Module):
         J = motion.jacobian
         planned = law.planned_motion(motion.task_twist, motion.twist, J, joint_velocity, dt)
         # An arm that only brakes does not drift.
-        braking = torch.linalg.vecdot(J, joint_velocity.unsqueeze(-2))
-        braking = safety.dt.unsqueeze(-1) * braking
+        braking = safety.dt.unsqueeze(-1) * torch.linalg.vecdot(J, joint_velocity.unsqueeze(-2))
         planned = torch.where(sound.unsqueeze(-1), planned, braking)
         return replace(motion.pose_drift, planned=planned)
 

@@ -121,10 +121,9 @@ class SeparationConfig:
     """Surface and inertia of the arm, for power and force limiting."""
 
     def __post_init__(self):
-        if self.mode not in (modes := get_args(PersonMode)):
-            raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
-        terms = "human_speed", "reaction_time", "clearance"
-        check_settings(self, positive=["deceleration"], not_negative=terms)
+        terms, modes = ("human_speed", "reaction_time", "clearance"), get_args(PersonMode)
+        one_of = [("mode", modes)]
+        check_settings(self, positive=["deceleration"], not_negative=terms, one_of=one_of)
 
     def protective_distance(
         self,

@@ -153,11 +153,10 @@ class WayMakingConfig:
     direction would jump where another pair becomes the nearest."""
 
     def __post_init__(self):
-        if self.mode not in (modes := get_args(WayMaking)):
-            raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
         if not self.near < self.far:
             raise ValueError(f"near must be below far, but they are {self.near} and {self.far}")
-        check_settings(self, positive=("speed", "smoothing"))
+        one_of = [("mode", get_args(WayMaking))]
+        check_settings(self, positive=("speed", "smoothing"), one_of=one_of)
 
     @property
     def automatic(self) -> bool:

@@ -55,6 +55,7 @@ def check_settings(
     not_negative: Iterable[str] = (),
     below_one: Iterable[str] = (),
     fraction: Iterable[str] = (),
+    one_of: Iterable[tuple[str, tuple[str, ...]]] = (),
 ) -> None:
     """Check that settings are in their ranges; NaN is in no range.
 
@@ -65,6 +66,7 @@ def check_settings(
         not_negative: Names of settings that must be zero or positive.
         below_one: Names of settings that must be in [0, 1).
         fraction: Names of settings that must be in (0, 1].
+        one_of: Names of settings, each with its possible values.
 
     Raises:
         ValueError: A setting is not in its range.
@@ -81,6 +83,9 @@ def check_settings(
             value = getattr(settings, name)
             if not holds(value):
                 raise ValueError(f"{name} {rule}, but is {value}")
+    for name, known in one_of:
+        if (value := getattr(settings, name)) not in known:
+            raise ValueError(f"{name} must be {' or '.join(known)}, but is {value!r}")
 
 
 def cos_and_sinc(square: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:

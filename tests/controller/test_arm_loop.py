@@ -173,6 +173,11 @@ def test_the_speed_must_be_a_fraction():
         ArmLoopConfig(speed=1.5)
 
 
+def test_what_follows_a_push_is_named():
+    with pytest.raises(ValueError, match="must be return or stay, but is 'go'"):
+        ArmLoopConfig(after_push="go")  # pyright: ignore[reportArgumentType]
+
+
 DIVISORS = ["dt", "damping", "nullspace_rise", "pose_gain", "elbow_speed", "return_speed"]
 TIMES = ["longest_wait", "back_after", "direct_return_after"]
 
