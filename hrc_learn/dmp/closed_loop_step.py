@@ -172,13 +172,11 @@ def uncoupled_step(
         State after the step. None where NumPy does not apply: the motion is differentiated,
         mapped or traced, is a batch, is not on the CPU or is not in float64.
     """
-    tensors = (
-        *(weights, state.position, state.rate, state.target, state.forced),
-        *(state.s, state.duration, state.pace, state.displacement),
-    )
     if weights.ndim != 2 or weights.dtype is not torch.float64:
         return None
-    if state.s.ndim or state.duration.ndim or state.pace.ndim or not fits_numpy(*tensors):
+    if state.s.ndim or state.duration.ndim or state.pace.ndim:
+        return None
+    if not fits_numpy(weights, *vars(state).values()):
         return None
     begin, ds = state.s.item(), dt / state.duration.item()
     now = begin + ds

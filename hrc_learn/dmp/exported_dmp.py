@@ -191,17 +191,13 @@ def _where_new[S: (OrientationState, PoseState)](new: S, old: S) -> S:
 
 
 def _program(dmp: MotionPrimitive, goal_filter: float | None) -> ExportedProgram:
-    trained = {name: p.requires_grad for name, p in dmp.named_parameters()}
-    dmp.requires_grad_(False)
-    try:
-        state = state_tensors(dmp.initial_state())
-        state = {k: x.repeat(TRACED_BATCH, *[1] * (x.ndim - 1)) for k, x in state.items()}
-        inputs = resting_inputs(dmp, state)
-        dt = torch.full((TRACED_BATCH,), TRACED_STEP).to(dmp.motion.duration)
-        first = {0: Dim("batch", min=1)}
-        shapes = dict.fromkeys(state, first), first, dict.fromkeys(inputs, first)
-        step = StepModule(dmp, goal_filter)
-        return torch.export.export(step, (state, dt, inputs), dynamic_shapes=shapes)
-    finally:
-        for name, parameter in dmp.named_parameters():
-            parameter.requires_grad_(trained[name])
+    frozen = dmp.with_tensors({name: x.detach() for name, x in dmp.tensors().items()})
+    frozen.requires_grad_(False)
+    state = state_tensors(frozen.initial_state())
+    state = {k: x.repeat(TRACED_BATCH, *[1] * (x.ndim - 1)) for k, x in state.items()}
+    inputs = resting_inputs(frozen, state)
+    dt = torch.full((TRACED_BATCH,), TRACED_STEP).to(frozen.motion.duration)
+    first = {0: Dim("batch", min=1)}
+    shapes = dict.fromkeys(state, first), first, dict.fromkeys(inputs, first)
+    step = StepModule(frozen, goal_filter)
+    return torch.export.export(step, (state, dt, inputs), dynamic_shapes=shapes)
