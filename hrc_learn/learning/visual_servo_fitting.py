@@ -169,17 +169,19 @@ def _ends(demos: Demonstrations) -> list[_End]:
 def _end(demo: Demonstration, source: str) -> _End:
     """End of a demonstration, with positions and pixels averaged over the rest."""
     watched = _watched(demo, source)
-    at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
+    # Columns u, v and 1 while the object is visible.
+    objects = demo.extra[OBJECT_FEATURE]
+    at_rest = torch.from_numpy((demo.time > demo.time[-1] - _REST) & (objects[:, 2] > 0))
     last = (watched.visible & at_rest).nonzero()[:, 0]
     if not len(last):
         raise ValueError(
-            f"{source}, episode {demo.episode}: the end effector's marker is not visible in "
+            f"{source}, episode {demo.episode}: end effector and object are not visible in "
             f"the last {_REST} s, at rest above the object. Leave this episode out."
         )
     angles = demo.extra.get(ANGLE_FEATURE)
     place = watched.pose.position[last].mean(dim=0)
     return _End(
-        object_pixel=demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0),
+        object_pixel=objects[last.numpy(), :2].mean(axis=0),
         pose=Pose(place, watched.pose.orientation[last[-1]]),
         path=watched.pose,
         angle=None if angles is None else float(angles[int(last[-1]), 1]),

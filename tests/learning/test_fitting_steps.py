@@ -67,6 +67,17 @@ def test_a_marker_that_is_not_seen_at_rest_is_refused():
         _end(watched(4, feature_visible=hidden), "here")
 
 
+def test_frames_in_which_the_object_is_hidden_do_not_count():
+    demo = watched()
+    demo.extra[OBJECT_FEATURE][FRAMES - 2] = 0.0
+    end = _end(demo, "here")
+    np.testing.assert_allclose(end.object_pixel, demo.extra[OBJECT_FEATURE][FRAMES - 3, :2])
+    np.testing.assert_allclose(end.pose.position, demo.position[FRAMES - 3])
+    demo.extra[OBJECT_FEATURE][:, 2] = 0.0
+    with pytest.raises(ValueError, match="end effector and object are not visible in the last"):
+        _end(demo, "here")
+
+
 def test_objects_are_seen_in_all_demonstrations_or_in_none():
     demos = DemonstrationSet([watched(0), watched(1)], source="here")
     assert [float(end.pose.position[0]) for end in _ends(demos)] == [
