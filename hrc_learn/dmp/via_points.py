@@ -166,7 +166,10 @@ def _window(
     duration = motion.duration.double().reshape(-1)
     if not (duration == duration[0]).all():
         raise ValueError("a window in seconds needs primitives of one duration")
-    return max(within[0] / duration[0].item(), 0.0), min(within[1] / duration[0].item(), 1.0)
+    first, last = (min(max(time / duration[0].item(), 0.0), 1.0) for time in within)
+    if not first < last:
+        raise ValueError(f"within must be two increasing times of the motion [s], got {within}")
+    return first, last
 
 
 def _knots(

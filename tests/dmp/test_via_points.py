@@ -282,3 +282,11 @@ def test_what_cannot_be_is_refused():
     turning = OrientationDMP.fit(*turning_motion(), n_basis=5, formulation="ude")
     with pytest.raises(ValueError, match="'ude' is not linear"):
         turning.condition([1.0], orientation(0.0, 0.0, 0.0)[None])
+
+
+@pytest.mark.parametrize("within", [(1.5, 0.5), (1.0, 1.0), (NAN, 1.5), (5.0, 6.0)])
+def test_a_window_has_a_beginning_and_an_end(within):
+    time, position = arm_motion(n_joints=2)
+    dmp = JointDMP.fit(time, position, 20)
+    with pytest.raises(ValueError, match="within must be two increasing times of the motion"):
+        dmp.condition([1.0], [[0.1, 0.2]], within=within)
