@@ -129,10 +129,11 @@ class Stepper:
         pace = 1.0 / (1.0 + phase_stopping)
         ds = dt * pace / duration
         now = s + ds
-        if ds != self._transition[0]:
-            # Loops repeat one step length, so keep its matrix.
-            self._transition = ds, self._spring.propagator(ds).numpy()
-        E = self._transition[1]
+        known, E = self._transition
+        if ds != known:
+            # Loops repeat one step length, so keep its matrix. Another thread may replace it.
+            E = self._spring.propagator(ds).numpy()
+            self._transition = ds, E
         # After the end of the forcing, the state that it caused moves by the spring alone.
         forced = after = self._forced(now) if s < self._end else E.dot(before)
         if scale is not None:
