@@ -151,7 +151,9 @@ class MarkerDetector:
 
     def _search_near(self, image: np.ndarray, id: int, last: Corners) -> dict[int, Corners]:
         reach = 0.5 * np.ptp(last, axis=0).max() + 8  # half a marker of motion a frame
-        low = np.maximum(np.floor(last.min(axis=0) - reach).astype(int), 0)
+        # Images may have become smaller; OpenCV refuses an empty part.
+        end = np.array(image.shape[1::-1]) - 1
+        low = np.floor(last.min(axis=0) - reach).astype(int).clip(0, end)
         high = np.ceil(last.max(axis=0) + reach).astype(int)
         grey = as_grey(image[low[1] : high[1], low[0] : high[0]])
         rough = self._search(grey, frozenset([id]))

@@ -131,6 +131,16 @@ def test_the_answer_can_be_changed_without_leading_the_search_astray():
     np.testing.assert_allclose(detector.detect(image)[7], kept, atol=0.1)
 
 
+def test_images_may_become_smaller():
+    pose = np.eye(4)
+    pose[:3, 3] = [0.5, 0.0, 0.2]
+    image = camera_on(overhead(), {7: pose}, MARKER).read()
+    detector = MarkerDetector([7])
+    first = detector.detect(image)[7]
+    assert detector.detect(image[:200, :300].copy()) == {}
+    np.testing.assert_allclose(detector.detect(image)[7], first, atol=0.1)
+
+
 def test_centre_is_the_image_of_the_middle_and_not_the_mean():
     H = np.array([[200.0, 30.0, 400.0], [-20.0, 150.0, 300.0], [0.4, 0.3, 1.0]])
     square = np.array([[-0.5, 0.5, 1], [0.5, 0.5, 1], [0.5, -0.5, 1], [-0.5, -0.5, 1]])
