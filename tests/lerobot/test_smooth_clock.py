@@ -185,6 +185,18 @@ def test_the_path_begins_with_the_measured_velocity(
     np.testing.assert_allclose(begun, velocity * np.array([1.0, -0.5]))
 
 
+def test_actions_that_come_too_fast_are_told(smooth, clock, caplog):
+    smooth.connect()
+    smooth._thread.join(PATIENCE)  # takes no action
+    rate = round(LIMITS.fps)
+    for k in range(2 * rate):
+        smooth.send_action(both(0.3))
+        assert len(caplog.messages) == (k >= rate - 1)
+    (told,) = caplog.messages
+    assert f"faster than at the {rate} a second of" in told
+    assert told.endswith("the robot is behind by 1 s")
+
+
 def test_a_reading_that_is_not_finite_begins_nothing(smooth, clock):
     smooth.begin()
     smooth._readings.append((clock.now, np.array([0.0, np.nan])))

@@ -26,6 +26,8 @@ _LATE = 2.0
 """Setpoint periods after which a setpoint counts as late."""
 _WAIT = 0.5
 """Action periods to wait for a late action before the motion comes to rest."""
+_BEHIND = 1.0
+"""Duration of the actions that wait to be carried out above which there is a warning [s]."""
 _FOLLOW = 0.1
 """Fraction of an action's lateness by which later actions are postponed. A small fraction
 suppresses the jitter of the loop, but follows its drift.
@@ -376,6 +378,11 @@ class SmoothRobot(Robot):
             values = np.array([float(action.get(name, np.nan)) for name in self._names])
             if self.config.clock == "wall":
                 self._actions.append(values)
+                if len(self._actions) == round(_BEHIND * (fps := self.upsampler.limits.fps)):
+                    text = (
+                        "actions come faster than at the %g a second of %s: the robot is behind"
+                    )
+                    logger.warning(f"{text} by %g s", fps, self.config.limits, _BEHIND)
             else:
                 for setpoint in self.upsampler.frame(values):
                     self._send(setpoint)
