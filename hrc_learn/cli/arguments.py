@@ -88,7 +88,8 @@ class Columns:
     """Meaning of those columns of a dataset that cannot be detected."""
 
     units: dict[str, str] = field(default_factory=dict)
-    """Units on disk by quantity, such as: joint_position deg position mm."""
+    """Units on disk by quantity, such as: joint_position deg position mm. For -100..100 of
+    LeRobot: joint_position CALIBRATION.json; hrc repair converts these to degrees."""
     mapping: dict[str, str] = field(default_factory=dict)
     """Columns by quantity, such as: joint_position "observation.state[0:7]" gripper none."""
 

@@ -3,11 +3,14 @@
 MuJoCo gives the positions of the tool from robosuite's descriptions of the arms.
 """
 
+import json
+from dataclasses import asdict
 from importlib.metadata import distribution
 from pathlib import Path
 
 import mujoco
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from lerobot_folders import read_info, write_folder, write_info
 
@@ -16,9 +19,11 @@ from hrc_learn.demos import (
     RepairOptions,
     check_dataset,
     load_demos,
+    merge_datasets,
     open_demos,
     repair_dataset,
 )
+from hrc_learn.demos.read.contract import keep_contract
 from hrc_learn.demos.read.kinematic_evidence import agreement, residual, zero_offsets
 from hrc_learn.demos.read.unit_evidence import measure
 from hrc_learn.kinematics import arm
@@ -205,33 +210,53 @@ SO101 = [f"{j}.pos" for j in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wr
 SO101 += ["wrist_roll.pos", "gripper.pos"]
 
 
-def lerobot_positions(ticks, mode):
-    """Values of LeRobot for ticks of its Feetech bus, by its own rules."""
+LOW, HIGH = [760, 830, 900, 870, 0, 1100], [3430, 3180, 3090, 3200, 4095, 2400]
+"""Ranges of an SO-101's motors."""
+
+
+def lerobot_positions(ticks, mode, low=LOW, high=HIGH, drive_mode=0):
+    """Values of LeRobot for ticks of its Feetech bus, by its own rules, and the calibration."""
     motors = pytest.importorskip("lerobot.motors")
     feetech = pytest.importorskip("lerobot.motors.feetech")
     names = [name.removesuffix(".pos") for name in SO101]
-    low, high = ticks.min(0) - 90, ticks.max(0) + 130 + 37 * np.arange(6)
     bus = feetech.FeetechMotorsBus(
         port="",
-        motors={n: motors.Motor(k, "sts3215", mode) for k, n in enumerate(names)},
+        motors={
+            n: motors.Motor(k, "sts3215", mode if k < 5 else motors.MotorNormMode.RANGE_0_100)
+            for k, n in enumerate(names)
+        },
         calibration={
-            n: motors.MotorCalibration(k, 0, 0, int(low[k]), int(high[k]))
+            n: motors.MotorCalibration(k, drive_mode, 0, low[k], high[k])
             for k, n in enumerate(names)
         },
     )
     rows = [bus._normalize(dict(enumerate(map(int, row)))) for row in ticks]
-    return np.array([[row[k] for k in range(6)] for row in rows])
+    values = np.array([[row[k] for k in range(6)] for row in rows])
+    return values, {name: asdict(motor) for name, motor in bus.calibration.items()}
+
+
+def so101_ticks(seed=0):
+    """Ticks of the six motors in one episode."""
+    return np.rint([1900, 2000, 1900, 2000, 2000, 1700] + motion(seed, 0.9) * 400).astype(int)
+
+
+def so101_set(root, values, commands=True):
+    """Dataset of an SO-101 that has these values as states and commands."""
+    rows = [{STATE: v, "action": v} if commands else {STATE: v} for v in values]
+    root = write_folder(
+        root, rows, {STATE: SO101, "action": SO101} if commands else {STATE: SO101}
+    )
+    write_info(root, read_info(root) | {"robot_type": "so101_follower"})
+    return root
 
 
 @pytest.mark.parametrize("mode", ["DEGREES", "RANGE_M100_100"])
 def test_steps_of_encoders_tell_degrees_from_fractions_of_a_range(tmp_path, mode):
     """The two units of LeRobot's hobby arms, of which size tells nothing."""
     motors = pytest.importorskip("lerobot.motors")
-    ticks = [np.rint(2048 + motion(k, 0.9) * 400).astype(int) for k in range(3)]
-    ticks = [t - t.min(0) + 1200 for t in ticks]
-    values = [lerobot_positions(t, getattr(motors.MotorNormMode, mode)) for t in ticks]
-    root = write_folder(tmp_path / "set", [{STATE: v} for v in values], {STATE: SO101})
-    write_info(root, read_info(root) | {"robot_type": "so101_follower"})
+    mode_ = getattr(motors.MotorNormMode, mode)
+    values = [lerobot_positions(so101_ticks(k), mode_)[0] for k in range(3)]
+    root = so101_set(tmp_path / "set", values, commands=False)
     if mode == "DEGREES":
         source = open_demos(root, refuse_doubt=True)
         np.testing.assert_allclose(
@@ -239,8 +264,12 @@ def test_steps_of_encoders_tell_degrees_from_fractions_of_a_range(tmp_path, mode
         )
         assert any("as an encoder of 4096 steps does in deg" in note for note in source.notes)
     else:
-        with pytest.raises(DatasetError, match="--units joint_position"):
-            open_demos(root, refuse_doubt=True)
+        source = open_demos(root, refuse_doubt=True)
+        assert source.joint_unit == "1"
+        np.testing.assert_allclose(
+            source[0].joint_position[:, :5], values[0][:, :5] / 100, atol=1e-5
+        )
+        assert any("as their ranges differ: taken for %" in note for note in source.notes)
 
 
 @pytest.mark.parametrize("step", [360 / 4096, 2 * np.pi / 4096, 0.5])
@@ -251,3 +280,86 @@ def test_the_step_of_an_encoder(step):
     levels = np.array([len(np.unique(column)) for column in values.T])
     np.testing.assert_allclose(found[levels > 15], step, rtol=1e-3)
     assert not measure(smooth).step.any()
+
+
+class Calibrated:
+    """One recording as -100..100 and as degrees of LeRobot, and the file of the calibration."""
+
+    def __init__(self, folder, **calibration):
+        modes = pytest.importorskip("lerobot.motors").MotorNormMode
+        folder.mkdir()
+        ticks = [so101_ticks(k) for k in range(3)]
+        percent = [lerobot_positions(t, modes.RANGE_M100_100, **calibration) for t in ticks]
+        degrees = [lerobot_positions(t, modes.DEGREES, **calibration)[0] for t in ticks]
+        self.degrees, self.file = degrees, folder / "arm.json"
+        self.file.write_text(json.dumps(percent[0][1]))
+        self.percent = so101_set(folder / "percent", [values for values, _ in percent])
+        self.in_degrees = so101_set(folder / "degrees", degrees)
+        self.units = {"joint_position": str(self.file)}
+
+
+@pytest.mark.parametrize("drive_mode", [0, 1])
+def test_a_calibration_tells_the_angles_of_fractions(tmp_path, drive_mode):
+    """LeRobot's degrees ignore `drive_mode`, which its fractions of the range obey."""
+    one = Calibrated(tmp_path / "a", drive_mode=drive_mode)
+    source = open_demos(one.percent, units=one.units, refuse_doubt=True)
+    assert source.joint_unit == "rad"
+    for demo, degrees in zip(source, one.degrees, strict=True):
+        expected = np.deg2rad(degrees[:, :5])
+        np.testing.assert_allclose(demo.joint_position, expected, atol=1e-5)
+        np.testing.assert_allclose(demo.command_position, expected, atol=1e-5)
+
+
+def test_a_kept_calibration_is_read_again(tmp_path):
+    one = Calibrated(tmp_path / "a")
+    report = check_dataset(one.percent, units=one.units)
+    keep_contract(one.percent, report.contract.without_doubt()[0])
+    demo = load_demos(one.percent)[0]
+    np.testing.assert_allclose(
+        demo.command_position, np.deg2rad(one.degrees[0][:, :5]), atol=1e-5
+    )
+
+
+def test_a_repair_applies_a_calibration(tmp_path):
+    one, out = Calibrated(tmp_path / "a"), tmp_path / "out"
+    options = RepairOptions(trim=False)
+    report = repair_dataset(one.percent, out, options, units=one.units)
+    assert "joint_position converted to deg; command_position converted to deg" in str(report)
+    table = pq.read_table(out / "data")
+    for key in (STATE, "action"):
+        written = table[key].to_pylist()
+        np.testing.assert_allclose(written, np.concatenate(one.degrees), atol=1e-4)
+    source = open_demos(out, refuse_doubt=True)
+    assert source.units["command_position"].unit == "deg"
+
+
+def test_arms_of_two_calibrations_are_merged(tmp_path):
+    one = Calibrated(tmp_path / "a")
+    two = Calibrated(tmp_path / "b", low=[k + 60 for k in LOW[:4]] + LOW[4:])
+    for arm_ in (one, two):
+        contract = check_dataset(arm_.percent, units=arm_.units).contract
+        keep_contract(arm_.percent, contract.without_doubt()[0])
+    report = merge_datasets([one.percent, two.percent], tmp_path / "out")
+    assert "action converted from" in str(report)
+    expected = [np.deg2rad(d[:, :5]) for d in [*one.degrees, *two.degrees]]
+    for demo, angles in zip(load_demos(tmp_path / "out"), expected, strict=True):
+        np.testing.assert_allclose(demo.joint_position, angles, atol=1e-5)
+
+
+def test_a_calibration_that_does_not_fit_is_refused(tmp_path):
+    one = Calibrated(tmp_path / "a")
+    other = Calibrated(tmp_path / "b", low=[k + 60 for k in LOW[:4]] + LOW[4:])
+    for root, units, message in (
+        (one.percent, other.units, "the steps of shoulder_pan, shoulder_lift.* another arm"),
+        (one.in_degrees, one.units, "the steps of .* values in deg"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            open_demos(root, units=units)
+    content = json.loads(one.file.read_text())
+    del content["elbow_flex"]
+    one.file.write_text(json.dumps(content))
+    with pytest.raises(DatasetError, match="has no elbow_flex; there are shoulder_pan"):
+        open_demos(one.percent, units=one.units)
+    far = so101_set(tmp_path / "far", [1.6 * np.rint(d) for d in one.degrees])
+    with pytest.raises(DatasetError, match=r"reaches \d+.*: is it in deg, not %"):
+        open_demos(far, units=other.units)

@@ -27,7 +27,7 @@ from hrc_learn.demos.read.profiles import (
 )
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES
 from hrc_learn.demos.read.source import DemonstrationSource, OpenedDataset
-from hrc_learn.demos.read.units import Quantities, UnitDecision, unit_factor
+from hrc_learn.demos.read.units import Quantities, UnitDecision, require_known
 
 METADATA_CHECKS = (
     structure_checks.statistics_exist,
@@ -77,8 +77,7 @@ def check_dataset(
     Raises:
         DatasetError: `mapping` or `units` name an unknown quantity, column or unit.
     """
-    for role, unit in (units or {}).items():
-        unit_factor(role, unit)
+    require_known(units or {})
     report = ValidationReport(path=Path(path))
     folder = read_metadata(report.path, report)
     if folder is None:

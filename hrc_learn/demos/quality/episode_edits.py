@@ -260,6 +260,16 @@ def move_zeros(edit: EpisodeEdit, offsets: Mapping[str, float]) -> EpisodeEdit:
     return edit
 
 
+def apply_calibration(edit: EpisodeEdit) -> EpisodeEdit:
+    """Convert joints and their commands from -100..100 to degrees."""
+    for role in ("joint_position", "command_position"):
+        if role in edit.selections and (plain := edit.units[role].plain) != edit.units[role]:
+            degrees = edit.quantities[role] * (edit.units[role].factor / plain.factor)
+            edit = edit.with_quantity(role, degrees, f"{role} converted to {plain.unit}")
+            edit = replace(edit, units={**edit.units, role: plain})
+    return edit
+
+
 def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
     """Remove jumps by whole turns from joints, Euler angles and rotation vectors.
 

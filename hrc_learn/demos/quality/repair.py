@@ -37,7 +37,7 @@ from hrc_learn.demos.read.dataset_folder import (
 )
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.source import OpenedDataset
-from hrc_learn.demos.read.units import Quantities
+from hrc_learn.demos.read.units import Quantities, calibrations
 from hrc_learn.demos.recorded_episode import to_table
 from hrc_learn.demos.videos import read_segments, video_keys
 from hrc_learn.store import write_json
@@ -141,7 +141,8 @@ def repair_dataset(
         out: Folder of the new dataset, which must not exist.
         options: Permitted changes.
         mapping: Columns of quantities that are not found by name, as in `load_demos`.
-        units: Units on disk by role, as in `load_demos`; kept in the new dataset.
+        units: Units on disk by role, as in `load_demos`; kept in the new dataset. A calibration
+            file is applied: the new dataset holds degrees.
         progress: Function that iterates over the episodes and shows the progress.
         kept: Episode index -> frames to keep; all other episodes are left out. None keeps all.
 
@@ -312,6 +313,10 @@ class _Repair:
         self.decisions, faults = dataset.units_from(self._readable(), units)
         self.faults = {fault.episode: fault for fault in faults}
         """Episode index -> error, for episodes that contradict the units of the others."""
+        self._calibrated = bool(calibrations(units))
+        if self._calibrated:
+            joints = {r: d.plain for r, d in self.decisions.items() if d.plain != d}
+            units = {**units, **{role: plain.unit for role, plain in joints.items()}}
         add_time = (
             "time" not in dataset.columns.selections
             and options.fps is None
@@ -383,6 +388,7 @@ class _Repair:
             edit = edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
         edit = edits.renew_stamps(edit, self.folder.fps)
         edit = edits.drop_bad_frames(edit, options.drop_bad_frames)
+        edit = edits.apply_calibration(edit) if self._calibrated else edit
         edit = edits.move_zeros(edit, options.offsets)
         for name in ("drop_late", "trim", "drop_repeats", "unwrap", "fix_signs"):
             if getattr(options, name):

@@ -32,6 +32,7 @@ from hrc_learn.demos.read.unit_evidence import FEWEST_JOINTS
 from hrc_learn.demos.read.units import (
     Quantities,
     UnitDecision,
+    calibrations,
     guessed_from_values,
     units_from_episodes,
 )
@@ -118,7 +119,7 @@ class OpenedDataset:
         Raises:
             DatasetError: A unit is unknown or does not fit its quantity.
         """
-        known = {*self.declared_units, *given}
+        known = {*self.declared_units, *given} - calibrations(given).keys()
         guessed = guessed_from_values(self.columns.selections, known)
         # Commands are identified by comparing them with the joints.
         more = {"time"} - known | ({"joint_position"} if _COMMAND in guessed else set())
@@ -227,7 +228,7 @@ def _meaning_of_commands(
     hands = [is_hand(label) for label in selection.labels[:-1]]
     hands.append(selection.numbered or is_hand(selection.labels[-1]))
     units = tuple(
-        command.unit_of(i) if no and hand else f"{factor}{command.unit}/step"
+        command.unit_of(i) if no and hand else f"{factor}{command.unit_of(i)}/step"
         for i, (no, hand) in enumerate(zip(np.isnan(slope), hands, strict=True))
     )
     evidence = (
@@ -298,7 +299,8 @@ def load_demos(
             -> feature ("observation.qpos"), range of a feature ("observation.state[0:7]") or
             list of components. Roles are the keys of `demos.ROLES`; None leaves a role out.
         units: Units on disk by role, such as {"joint_position": "deg", "position": "mm"};
-            they take precedence over the dataset's sidecar and over guesses.
+            they take precedence over the dataset's sidecar and over guesses. For joints
+            that LeRobot stored as -100..100, its calibration file of the arm gives the angles.
         joint_names: Joints wanted, in the order wanted; None takes all in their order.
         tasks: Read only episodes that show one of these tasks.
         where: Read only episodes for which this is true; it receives their `index`, `length`

@@ -3,14 +3,17 @@
 import math
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy.lib.stride_tricks import sliding_window_view
 
-from hrc_learn.demos.read.naming import WORDS
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.naming import WORDS, is_hand
 from hrc_learn.demos.read.quantities import SIZES
+from hrc_learn.store import read_json
 
 CONFIDENT = 0.75
 """Smallest confidence at which a guessed unit is used without a question."""
@@ -25,8 +28,13 @@ _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
 # Unit, and step of an encoder in it. LeRobot divides a turn by 4095.
-_ENCODERS = (("deg", 360 / 4095), ("deg", 360 / 4096), ("rad", math.tau / 4096))
+STEP_IN_DEGREES = 360 / 4095
+_ENCODERS = (("deg", STEP_IN_DEGREES), ("deg", 360 / 4096), ("rad", math.tau / 4096))
 _FEWEST_STEPS, _FEWEST_ENCODERS = 10, 3
+_RANGED = (0.045, 0.2)
+"""Steps of an encoder of 4096 steps in -100..100, for ranges of a quarter turn to a turn."""
+_DYNAMIXEL = re.compile("koch|omx|aloha|widowx|viperx", re.IGNORECASE)
+"""Robot types with motors that reverse themselves; LeRobot reverses those of other makers."""
 _SLIDE = 0.12
 """Longest stroke of a gripper's finger [m]."""
 # Old datasets of LeRobot name the columns of joints and of poses alike.
@@ -115,7 +123,7 @@ def typical(sizes: Sequence[Sizes]) -> Sizes:
         whole=np.all([s.whole for s in sizes], axis=0),
         unit_length=np.all([s.unit_length for s in sizes], axis=0),
         opening=np.all([s.opening for s in sizes], axis=0),
-        step=np.median([s.step for s in sizes], axis=0),
+        step=np.quantile([s.step for s in sizes], 0.5, axis=0, method="higher"),
     )
 
 
@@ -123,6 +131,66 @@ def is_hobby_arm(robot_type: str, labels: Sequence[str]) -> bool:
     """True for arms of hobby servos, by robot type or names of joints."""
     named = {label.lower().removeprefix("main_") for label in labels}
     return bool(_HOBBY.search(robot_type)) or len(named & _HOBBY_JOINTS) >= 3
+
+
+def read_calibration(file: Path) -> dict[str, tuple[float, bool]]:
+    """Range of each motor in a calibration of LeRobot [encoder steps], and its `drive_mode`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no calibration.
+    """
+    found = {}
+    for name, motor in read_json(file).items():
+        try:
+            span = float(motor["range_max"]) - float(motor["range_min"])
+        except (TypeError, KeyError, ValueError):
+            span = 0.0
+        if span <= 0:
+            text = f"is no calibration of LeRobot: {name} has no range_min below a range_max"
+            raise DatasetError(text, file=file)
+        found[name] = span, bool(motor.get("drive_mode"))
+    if not found:
+        raise DatasetError("is no calibration of LeRobot: it has no motors", file=file)
+    return found
+
+
+def calibrated_units(
+    file: Path, labels: Sequence[str], sizes: Sizes, robot_type: str
+) -> tuple[str, ...]:
+    """Unit of each joint that LeRobot stored as -100..100 of its calibrated range.
+
+    LeRobot's degrees count from the middle of the range, too.
+
+    Args:
+        file: The calibration of the arm that was recorded.
+        labels: Joint names.
+        sizes: Sizes of the joints.
+        robot_type: Robot type of the dataset, "" if unknown.
+
+    Raises:
+        DatasetError: The file is no calibration, lacks a joint, or does not fit the values.
+    """
+    known, units = read_calibration(file), []
+    names = [name if name in known else name.removeprefix("main_") for name in labels]
+    if missing := [name for name in names if name not in known]:
+        text = f"has no {', '.join(missing)}; there are {', '.join(known)}"
+        raise DatasetError(f"{text}: give the calibration of the robot recorded", file=file)
+    spans = np.array([known[name][0] for name in names])
+    # Encoder steps in each recorded step.
+    steps = np.broadcast_to(sizes.step, len(names)) * spans / 200
+    other = (steps > 0) & (np.abs(steps - np.maximum(np.rint(steps), 1)) > 5e-3 * steps)
+    if (beyond := sizes.peak > _CLIP + 0.05).any():
+        text = f"{labels[beyond.argmax()]} reaches {sizes.peak.max():.4g}: is it in deg, not %?"
+        raise DatasetError(f"does not fit: {text}", file=file)
+    if other.sum() > 1:
+        text = f"the steps of {', '.join(np.array(labels)[other])} are not those of its ranges"
+        raise DatasetError(f"does not fit: {text}: another arm, or values in deg?", file=file)
+    for name, span in zip(names, spans / 2, strict=True):
+        sign = -1 if known[name][1] and not _DYNAMIXEL.search(robot_type) else 1
+        deg = f"{sign * span / 100 * STEP_IN_DEGREES:.9g} deg"
+        units.append("%" if is_hand(name) else deg)
+    return tuple(units)
 
 
 def guess_joints(
@@ -154,6 +222,12 @@ def guess_joints(
                 f"all values step by {steps[0]:.4g}, as an encoder of 4096 steps does in {unit}"
             )
             return Guess(unit, 0.97, text)
+    ranged = (
+        len(steps) >= _FEWEST_ENCODERS and ((steps > _RANGED[0]) & (steps < _RANGED[1])).all()
+    )
+    if ranged and is_hobby_arm(robot_type, labels) and np.ptp(steps) > 1e-2 * steps[0]:
+        text = f"joints step by {steps.min():.3g} to {steps.max():.3g}, as their ranges differ"
+        return Guess("%", 0.95, text, "deg")
     most = np.median(peaks[moving])
     limit = next((x for x in (_TWO_TURNS, _DEGREES) if most <= x), math.inf)
     fitting = moving & (peaks <= limit)

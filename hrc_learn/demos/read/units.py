@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -21,9 +22,9 @@ from hrc_learn.demos.read.naming import is_hand, role_of_key
 from hrc_learn.demos.read.quantities import DIMENSIONS, ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.unit_evidence import CONFIDENT, Guess, Sizes
 
-_STEP = re.compile(r"(?:(\d+\.?\d*(?:e-?\d+)?) )?(.+)/step")
-"""Unit of commands that are added to the joint positions: rad/step, or 0.05 rad/step for values
-that were scaled."""
+_SCALED = re.compile(r"(?:(-?\d+\.?\d*(?:e-?\d+)?) )?(.+?)(/step)?")
+"""Unit with an optional factor: 1.1 deg for -100..100 of a calibrated motor, 0.05 rad/step for
+scaled commands that are added to the joint positions."""
 
 _FOLLOWERS = ("joint_velocity", "command_position", "command_velocity")
 """Quantities that take over the unit of the joint positions if nothing is declared."""
@@ -103,6 +104,12 @@ class UnitDecision:
         own = "1" if self.unit in DIMENSIONS["ratio"] else ROLES[self.role].unit
         return own + "/step" * bool(self.steps.any())
 
+    @property
+    def plain(self) -> "UnitDecision":
+        """The decision without the factors in its units: deg for 1.1 deg."""
+        units = [re.sub(_SCALED, r"\2\3", unit, count=1) for unit in self.units or (self.unit,)]
+        return replace(self, unit=units[0], units=tuple(units) if len({*units}) > 1 else ())
+
     def unit_of(self, component: int) -> str:
         """Unit of one component."""
         return self.units[component] if self.units else self.unit
@@ -118,8 +125,10 @@ def unit_factor(role: str, unit: str) -> float:
         raise DatasetError(
             f"units are given for the unknown quantity {role!r}; known are {', '.join(ROLES)}"
         )
-    if role == "command_position" and (step := _STEP.fullmatch(unit)):
-        return float(step[1] or 1) * unit_factor("joint_position", step[2])
+    scaled = _SCALED.fullmatch(unit)
+    known = ("command_position",) if scaled and scaled[3] else _JOINTS
+    if role in known and scaled and scaled[2] != unit:
+        return float(scaled[1] or 1) * unit_factor("joint_position", scaled[2])
     options = units_of(role)
     if unit not in options:
         raise DatasetError(
@@ -318,7 +327,7 @@ def units_from_episodes(
         episodes: Episodes in the units on disk.
         fps: Frame rate [1/s].
         declared: Units from the sidecar, as in `decide_units`.
-        given: Units from the caller, which take precedence.
+        given: Units from the caller, which take precedence; for joints, also calibration files.
         sample: Indices of the episodes that decide; None for all.
         robot_type: Robot type of the dataset, "" if unknown.
 
@@ -326,12 +335,12 @@ def units_from_episodes(
         The decisions, and an error for each episode that contradicts them.
 
     Raises:
-        DatasetError: A unit is unknown, or does not fit its quantity.
+        DatasetError: A unit is unknown, or does not fit its quantity or its values.
     """
-    for role, unit in given.items():
-        unit_factor(role, unit)
+    require_known(given)
     _require_declared(declared)
-    guessed = guessed_from_values(selections, {*declared, *given})
+    files = calibrations(given)
+    guessed = guessed_from_values(selections, {*declared, *given} - files.keys())
     steps: list[float] = []
     measured: list[tuple[EpisodeEntry, dict[str, Sizes]]] = []
     for entry, quantities in episodes:
@@ -349,13 +358,34 @@ def units_from_episodes(
     found = {role: [own[role] for own in deciding if role in own] for role in guessed}
     sizes = {role: unit_evidence.typical(known) for role, known in found.items() if known}
     step = float(np.median(steps)) if steps else 1.0
-    decisions = decide_units(selections, sizes, {**declared, **given}, step, robot_type)
+    read = {
+        role: unit_evidence.calibrated_units(file, selections[role].labels, own, robot_type)
+        for role, file in files.items()
+        if (own := sizes.get(role)) is not None
+    }
+    stated = {**declared, **given, **read}
+    decisions = decide_units(selections, sizes, stated, step, robot_type)
     faults = [
         fault
         for role, own in sizes.items()
         for fault in _contradictions(selections[role], own.peak, decisions[role], measured)
     ]
     return decisions, faults
+
+
+def calibrations(given: Mapping[str, str]) -> dict[str, Path]:
+    """Files of LeRobot's calibrations that the caller gives as units of joints, by role."""
+    return {r: Path(u) for r, u in given.items() if r in _JOINTS and u.endswith(".json")}
+
+
+def require_known(given: Mapping[str, str]) -> None:
+    """Check the units that a caller gives; calibration files are read later.
+
+    Raises:
+        DatasetError: A unit is unknown, or does not fit its quantity.
+    """
+    for role in given.keys() - calibrations(given).keys():
+        unit_factor(role, given[role])
 
 
 def _require_declared(declared: Mapping[str, str | Sequence[str]]) -> None:

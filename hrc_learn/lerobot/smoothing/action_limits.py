@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from hrc_learn.controller.motion_filter import MotionFilter
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
+from hrc_learn.demos.read.unit_evidence import STEP_IN_DEGREES, read_calibration
 from hrc_learn.kinematics.description import MOVING
 from hrc_learn.kinematics.urdf import read_urdf
 from hrc_learn.lerobot.policy.action_encoding import matched_columns
@@ -24,10 +25,6 @@ _UNUSUAL = 0.999
 _STILL = 1e-3
 """Least limit of a value, relative to the largest limit of all values: limits must be positive,
 even for a value that never moved."""
-_ENCODER_STEPS = 4095
-"""Encoder steps of a turn, for servos that LeRobot calibrates in degrees (Feetech STS,
-Dynamixel X).
-"""
 
 type Range = tuple[float | None, float | None]
 """Lowest and highest position; None: no limit."""
@@ -275,22 +272,10 @@ def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, 
         FileNotFoundError: There is no such file.
         ValueError: The file is no calibration.
     """
-    content = read_json(calibration)
     ranges: dict[str, Range] = {}
-    for name, motor in content.items():
-        try:
-            half = (float(motor["range_max"]) - float(motor["range_min"])) / 2
-        except (TypeError, KeyError, ValueError):
-            half = 0.0
-        if half <= 0:
-            raise ValueError(
-                f"{calibration} is no calibration of LeRobot: {name} has no range_min below a "
-                "range_max"
-            )
-        end = half * 360 / _ENCODER_STEPS if degrees else 100.0
+    for name, (span, _) in read_calibration(calibration).items():
+        end = span / 2 * STEP_IN_DEGREES if degrees else 100.0
         ranges[f"{name}.pos"] = (0.0, 100.0) if name == "gripper" else (-end, end)
-    if not ranges:
-        raise ValueError(f"{calibration} is no calibration of LeRobot: it has no motors")
     return ranges
 
 
