@@ -116,6 +116,9 @@ class Check(Columns, OnDataset, Written):
     """Print one line per finding instead of one line per kind of finding."""
     keep_contract: bool = False
     """Store the meaning of the columns in DATASET/meta/hrc_learn.json."""
+    robot: str = ""
+    """Arm whose kinematics tell the units, as in `hrc demo` (NAME or FILE). Default: by the
+    dataset's robot type."""
     camera: bool = False
     """Also detect between which episodes the camera was moved, from the tool's marker."""
 

@@ -39,6 +39,7 @@ from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.recording_import import plan_import, write_plan
 from hrc_learn.demos.recording_names import ImportOptions
 from hrc_learn.jacobian import camera_placements
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.store import new_folder, read_json, read_toml, write_json, write_text
 from hrc_learn.vision.camera_model import IMAGE_SIZE
@@ -114,7 +115,8 @@ def check(args: Check) -> int:
     """
     if not args.dataset.is_dir():  # not an error in the data
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
-    report = check_dataset(args.dataset, columns(args.mapping), units=args.units)
+    robot = ArmChoice(args.robot).arm() if args.robot else None
+    report = check_dataset(args.dataset, columns(args.mapping), args.units, robot)
     if report.contract is not None:
         print(*report.contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from commands import hrc
 from lerobot_folders import read_info, write_folder, write_info
 
 from hrc_learn.demos import (
@@ -126,10 +127,10 @@ def test_zeros_explain_no_other_motion(model):
     assert not zero_offsets(arm("ur5e"), q, tool(model, motion(7))).any()
 
 
-def write(root, model, joints, spans=(1.0, 1.2, 0.9), robot="ur5e"):
+def write(root, model, joints, spans=(1.0, 1.2, 0.9), robot="ur5e", per_metre=1.0):
     """A dataset of joints as recorded and of the tool's position."""
     episodes = [motion(k, span) for k, span in enumerate(spans)]
-    rows = [{STATE: np.hstack([joints(q), tool(model, q)])} for q in episodes]
+    rows = [{STATE: np.hstack([joints(q), per_metre * tool(model, q)])} for q in episodes]
     names = [*(f"joint_{i}.pos" for i in range(6)), "ee.x", "ee.y", "ee.z"]
     write_folder(root, rows, {STATE: names}, fps=20)
     write_info(root, read_info(root) | {"robot_type": robot})
@@ -139,11 +140,7 @@ def write(root, model, joints, spans=(1.0, 1.2, 0.9), robot="ur5e"):
 @pytest.mark.parametrize("unit", ["deg", "rev"])
 def test_a_dataset_of_six_degrees_in_all_is_read_by_kinematics(model, tmp_path, unit):
     # About a posture near zero: values within six degrees look like radians.
-    near = np.array([0.02, -0.05, 0.03, 0.04, -0.03, 0.05])
-    rows = []
-    for k in range(3):
-        q = motion(k, SMALL) - HOME + near
-        rows.append((q, np.hstack([q / UNITS[unit], tool(model, q)])))
+    rows = [(q, np.hstack([q / UNITS[unit], tool(model, q)])) for q in near_zero()]
     names = [*(f"joint_{i}.pos" for i in range(6)), "ee.x", "ee.y", "ee.z"]
     root = write_folder(tmp_path / "set", [{STATE: r} for _, r in rows], {STATE: names}, fps=20)
     write_info(root, read_info(root) | {"robot_type": "ur5e"})
@@ -152,6 +149,37 @@ def test_a_dataset_of_six_degrees_in_all_is_read_by_kinematics(model, tmp_path, 
     line = next(note for note in source.notes if note.startswith("joint_position"))
     assert "forward kinematics of ur5e give the position within" in line
     assert f"taken for {unit};" in line
+
+
+def near_zero():
+    """Motions within six degrees of zero, which look like radians in either unit."""
+    near = np.array([0.02, -0.05, 0.03, 0.04, -0.03, 0.05])
+    return [motion(k, SMALL) - HOME + near for k in range(3)]
+
+
+@pytest.mark.parametrize(("unit", "per_metre"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
+def test_the_unit_of_positions_by_kinematics(model, tmp_path, unit, per_metre):
+    """Size alone leaves the question whether positions of 130 are in cm or mm."""
+    root, episodes = write(tmp_path / "set", model, np.rad2deg, per_metre=per_metre)
+    source = open_demos(root, refuse_doubt=True)
+    assert (source.units["position"].unit, source.units["joint_position"].unit) == (unit, "deg")
+    np.testing.assert_allclose(source[1].position, tool(model, episodes[1]), atol=1e-6)
+
+
+def test_the_check_compares_with_an_arm_from_a_file(model, tmp_path):
+    rows = [{STATE: np.hstack([np.rad2deg(q), tool(model, q)])} for q in near_zero()]
+    names = [*(f"joint_{i}.pos" for i in range(6)), "ee.x", "ee.y", "ee.z"]
+    root = str(write_folder(tmp_path / "set", rows, {STATE: names}, fps=20))
+    file = distribution("robosuite").locate_file(
+        "robosuite/models/assets/robots/ur5e/robot.xml"
+    )
+    status, text, _ = hrc("check", "--dataset", root, "--robot", file)
+    assert "give the position within" in text
+    assert "taken for deg;" in text
+    assert "taken for rad" in hrc("check", "--dataset", root)[1]
+    status, text, _ = hrc("check", "--dataset", root, "--robot", "panda")
+    assert status == 1
+    assert "are not those of panda" in text
 
 
 def test_without_a_pose_the_unit_is_assumed_and_the_line_says_so(tmp_path):

@@ -28,6 +28,7 @@ from hrc_learn.demos.read.profiles import (
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES
 from hrc_learn.demos.read.source import DemonstrationSource, OpenedDataset
 from hrc_learn.demos.read.units import Quantities, UnitDecision, require_known
+from hrc_learn.kinematics import Arm
 
 METADATA_CHECKS = (
     structure_checks.statistics_exist,
@@ -64,6 +65,7 @@ def check_dataset(
     path: str | Path,
     mapping: MappingSpec | None = None,
     units: Mapping[str, str] | None = None,
+    robot: Arm | None = None,
 ) -> ValidationReport:
     """Validate a LeRobot dataset of version 2.0, 2.1 or 3.0.
 
@@ -73,6 +75,8 @@ def check_dataset(
         path: Folder of the dataset.
         mapping: Columns of quantities that are not found by name, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`.
+        robot: Arm of the dataset, with whose kinematics joints and positions are compared; None
+            for that of the robot type.
 
     Raises:
         DatasetError: `mapping` or `units` name an unknown quantity, column or unit.
@@ -88,6 +92,7 @@ def check_dataset(
     columns = map_columns(folder.features, mapping)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
     dataset = dataset or OpenedDataset(folder=folder, columns=columns)
+    dataset = replace(dataset, robot=robot)
     report.attempt(lambda: check_videos(folder, report))
     report.attempt(lambda: _check_content(dataset, report, units or {}))
     return report
@@ -189,9 +194,8 @@ def _check_motions(
         if (motion := episode_checks.arm_motion(demo)) is not None:
             span = float(np.ptp(motion, axis=0).max())
             sketches.append((entry, motion_sketch(motion), span))
-    if placed and source.joint_unit == "rad":
-        kind, names = dataset.folder.robot_type, source.joint_names
-        report.run(consistency.joint_zeros, kind, names, placed)
+    if placed and source.joint_unit == "rad" and dataset.arm is not None:
+        report.run(consistency.joint_zeros, *dataset.arm, placed)
     report.run(episode_checks.duplicates, sketches)
 
 

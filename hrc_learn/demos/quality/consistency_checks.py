@@ -10,7 +10,7 @@ from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import Issue, warning
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
-from hrc_learn.demos.read.kinematic_evidence import known_arm, zero_offsets
+from hrc_learn.demos.read.kinematic_evidence import zero_offsets
 from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
     FOLLOWS,
@@ -24,6 +24,7 @@ from hrc_learn.demos.read.profiles import (
     over_episodes,
 )
 from hrc_learn.demos.read.units import UnitDecision
+from hrc_learn.kinematics import Arm
 
 FEWEST = 3
 """Smallest number of episodes for comparing one episode with the others."""
@@ -354,23 +355,20 @@ def command_offsets(
 
 
 def joint_zeros(
-    robot_type: str | None, joint_names: Sequence[str], demos: Sequence[Demonstration]
+    arm: Arm, columns: Sequence[int], demos: Sequence[Demonstration]
 ) -> Iterator[Issue]:
     """Report wrong zeros of joints, found from tool positions and the kinematics of the arm.
 
     Args:
-        robot_type: Robot type of the dataset.
-        joint_names: Joints of the demonstrations.
+        arm: The arm.
+        columns: Columns of its joints.
         demos: Demonstrations with joints [rad] and positions.
     """
-    if (known := known_arm(robot_type, joint_names)) is None:
-        return
-    arm, columns = known
     joints = [q[:, columns] for demo in demos if (q := demo.joint_position) is not None]
     positions = [p for demo in demos if (p := demo.position) is not None]
     offsets = zero_offsets(arm, np.concatenate(joints), np.concatenate(positions))
     found = [
-        f"{joint_names[k]} {np.rad2deg(offset):+.1f} deg"
+        f"{demos[0].joint_names[k]} {np.rad2deg(offset):+.1f} deg"
         for k, offset in zip(columns, offsets, strict=True)
         if offset
     ]

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, overload, runtime_checkable
+from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from hrc_learn.demos.read.dataset_folder import (
     select_episodes,
 )
 from hrc_learn.demos.read.frames import RawEpisode, frame_timestamps, raising, read_quantities
-from hrc_learn.demos.read.kinematic_evidence import agreement, known_arm
+from hrc_learn.demos.read.kinematic_evidence import agreement, arm_columns, known_arm
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, demonstration_fields
@@ -34,8 +34,11 @@ from hrc_learn.demos.read.units import (
     UnitDecision,
     calibrations,
     guessed_from_values,
+    unit_factor,
     units_from_episodes,
+    units_of,
 )
+from hrc_learn.kinematics import Arm
 
 _SAMPLED = 32
 """Number of episodes that decide on units."""
@@ -56,6 +59,8 @@ class OpenedDataset:
     sidecar: Sidecar = field(default_factory=Sidecar)
     own_feature: bool = False
     """True if the image feature is a column of the dataset, or the mapping decides on it."""
+    robot: Arm | None = None
+    """Arm that the caller names; None for that of the robot type."""
 
     @classmethod
     def of(cls, folder: DatasetFolder, mapping: MappingSpec | None = None) -> "OpenedDataset":
@@ -84,6 +89,18 @@ class OpenedDataset:
     def contract(self) -> Contract | None:
         """Contract kept with the dataset."""
         return self.sidecar.contract if self.sidecar.contract.components else None
+
+    @cached_property
+    def arm(self) -> tuple[Arm, tuple[int, ...]] | None:
+        """Arm of the dataset and the columns of its joints; None if it is not known.
+
+        Raises:
+            DatasetError: The caller named an arm with other joints.
+        """
+        names = self.columns.joint_names
+        if self.robot is not None:
+            return self.robot, arm_columns(names, self.robot)
+        return known_arm(self.folder.robot_type, names)
 
     @cached_property
     def contract_note(self) -> str | None:
@@ -164,30 +181,35 @@ class OpenedDataset:
         )
         joints = decisions.get("joint_position")
         if joints is not None and joints.guessed and poses:
-            factor = decisions["position"].factor
-            decisions["joint_position"] = self._by_kinematics(joints, poses, factor)
+            decisions |= self._by_kinematics(joints, decisions["position"], poses)
         if asked:
             decisions |= _meaning_of_commands(columns, decisions, trackings, fps)
         return decisions, faults
 
     def _by_kinematics(
-        self, joints: UnitDecision, poses: Sequence[tuple[np.ndarray, np.ndarray]], factor: Any
-    ) -> UnitDecision:
-        """Decision on the unit of the joints, by the kinematics if they agree with the poses.
+        self,
+        joints: UnitDecision,
+        place: UnitDecision,
+        poses: Sequence[tuple[np.ndarray, np.ndarray]],
+    ) -> dict[str, UnitDecision]:
+        """Decisions on joints and positions for which the kinematics agree; {} if none agree.
 
         Args:
-            joints: Decision from the values of the joints; returned if the kinematics disagree.
+            joints: Decision from the values of the joints.
+            place: Decision on the positions of the end effector.
             poses: Joint positions and positions of the end effector, as recorded.
-            factor: Factor from recorded positions to metres.
         """
+        if self.arm is None:
+            return {}
+        arm, columns = self.arm
         values, position = map(np.concatenate, zip(*poses, strict=True))
-        known = known_arm(self.folder.robot_type, self.columns.joint_names)
-        if known is None:
-            return joints
-        arm, columns = known
-        found = agreement(arm, values[:, columns], position * factor)
-        if found is None:
-            return joints
+        lengths = [place.unit, *(units_of("position") if place.guessed else ())]
+        for length in dict.fromkeys(lengths):
+            metres = position * unit_factor("position", length)
+            if (found := agreement(arm, values[:, columns], metres)) is not None:
+                break
+        else:
+            return {}
         text = f"the forward kinematics of {arm.name} give the position within"
         text += f" {1e3 * found.residual:.2g} mm"
         if found.change:
@@ -197,13 +219,11 @@ class OpenedDataset:
         units = [joints.unit_of(i) for i in range(values.shape[1])]
         for column in columns:
             units[column] = found.unit
-        return replace(
-            joints,
-            unit=found.unit,
-            units=tuple(units) if len({*units}) > 1 else (),
-            confidence=0.4 if found.change else 0.99,
-            evidence=text,
-        )
+        sure = {"confidence": 0.4 if found.change else 0.99, "evidence": text}
+        several = tuple(units) if len({*units}) > 1 else ()
+        joints = replace(joints, unit=found.unit, units=several, **sure)
+        place = replace(place, unit=length, **sure) if place.guessed else place
+        return {joints.role: joints, place.role: place}
 
 
 def _meaning_of_commands(
