@@ -53,15 +53,19 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     remarks = [line.lstrip().lstrip("#%/ ") for _, line in rows[: plain.index(True)]]
     rows = [row for row, is_row in zip(rows, plain, strict=True) if is_row]
     delimiter = _delimiter(rows[min(1, len(rows) - 1)][1])
-    header = _split(rows[0][1], delimiter)
+    fields = [_split(line, delimiter) for _, line in rows]
+    header = _without_end(fields[0])
     if any(map(_is_number, header)):
         named = _split(remarks[-1], delimiter) if remarks else []
-        header = named if len(named) == len(header) else []
+        header = named if len(named) in (len(header), len(fields[0])) else []
     else:
-        rows = rows[1:]
+        rows, fields = rows[1:], fields[1:]
     if not rows:
         raise DatasetError("holds a header and no numbers", file=path)
-    width = len(_split(rows[0][1], delimiter))
+    width = len(fields[0])
+    if width != len(header) and not any(len(row) == width and row[-1] for row in fields):
+        width = len(_without_end(fields[0]))  # every line ends with a separator
+    fields = [row if any(row[width:]) else row[:width] for row in fields]
     if header and len(header) == width - 1:
         header = ["", *header]  # R and pandas do not name the column of row numbers
     names = header or list(columns) or [str(place) for place in range(width)]
@@ -70,7 +74,7 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     names = [
         f"{n} ({names[:k].count(n) + 1})" if n in names[:k] else n for k, n in enumerate(names)
     ]
-    table = _parsed(path, rows, names, delimiter)
+    table = _parsed(path, [number for number, _ in rows], fields, names, delimiter)
     if not header and not columns:
         return {UNNAMED: np.stack([*table.values()], axis=1)}
     return _without_index(path, table)
@@ -89,8 +93,12 @@ def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == " " and '"' not in line:
         return line.split()
     fields = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    fields = [field.strip() for field in fields]
-    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields  # without an empty end
+    return [field.strip() for field in fields]
+
+
+def _without_end(fields: list[str]) -> list[str]:
+    """The fields of a line without an empty one at the end."""
+    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields
 
 
 def _is_number(field: str) -> bool:
@@ -102,14 +110,18 @@ def _is_number(field: str) -> bool:
 
 
 def _parsed(
-    path: Path, rows: Sequence[tuple[int, str]], names: Sequence[str], delimiter: str
+    path: Path,
+    lines: Sequence[int],
+    fields: Sequence[list[str]],
+    names: Sequence[str],
+    delimiter: str,
 ) -> Table:
-    """Columns of numbers, parsed by Arrow."""
+    """Columns of numbers, parsed by Arrow; `lines` has the line number of each row."""
     from pyarrow.csv import ConvertOptions, ParseOptions, ReadOptions, read_csv
 
     text = io.StringIO()
     writer = csv.writer(text, delimiter="\t")
-    writer.writerows(_split(line, delimiter) for _, line in rows)
+    writer.writerows(fields)
     comma = bool(re.search(r"\d,\d", text.getvalue()))
     options = {
         "read_options": ReadOptions(column_names=names, use_threads=False),
@@ -122,7 +134,7 @@ def _parsed(
         table = read_csv(io.BytesIO(text.getvalue().encode()), **options)
     except pa.ArrowInvalid as error:
         wrong = _WRONG_ROW.search(str(error))
-        place = f"line {rows[int(wrong[1]) - 1][0]}" if wrong else "a line"
+        place = f"line {lines[int(wrong[1]) - 1]}" if wrong else "a line"
         text = f"{place} does not hold {len(names)} numbers separated by {delimiter!r}"
         raise DatasetError(text, file=path) from error
     for name, column in zip(table.column_names, table.columns, strict=True):
@@ -133,7 +145,7 @@ def _parsed(
             text = "mixes decimal points and decimal commas"
             raise DatasetError(text, file=path, key=name)
         if wrong[0] != 0:
-            text = f"line {rows[wrong[0]][0]} does not hold {len(names)} numbers separated by"
+            text = f"line {lines[wrong[0]]} does not hold {len(names)} numbers separated by"
             raise DatasetError(
                 f"{text} {delimiter!r}: {words[wrong[0]]!r}", file=path, key=name
             )

@@ -33,6 +33,7 @@ def table(tmp_path, text, columns=()):
         ("a,a,a\n1,2,3\n", (), {"a": [1], "a (2)": [2], "a (3)": [3]}),
         ('"the time", b\n1, 2\n', (), {"the time": [1], "b": [2]}),
         ("a,b,\n1,2,\n3,4,\n", (), {"a": [1, 3], "b": [2, 4]}),
+        ("a,b,\n1,2\n3,4,\n", (), {"a": [1, 3], "b": [2, 4]}),
         # Rows are numbered from 0 or 1, without a name or as pandas names them.
         (",a\n0,5\n1,6\n", (), {"a": [5, 6]}),
         ("a\n1,5\n2,6\n3,7\n", (), {"a": [5, 6, 7]}),
@@ -48,6 +49,24 @@ def table(tmp_path, text, columns=()):
 )
 def test_text_becomes_columns_of_numbers(tmp_path, text, columns, found):
     assert table(tmp_path, text, columns) == found
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("a,b\n1,\n3,4\n", ()),
+        ("a,b\n1,2\n3,\n", ()),
+        (",a,b\n0,1,\n1,3,4\n", ()),
+        ("a,b\n0,1,\n1,3,4\n", ()),
+        ("1,\n3,4\n", ("a", "b")),
+        ("# a,b\n1,\n3,4\n", ()),
+    ],
+)
+def test_a_last_number_may_be_missing_in_any_row(tmp_path, text, columns):
+    found = table(tmp_path, text, columns)
+    assert list(found) == ["a", "b"]
+    assert found["a"][0] == 1
+    assert np.isnan(found["b"]).any()
 
 
 def test_a_missing_number_is_nan(tmp_path):
