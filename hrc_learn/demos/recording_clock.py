@@ -9,15 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from hrc_learn.demos.read.units import unit_factor
-from hrc_learn.demos.recording_files import Recording, is_time, longest_hold, time_unit_in
+from hrc_learn.demos.recording_files import (
+    STEPS,
+    Recording,
+    is_time,
+    longest_hold,
+    read_stamps,
+)
 from hrc_learn.demos.recording_meaning import Meaning
 from hrc_learn.demos.recording_names import ImportOptions
 
-_EPOCH = (1e9, 3e9)
-"""Range of stamps that count from 1970 [s]: the years 2001 to 2065."""
-_STEPS = (1 / 1500, 0.5)
-"""Plausible steps between stamps [s]: 2 Hz to 1.5 kHz."""
 _JUMP = 10.0
 """Smallest step between stamps that is reported, as a multiple of the median step."""
 _FASTER = 1.5
@@ -113,7 +114,7 @@ def _stamps_of_state(
     if meaning.time and fields[stamps].frames == frames:
         time = read_stamps(recording, stamps, options.units.get("time", ""))
         steps = np.diff(time)
-        wide = np.flatnonzero(steps > max(_JUMP * float(np.median(steps)), _STEPS[1]))
+        wide = np.flatnonzero(steps > max(_JUMP * float(np.median(steps)), STEPS[1]))
         jumps = [f"{stamps} jumps by {steps[k]:.3g} s after frame {k}" for k in wide[:1]]
         return time, jumps
     if options.duration is not None:
@@ -129,38 +130,6 @@ def _stamps_of_state(
     raise recording.error(
         "there are no stamps: name the field of stamps (time), or give duration or fps"
     )
-
-
-def read_stamps(
-    recording: Recording, name: str, unit: str = ""
-) -> Float64[np.ndarray, " _frames"]:
-    """Stamps of a field [s]. Their unit is given or declared, or their name or size tells it.
-
-    Raises:
-        DatasetError: Stamps do not increase, or their unit is in doubt.
-    """
-    time = recording.fields[name].numbers()[:, 0]
-    bad = np.flatnonzero(~np.isfinite(time))
-    if len(bad):
-        raise recording.error(f"is {time[bad[0]]} at frame {bad[0]}", name)
-    steps = np.diff(time)
-    for k in np.flatnonzero(steps <= 0)[:1]:
-        way = f"{time[k]:.9g} to {time[k + 1]:.9g} at frame {k}"
-        text = f"time must increase, but goes from {way}: remove repeated rows, or import"
-        raise recording.error(f"{text} without this field and with --fps", name)
-    unit = unit or recording.fields[name].unit or time_unit_in(name)
-    if unit:
-        return time * unit_factor("time", unit)
-    step = float(np.median(steps)) if len(steps) else 1.0
-    sizes = {unit: unit_factor("time", unit) for unit in ("s", "ms", "us", "ns")}
-    found = [u for u, size in sizes.items() if _EPOCH[0] < time[0] * size < _EPOCH[1]]
-    found = found or [u for u, size in sizes.items() if _STEPS[0] <= step * size <= _STEPS[1]]
-    counts = bool((steps == 1).all())
-    if counts or len(found) != 1:
-        kinds = "a count of frames (give --fps), ms or s" if counts else "s, ms, us or ns"
-        text = f"steps by {step:.4g}: {kinds}? Give the unit: --units time s"
-        raise recording.error(text, name)
-    return time * sizes[found[0]]
 
 
 def _latest(

@@ -14,6 +14,7 @@ from jaxtyping import Float64, Shaped
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import column_places
 from hrc_learn.demos.read.naming import without_unit
+from hrc_learn.demos.read.units import unit_factor
 
 Kind = Literal["number", "image", "encoded", "text", "depth", "pose", "other"]
 """Content of a field; "pose" is the pose of a frame that is not known to be the tool's."""
@@ -43,6 +44,12 @@ _UNITS = {"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", 
 _UNITS |= {"nsec": "ns", "nanos": "ns", "nm": "N m", "n*m": "N m", "metre": "m", "meter": "m"}
 _UNITS |= {"radian": "rad", "degree": "deg", "percent": "%"}
 """Spellings of units in files -> units of `read.units`."""
+
+
+_EPOCH = (1e9, 3e9)
+"""Range of stamps that count from 1970 [s]: the years 2001 to 2065."""
+STEPS = (1 / 1500, 0.5)
+"""Plausible steps between stamps [s]: 2 Hz to 1.5 kHz."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +164,38 @@ def time_unit_in(name: str) -> str:
     """Unit in the name of a field of stamps; "" if the name states none."""
     match = _TIME.fullmatch(name.split("/")[-1].lower())
     return unit_in_words((match and match["unit"]) or "")
+
+
+def read_stamps(
+    recording: Recording, name: str, unit: str = ""
+) -> Float64[np.ndarray, " _frames"]:
+    """Stamps of a field [s]. Their unit is given or declared, or their name or size tells it.
+
+    Raises:
+        DatasetError: Stamps do not increase, or their unit is in doubt.
+    """
+    time = recording.fields[name].numbers()[:, 0]
+    bad = np.flatnonzero(~np.isfinite(time))
+    if len(bad):
+        raise recording.error(f"is {time[bad[0]]} at frame {bad[0]}", name)
+    steps = np.diff(time)
+    for k in np.flatnonzero(steps <= 0)[:1]:
+        way = f"{time[k]:.9g} to {time[k + 1]:.9g} at frame {k}"
+        text = f"time must increase, but goes from {way}: remove repeated rows, or import"
+        raise recording.error(f"{text} without this field and with --fps", name)
+    unit = unit or recording.fields[name].unit or time_unit_in(name)
+    if unit:
+        return time * unit_factor("time", unit)
+    step = float(np.median(steps)) if len(steps) else 1.0
+    sizes = {unit: unit_factor("time", unit) for unit in ("s", "ms", "us", "ns")}
+    found = [u for u, size in sizes.items() if _EPOCH[0] < time[0] * size < _EPOCH[1]]
+    found = found or [u for u, size in sizes.items() if STEPS[0] <= step * size <= STEPS[1]]
+    counts = bool((steps == 1).all())
+    if counts or len(found) != 1:
+        kinds = "a count of frames (give --fps), ms or s" if counts else "s, ms, us or ns"
+        text = f"steps by {step:.4g}: {kinds}? Give the unit: --units time s"
+        raise recording.error(text, name)
+    return time * sizes[found[0]]
 
 
 def make_field(

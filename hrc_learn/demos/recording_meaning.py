@@ -18,7 +18,7 @@ from hrc_learn.demos.read.naming import joint_of
 from hrc_learn.demos.read.profiles import are_positions, track
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.units import UnitDecision, unit_factor, units_from_episodes
-from hrc_learn.demos.recording_files import UNNAMED, Recording, is_time
+from hrc_learn.demos.recording_files import UNNAMED, Recording, is_time, read_stamps
 from hrc_learn.demos.recording_names import (
     FieldSearch,
     ImportOptions,
@@ -32,7 +32,7 @@ _REACH = 5.0
 _ANGLES = re.compile(r"(?:^|[._])r_?x$", re.IGNORECASE)
 _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 """`_CHECKED_EPISODES`: approximate number of episodes in which commands are compared with
-joints. `_CHECK_RATE`: frame rate of the comparison [1/s]; it limits the delay to 30 frames."""
+joints. `_CHECK_RATE`: frame rate of the comparison [1/s] for topics and where none is known."""
 _ALIKE = 0.3
 """Ratio of the distances from a joint to the nearest and to the second nearest unnamed command.
 The order of the commands is clear if the ratio of every joint is smaller."""
@@ -109,7 +109,7 @@ def understand(
                 text = f"{other.file} and {first.file} do not fit into one dataset: {what}"
                 raise ValueError(f"{text} {', '.join(two)} and {', '.join(one)}")
     _decide_units(meaning, options, recordings)
-    _decide_commands(meaning, recordings, "command_position" in options.columns, search.actions)
+    _decide_commands(meaning, recordings, options, search.actions)
     used = {*meaning.fields, meaning.time, *meaning.left_out}
     meaning.left_out |= {
         name: "stamps" if is_time(name, one) else "not understood; to keep it: observation.NAME"
@@ -354,23 +354,32 @@ def _largest(first: Recording, selection: ColumnSelection, columns: Sequence[int
 
 
 def _decide_commands(
-    meaning: Meaning, recordings: Sequence[Recording], named: bool, actions: Sequence[str]
+    meaning: Meaning,
+    recordings: Sequence[Recording],
+    options: ImportOptions,
+    actions: Sequence[str],
 ) -> None:
     """Take a recorded action for commands of the joints if the joints follow it.
 
     Args:
         meaning: Receives the commands.
         recordings: Episodes.
-        named: True if the caller named the commands.
+        options: The caller's options.
         actions: Fields that hold an action, but do not name its content.
     """
     selections, kept, first = meaning.selections, meaning.kept, recordings[0]
     joints, command = selections.get("joint_position"), selections.get("command_position")
+
+    def followed(places: Sequence[Place]) -> bool:
+        rate = _rate_of(first, meaning, options)
+        return joints is not None and _followed(recordings, places, joints.columns, rate)
+
+    named = "command_position" in options.columns
     if command is not None and joints is not None and not named:
         if command.numbered:
             columns = _in_order(first, command.columns, joints.columns)
             selections["command_position"] = command = replace(command, columns=columns)
-        if not _followed(recordings, command.columns, joints.columns):
+        if not followed(command.columns):
             del selections["command_position"], meaning.decisions["command_position"]
             kept.setdefault("action", (command.columns, column_names(first, command.columns)))
             text = "the joints do not follow the recorded action: kept as recorded"
@@ -384,7 +393,7 @@ def _decide_commands(
         arm, rest = places[:width], places[width:]
         fits = len(arm) == width and (not rest or (len(rest) == 1 and "gripper" in selections))
         arm = _in_order(first, arm, joints.columns) if joints and fits else arm
-        if joints and fits and _followed(recordings, arm, joints.columns):
+        if joints and fits and followed(arm):
             role, unit = "command_position", meaning.decisions["joint_position"]
             selections[role] = replace(joints, role=role, columns=arm)
             meaning.decisions[role] = replace(unit, role=role, evidence="the joints follow it")
@@ -394,6 +403,17 @@ def _decide_commands(
         kept["action"] = (places, column_names(first, places))
         if joints:
             meaning.notes.append(f"the joints do not follow {name}: it is kept as recorded")
+
+
+def _rate_of(first: Recording, meaning: Meaning, options: ImportOptions) -> float | int:
+    """Frame rate at which commands are compared with joints [1/s]."""
+    fields, frames = first.fields, first.fields[meaning.main].frames
+    if not first.streams and meaning.time and fields[meaning.time].frames == frames > 1:
+        time = read_stamps(first, meaning.time, options.units.get("time", ""))
+        return 1 / float(np.median(np.diff(time)))
+    if options.duration is not None and not first.streams:
+        return max(frames - 1, 1) / options.duration
+    return _CHECK_RATE if first.streams else options.fps or first.fps or _CHECK_RATE
 
 
 def _matched(
@@ -430,15 +450,18 @@ def _in_order(
 
 
 def _followed(
-    recordings: Sequence[Recording], command: Sequence[Place], state: Sequence[Place]
+    recordings: Sequence[Recording],
+    command: Sequence[Place],
+    state: Sequence[Place],
+    rate: float | int,
 ) -> bool:
-    """True if the joints move as the command does, in the same unit."""
+    """True if the joints, at a rate [1/s], move as the command does, in the same unit."""
     votes = []
     for one in recordings[:: max(1, len(recordings) // _CHECKED_EPISODES)]:
         given, measured = _matched(one, command, state)
         apart = np.median(np.abs(given - measured), axis=0)
         near = apart <= 0.1 + 0.5 * np.ptp(measured, axis=0)
-        tracking = track(given, measured, _CHECK_RATE)
+        tracking = track(given, measured, rate)
         known = [] if tracking is None else [{"command_position": tracking}]
-        votes.append(near.mean() > 0.5 and are_positions(known, _CHECK_RATE))
+        votes.append(near.mean() > 0.5 and are_positions(known, rate))
     return bool(np.mean(votes) > 0.5)
