@@ -159,6 +159,17 @@ def test_an_episode_whose_save_failed_takes_no_other_along(
     assert check_dataset(tmp_path / "out").ok
 
 
+def test_an_episode_whose_video_was_not_saved_is_left_out(tmp_path):
+    root = write_set(tmp_path / "reach", "v3.0", camera=True)
+    before = load_demos(root)
+    fail_to_save(root, 4, again=False, listed=True)
+    report = repair_dataset(root, tmp_path / "out", AS_IT_IS)
+    assert "episode 4: left out: the video of this episode is missing" in str(report)
+    same(load_demos(tmp_path / "out"), before[:4])
+    report = repair_dataset(root, tmp_path / "blind", RepairOptions(trim=False, videos=False))
+    assert not report.left_out
+
+
 def test_repeated_frames_are_no_failed_save(root, tmp_path):
     (file,) = (root / "data").glob("*/*.parquet")
     table = pq.read_table(file)

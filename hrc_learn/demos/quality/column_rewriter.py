@@ -167,10 +167,10 @@ class ColumnRewriter:
         """
         self._folder, self._header, self._segments = folder, header, segments
         types = {key: feature["dtype"] for key, feature in header.features.items()}
-        self._cameras = [key for key, dtype in types.items() if dtype == "video"]
+        self.cameras = [key for key, dtype in types.items() if dtype == "video"]
         self._image_columns = [key for key, dtype in types.items() if dtype == "image"]
         self._others = [k for k, dtype in types.items() if not dtype.startswith(_IN_TABLES)]
-        pictures = self._cameras or self._image_columns
+        pictures = self.cameras or self._image_columns
         self._recorded = recorded_statistics(folder) if pictures else {}
 
     def rewritten(self, edit: EpisodeEdit) -> Rewritten:
@@ -186,14 +186,14 @@ class ColumnRewriter:
     def _videos_of(self, edit: EpisodeEdit) -> Segments:
         """Parts of the old videos that show the remaining frames."""
         found, fps = self._segments.get(edit.entry.index, {}), self._folder.fps
-        for key in self._cameras:
+        for key in self.cameras:
             if key not in found:
                 raise edit.fault(
                     "the video of this episode is missing: copy it, or leave out the videos "
                     "(--no-videos) or the episode (--drop bad-episodes)",
                     key=key,
                 )
-        if self._cameras and (edit.resampled or (np.diff(edit.kept) != 1).any()):
+        if self.cameras and (edit.resampled or (np.diff(edit.kept) != 1).any()):
             raise edit.fault(
                 "its videos would have to be encoded anew, because frames were dropped in the "
                 "middle or resampled: leave the videos out (videos=False), or keep the frames "
@@ -208,7 +208,7 @@ class ColumnRewriter:
             key: replace(
                 found[key], start=found[key].start + begin, stop=found[key].start + end
             )
-            for key in self._cameras
+            for key in self.cameras
         }
 
     def _tasks_of(self, edit: EpisodeEdit) -> list[str]:
@@ -242,7 +242,7 @@ class ColumnRewriter:
         pictures = {**episode.videos, **others}
         statistics = {
             key: self._image_statistics(edit, key, pictures[key])
-            for key in (*self._cameras, *self._image_columns)
+            for key in (*self.cameras, *self._image_columns)
         }
         indices = np.array([numbers[text] for text in episode.tasks])
         recorded.write_episode(

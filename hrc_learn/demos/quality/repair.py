@@ -157,6 +157,7 @@ def repair_dataset(
         repair = _Repair(dataset, options or RepairOptions(), units or {}, kept)
         repair.report.path = Path(out)
         repair.report.notes[:0] = notes
+        repair.finished = bool(notes)
         rewritten = repair.episodes(progress)
         if repair.options.dry_run:
             for _ in rewritten:
@@ -311,6 +312,8 @@ class _Repair:
         self._regular = True
         """True if the increasing stamps of LeRobot are 1/fps apart in all episodes."""
         self.decisions, faults = dataset.units_from(self._readable(), units)
+        self.finished = False
+        """True if the recorder was killed, so that episodes may lack their videos."""
         self.faults = {fault.episode: fault for fault in faults}
         """Episode index -> error, for episodes that contradict the units of the others."""
         self._calibrated = bool(calibrations(units))
@@ -364,7 +367,9 @@ class _Repair:
             try:
                 rewritten = self.writer.rewritten(self._repaired(entry, frames))
             except DatasetError as error:
-                if not self.options.drop_bad_episodes:
+                # A killed recorder loses the video of an episode whose save failed.
+                lost = self.finished and error.key in self.writer.cameras
+                if not (lost or self.options.drop_bad_episodes):
                     raise
                 report.left_out[entry.index] = error.issue.message
                 continue
