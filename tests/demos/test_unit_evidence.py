@@ -112,8 +112,8 @@ HOBBY = ("shoulder_pan", "shoulder_lift", "elbow_flex")
         (sizes(1e-6, 0.9e-6), SIX, Guess("rad", 0.9, "the joints do not move")),
         (sizes(1.1e-6, 0), SIX, Guess("rad", 0.95, "values usually reach 1.1e-06", "deg")),
         (sizes(1, 6.28), SIX, Guess("rad", 0.95, "values usually reach 6.28", "deg")),
-        (sizes(6.29, 6.29), SIX, Guess("rad", 0.8, "values usually reach 6.29", "deg")),
-        (sizes(12.5, 12.5), SIX, Guess("rad", 0.8, "values usually reach 12.5", "deg")),
+        (sizes(6.38, 6.3), SIX, Guess("rad", 0.95, "values usually reach 6.38", "deg")),
+        (sizes(12.5, 12.5), SIX, Guess("rad", 0.7, "values usually reach 12.5", "deg")),
         (sizes(400, 400), SIX, Guess("deg", 0.8, "values usually reach 400", "%")),
         (sizes(401, 401), SIX, Guess("tick", 0.4, "values usually reach 401", "deg")),
         (sizes(math.tau, 1), SIX, Guess("rad", 0.95, "values usually reach 6.28", "deg")),
@@ -260,6 +260,17 @@ def test_columns_without_telling_names_may_be_a_pose(peaks, labels, numbered, re
         )
         low = SURE._replace(confidence=0.3)
         assert evidence.doubt_meaning(low, sizes(*peaks), names, numbered).confidence == 0.3
+
+
+def test_small_values_without_names_may_be_revolutions():
+    for numbered, peaks, sure in (
+        (True, [0.49] * 6, 0.6),
+        (True, [0.51] * 6, 0.95),
+        (False, [0.49] * 6, 0.95),
+    ):
+        guess = evidence.doubt_meaning(SURE, sizes(*peaks), tuple("abcdef"), numbered)
+        assert guess.confidence == sure
+    assert evidence.doubt_meaning(SURE, sizes(0.4, 0.4), ("a", "b"), True).other == "rev"
 
 
 @pytest.mark.parametrize(

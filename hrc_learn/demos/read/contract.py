@@ -290,7 +290,7 @@ def infer_contract(
         features: Profiles of its features.
         profiles: Profiles of its episodes.
     """
-    smooth = {(f.key, i): bool(moves) for f in features for i, moves in enumerate(f.smooth)}
+    smooth = {(f.key, i): bool(moves) for f in features for i, moves in enumerate(f.varied)}
     unnamed: dict[tuple[str, int], ComponentContract] = {}
     for feature in features:
         # Quantiles over episodes, so that a single episode does not set the range.

@@ -216,6 +216,15 @@ class FeatureProfiles:
         """Mask of components that have one value in all episodes."""
         return self.stack("low").min(0) == self.stack("high").max(0)
 
+    @property
+    def varied(self) -> Bool[np.ndarray, " components"]:
+        """Mask of components that are smooth, or whose extremes take many values.
+
+        In short episodes, values such as pixels hardly move, but their levels differ.
+        """
+        ends = np.sort(np.concatenate([self.stack("low"), self.stack("high")]), axis=0)
+        return self.smooth | ((np.diff(ends, axis=0) > 0).sum(0) > 3)
+
     def named(self, chosen: Bool[np.ndarray, " components"]) -> str:
         """Names of the chosen components."""
         if chosen.all() and len(chosen) > 1:

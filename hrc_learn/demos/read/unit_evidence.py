@@ -39,6 +39,8 @@ _SLIDE = 0.12
 """Longest stroke of a gripper's finger [m]."""
 # Old datasets of LeRobot name the columns of joints and of poses alike.
 _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
+_REVOLUTIONS = 0.5
+"""Reach of unnamed joints below which they may count revolutions: half a radian is little."""
 FEWEST_JOINTS, _POSE_AND_FINGERS = 5, 8
 """`FEWEST_JOINTS`: number of joints of the smallest usual arms.
 `_POSE_AND_FINGERS`: number of columns of a pose and two fingers."""
@@ -236,7 +238,7 @@ def guess_joints(
     reach = f"values usually reach {largest:.3g}"
     if limit == _TWO_TURNS:
         # Radians beyond a turn are rare; small values in degrees are not.
-        guess = Guess("rad", 0.95 if largest <= math.tau else 0.8, reach, "deg")
+        guess = Guess("rad", 0.95 if largest <= math.tau + 0.1 else 0.7, reach, "deg")
     elif limit == _DEGREES:
         guess = _degrees_or_range(sizes, fitting, largest, labels, robot_type)
     else:
@@ -314,6 +316,8 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
     """
     count, largest = len(sizes.peak), float(sizes.peak.max())
     named_alike = all(map(_MOTOR.fullmatch, labels))
+    if numbered and guess.unit == "rad" and 1e-6 < largest < _REVOLUTIONS:
+        guess = guess._replace(confidence=0.6, other="rev")
     if not (named_alike or numbered) or count > _POSE_AND_FINGERS:
         return guess
     last = float(sizes.peak[-1])
