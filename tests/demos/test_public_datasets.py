@@ -374,6 +374,179 @@ DATASETS = {
     ),
 }
 
+UR_LOW = [-0.6, -2.1, 1.1, -2.2, -1.7, -0.5, 0.0]
+UR_HIGH = [1.6, -0.9, 2.3, -0.8, -1.4, 1.5, 1.0]
+UR_MOTORS = [*(f"joint_{i}" for i in range(6)), "gripper"]
+FER = [f"joint_{i}.{end}" for end in ("pos", "vel") for i in range(7)]
+GUN_LOW = [-1.45, 0.24, -0.27, -1.36, -0.72, 0.48, -0.18]
+GUN_LOW += [19.22, 145.88, 133.41, 140.57, 137.52, 1.86]
+GUN_LOW += [0.11, -1.5, -1.22, 0.34, -1.5, -1.48, -0.24]
+GUN_LOW += [2.8, 125.82, 105.8, 108.47, 99.74, 1.25]
+GUN_HIGH = [0.0, 0.86, 1.27, -0.96, 0.71, 1.49, 1.0]
+GUN_HIGH += [36.01, 169.98, 170.02, 170.05, 169.95, 20.58]
+GUN_HIGH += [1.84, -0.32, 0.45, 1.43, 0.09, -0.12, 1.28]
+GUN_HIGH += [36.12, 170.28, 170.62, 170.19, 170.36, 86.54]
+PICO = {
+    "left_shoulder_pan": (-51.73, 51.95),
+    "left_shoulder_lift": (-100.0, 30.42),
+    "left_elbow_flex": (13.05, 88.5),
+    "left_wrist_flex": (6.44, 92.13),
+    "left_wrist_roll": (-48.3, -47.72),
+    "left_gripper": (11.61, 45.31),
+}
+UNREAD = {"nothing": ""}
+"""By hand: joints under names that are not read; the check asks for a mapping."""
+
+# Chosen and decided by hand before the reader saw them. Two were then wrong without a word
+# (velocities and two fingers taken for joints), for which the names were mended.
+HELD_OUT = {
+    # Measured ranges.
+    "Bhavya007-17/p1-so101-sim-t2": (
+        "so101_follower_sim",
+        {
+            STATE: Vector(
+                SO101,
+                [-1.26, -0.95, -0.33, 0.65, -0.05, 0.01],
+                [0.34, 0.41, 1.31, 1.58, 1.5, 1.26],
+            ),
+            "observation.velocity": spread(SO101, [1.03, 1.03, 1.12, 1.07, 0.96, 4.79]),
+        },
+        {"joint_position": "rad", "joint_velocity": "rad/s"},
+    ),
+    "wengmister/lerobot-dp-rollout, franka_wave": (
+        "franka_fer",
+        {
+            STATE: Vector(
+                FER,
+                [-0.84, -1.36, -0.36, -2.82, -0.28, 1.36, -1.55] + [-1.2] * 7,
+                [0.62, -0.61, 0.31, -2.17, 0.41, 2.4, -0.48] + [1.1] * 7,
+            ),
+            ACTION: Vector(
+                FER[:7],
+                [-0.89, -1.36, -0.53, -2.82, -0.37, 1.28, -1.56],
+                [0.63, -0.6, 0.54, -2.15, 0.44, 2.41, -0.42],
+            ),
+        },
+        {"joint_position": "rad", "joint_velocity": "rad/s"},
+    ),
+    "currygallagher87-ship-it/SUES-Embodied-intelligence-GroupB": (
+        "so101_follower",
+        {
+            STATE: Vector(
+                SO101,
+                [-77.19, -98.42, -99.28, -84.41, -66.38, 2.82],
+                [86.3, 83.83, 99.64, 77.54, -36.16, 69.84],
+            ),
+            ACTION: Vector(
+                SO101,
+                [-80.04, -99.58, -100.0, -85.29, -67.31, 0.64],
+                [88.37, 83.95, 100.0, 79.97, -35.51, 71.63],
+            ),
+        },
+        {"joint_position": "%", "gripper": "%"},
+    ),
+    "andaloo23/chameleon": (
+        "so100_isaaclab",
+        {
+            STATE: Vector(
+                {"axes": [n.replace(".pos", end) for end in ("_pos", "_vel") for n in SO101]},
+                [-1.57, 0.0, -2.48, -1.76, -0.31, -0.2] + [-1.0] * 5 + [-3.98],
+                [1.54, 3.14, 0.0, 1.0, 2.21, 1.5] + [1.0] * 5 + [10.0],
+            ),
+            ACTION: Vector(
+                {"axes": [n.removesuffix(".pos") for n in SO101]},
+                [-1.57, 0, -2.56, -1.79, -0.36, -0.4],
+                [1.56, 3.28, 0, 0.92, 2.29, 1.5],
+            ),
+        },
+        {"joint_position": "rad", "joint_velocity": "rad/s"},
+    ),
+    "Nolanwangth/openpi_repo": ("", {STATE: Vector(None, GUN_LOW, GUN_HIGH)}, ASKS),
+    "ShiZifeng/PICO_TELE_LEROBOT": (
+        "so101_follower_dual",
+        {f"observation.{k}.pos": Vector(None, [a], [b]) for k, (a, b) in PICO.items()},
+        UNREAD,
+    ),
+    "kingdom-of-warriors/microvla": (
+        "panda",
+        {"state": Vector(["state"], LIBERO_LOW, LIBERO_HIGH)},
+        ASKS,
+    ),
+    # Names from the dataset's card, ranges by convention.
+    "Ngseo/camera-ready": (
+        "ur5",
+        {STATE: Vector(UR_MOTORS, UR_LOW, UR_HIGH)},
+        {"joint_position": "rad", "gripper": "1"},
+    ),
+    "modanqing/ur_pick_merge": (
+        "ur5",
+        {"joint.state": Vector([*motors(6), "gripper"], UR_LOW, UR_HIGH)},
+        UNREAD,
+    ),
+    "mjuarez4/stack_single_mini": (
+        "xarm",
+        {
+            "observation.state.joints": spread([f"joint_{i}" for i in range(1, 8)], 2.0),
+            "observation.state.gripper": Vector(["gripper"], [0.0], [1.0]),
+        },
+        JOINTS,
+    ),
+    "SanZac/neurips": (
+        "xarm",
+        {
+            STATE: Vector(
+                ["joint_position"],
+                [-1.2, -0.9, -1.9, -2.0, 0.3, -1.5],
+                [1.3, 0.8, -0.4, 1.9, 1.9, 1.4],
+            )
+        },
+        JOINTS,
+    ),
+    "seojing/pickplace_panda": (
+        "",
+        {
+            STATE: spread(
+                ["x", "y", "z", "roll", "pitch", "yaw", "grip_l", "grip_r"],
+                [0.6, 0.4, 0.7, 3.1, 1.2, 3.1, 0.04, 0.04],
+            )
+        },
+        {"position": "m", "euler_xyz": "rad"},
+    ),
+    "aboardman/cube_sim_data_4": (
+        "",
+        {
+            STATE: spread(
+                ["x", "y", "z", "wx", "wy", "wz", "gripper"],
+                [0.6, 0.4, 0.7, 2.1, 2.2, 2.1, 1.0],
+            )
+        },
+        {"position": "m", "rotation_vector": "rad"},
+    ),
+    "globcy/pick_red_cube": (
+        "",
+        {
+            STATE: spread(
+                ["x", "y", "z", "qx", "qy", "qz", "qw", "gripper"],
+                [0.6, 0.4, 0.7, 0.9, 0.9, 0.3, 0.3, 1.0],
+            )
+        },
+        {"position": "m", "quaternion_wxyz": "1"},
+    ),
+    "sciencebanda09/trace": (
+        "Handheld",
+        {
+            STATE: spread(
+                [
+                    *("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg"),
+                    "gripper_width_mm",
+                ],
+                [400, 300, 250, 170, 60, 120, 85],
+            )
+        },
+        {"position": "mm", "euler_xyz": "deg", "gripper": "mm"},
+    ),
+}
+
 
 def decide(robot_type, vectors):
     """Decisions on three episodes that reach from the lowest to the highest values."""
@@ -410,7 +583,7 @@ def decide(robot_type, vectors):
 
 def verdict(name):
     """ "right", "asks" or what is wrong."""
-    robot_type, vectors, truth = DATASETS[name]
+    robot_type, vectors, truth = (DATASETS | HELD_OUT)[name]
     columns, decisions = decide(robot_type, vectors)
     if doubts := [d.doubt for d in decisions.values() if d.doubt]:
         return "asks", doubts
@@ -431,13 +604,22 @@ def verdict(name):
     return ("wrong", faults) if faults else ("right", [])
 
 
-@pytest.mark.parametrize("name", [name for name, (_, _, truth) in DATASETS.items() if truth])
+def named(wanted):
+    """Datasets by the decision made by hand."""
+    return [n for n, (_, _, truth) in (DATASETS | HELD_OUT).items() if wanted(truth)]
+
+
+@pytest.mark.parametrize("name", named(lambda truth: truth and truth != UNREAD))
 def test_units_and_meaning_are_those_found_by_hand(name):
     assert verdict(name) == ("right", [])
 
 
-@pytest.mark.parametrize(
-    "name", [name for name, (_, _, truth) in DATASETS.items() if not truth]
-)
+@pytest.mark.parametrize("name", named(lambda truth: truth == UNREAD))
+def test_joints_under_unknown_names_are_left_to_the_user(name):
+    robot_type, vectors, _ = HELD_OUT[name]
+    assert not {"joint_position", "position"} & decide(robot_type, vectors)[0].selections.keys()
+
+
+@pytest.mark.parametrize("name", named(lambda truth: not truth))
 def test_what_the_data_do_not_decide_is_asked(name):
     assert verdict(name)[0] == "asks"

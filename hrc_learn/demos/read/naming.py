@@ -20,9 +20,12 @@ _JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort":
 
 # `joint_1_vel`: only after a clear joint name, as `ee_pos` and `x_vel` are no joints.
 _UNDERSCORED = re.compile(
-    r"(.*(?:joint|motor|axis)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)", re.IGNORECASE
+    r"(.*(?:joint|motor|axis|shoulder|elbow|wrist|waist|gripper)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)",
+    re.IGNORECASE,
 )
-_GRIPPER = re.compile(r"gripper|(?:^|[._/ ])(?:jaw|claw)(?:$|[._/ ])")
+_GRIPPER = re.compile(
+    r"gripper|(?:^|[._/ ])(?:jaw|claw|grip(?:_?(?:l|r|left|right))?)(?:$|[._/ ])"
+)
 _HAND = re.compile("|".join(WORDS["hand"]))
 _CAMEL = re.compile(r"(?<=[a-z\d])(?=[A-Z])")
 """Word boundaries of a name such as `kRightHandIndex`."""
