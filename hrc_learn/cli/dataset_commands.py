@@ -44,6 +44,8 @@ from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.store import new_folder, read_json, read_toml, write_json, write_text
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
+_SKIPPED = {"trim": "trim", "unwrap": "unwrap", "signs": "fix_signs", "late": "drop_late"}
+"""Word of `--skip` -> option of a repair."""
 _RANKED_LINES = 20
 """Episodes of a ranking that fit on a screen."""
 
@@ -176,13 +178,8 @@ def repair(args: Repair) -> None:
         write_values(args.json, {"mended": len(mended)})
         return
     options = RepairOptions(
-        trim="trim" not in args.skip,
-        unwrap="unwrap" not in args.skip,
-        fix_signs="signs" not in args.skip,
-        drop_late="late" not in args.skip,
-        drop_repeats="repeats" in args.drop,
-        drop_bad_frames="bad-frames" in args.drop,
-        drop_bad_episodes="bad-episodes" in args.drop,
+        **{name: word not in args.skip for word, name in _SKIPPED.items()},
+        **{f"drop_{word.replace('-', '_')}": True for word in args.drop},
         offsets=args.offsets,
         fps=args.fps,
         videos=args.videos,

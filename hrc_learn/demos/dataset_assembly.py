@@ -210,14 +210,8 @@ def _write_metadata(
     tasks = list(listed.tasks)
     metadata.write_tasks(target / "meta/tasks.parquet", tasks)
     write_parquet(table, target / metadata.EPISODES_PATH)
-    content = metadata.info_content(
-        header.features,
-        header.fps,
-        header.robot_type,
-        episodes=listed.episodes,
-        frames=listed.frames,
-        tasks=len(tasks),
-    )
+    counts = {"episodes": listed.episodes, "frames": listed.frames, "tasks": len(tasks)}
+    content = metadata.info_content(header.features, header.fps, header.robot_type, counts)
     metadata.dump_json(target / "meta/info.json", content)
     stacked: dict[str, dict[str, np.ndarray]] = {}
     for name in table.column_names:
@@ -350,10 +344,7 @@ def finish(root: Path, claim: store.Claim) -> None:
             )
         paths = recorded.staged_paths(staging, episodes or 0)
         with store.replacing(
-            claim,
-            store.DATASET,
-            overwrite=episodes is not None,
-            source=header.id,
+            claim, store.DATASET, overwrite=episodes is not None, source=header.id
         ) as new:
             assemble(paths, new, earlier=None if episodes is None else root)
     discard(staging)

@@ -195,9 +195,7 @@ class DatasetWriter:
             self.discard_episode()
 
     def add_episode(
-        self,
-        demonstration: Demonstration,
-        images: Mapping[str, Iterable[Image]] | None = None,
+        self, demonstration: Demonstration, images: Mapping[str, Iterable[Image]] | None = None
     ) -> int:
         """Save a whole demonstration as one episode.
 

@@ -9,13 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from hrc_learn.demos.recording_files import (
-    STEPS,
-    Recording,
-    is_time,
-    longest_hold,
-    read_stamps,
-)
+from hrc_learn.demos.recording_files import STEPS, Recording, is_time, longest_hold, read_stamps
 from hrc_learn.demos.recording_meaning import Meaning
 from hrc_learn.demos.recording_names import ImportOptions
 

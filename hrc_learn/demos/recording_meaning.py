@@ -407,13 +407,13 @@ def _decide_commands(
 
 def _rate_of(first: Recording, meaning: Meaning, options: ImportOptions) -> float | int:
     """Frame rate at which commands are compared with joints [1/s]."""
-    fields, frames = first.fields, first.fields[meaning.main].frames
-    if not first.streams and meaning.time and fields[meaning.time].frames == frames > 1:
+    frames, lasts = first.fields[meaning.main].frames, options.duration
+    if first.streams:
+        return _CHECK_RATE
+    if meaning.time and first.fields[meaning.time].frames == frames > 1:
         time = read_stamps(first, meaning.time, options.units.get("time", ""))
         return 1 / float(np.median(np.diff(time)))
-    if options.duration is not None and not first.streams:
-        return max(frames - 1, 1) / options.duration
-    return _CHECK_RATE if first.streams else options.fps or first.fps or _CHECK_RATE
+    return frames / lasts if lasts else options.fps or first.fps or _CHECK_RATE
 
 
 def _matched(

@@ -103,6 +103,7 @@ class MultipliedColumns:
             for i, name in enumerate(feature.names or ())
             if key.startswith("action") and name in shown
         ]
+        self._refuse_changes()
         names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
         if not self._same:
             self._rename(names)
@@ -112,6 +113,16 @@ class MultipliedColumns:
             shape = list(feature.shape) if width == feature.width else [width]
             content = {"dtype": feature.dtype, "shape": shape, "names": feature.names and named}
             self.features[key] = content
+
+    def _refuse_changes(self) -> None:
+        """Check that actions named as the tool's position hold positions, no changes of it."""
+        for key, i, role, n in self._next:
+            (shown, k), parts = self._places[role][n], self._frames
+            apart = np.concatenate([p[key][:-1, i] - p[shown][1:, k] for p in parts])
+            span = np.ptp(np.concatenate([p[shown][:, k] for p in parts]))
+            if role == "position" and np.median(np.abs(apart)) > span / 2:
+                text = "holds changes, not commanded poses: hrc multiply needs absolute actions"
+                raise ValueError(f"{key} ({self._old[key].component(i)}) {text}")
 
     def _object_columns(self, given: Mapping[str, str]) -> dict[str, list[Place]]:
         """Places of the numbers of each object's pose, by name of the object."""

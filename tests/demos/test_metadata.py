@@ -105,7 +105,9 @@ def test_tasks_are_the_index_of_their_table(tmp_path):
 @pytest.mark.parametrize(("fps", "dtype"), [(30.0, "video"), (29.97, "float32")])
 def test_a_rate_stays_whole_and_a_video_has_a_path(fps, dtype):
     features = {"a": {"dtype": "float32"}, "b": {"dtype": dtype}}
-    info = metadata.info_content(features, fps, "panda", episodes=4, frames=90, tasks=2)
+    info = metadata.info_content(
+        features, fps, "panda", {"episodes": 4, "frames": 90, "tasks": 2}
+    )
     assert (info["fps"], type(info["fps"])) == (fps, int if fps == 30 else float)
     assert (info["video_path"] is None) == (dtype != "video")
     assert info["splits"] == {"train": "0:4"}

@@ -494,10 +494,11 @@ def test_transforms_in_row_and_column_order_are_poses():
         wrong[2, 3, 3] += error
         wrong[3, 3, 0] += error
         if valid:
-            assert torch.is_tensor(quantities.transforms(wrong.reshape(8, 16)))
+            numbers = torch.from_numpy(wrong.reshape(8, 16))
+            assert torch.is_tensor(quantities.transforms(numbers))
         else:
             with pytest.raises(ValueError, match="are no 4x4 transform"):
-                quantities.transforms(wrong.reshape(8, 16))
+                quantities.transforms(torch.from_numpy(wrong.reshape(8, 16)))
 
 
 @pytest.mark.parametrize(

@@ -213,3 +213,20 @@ def test_objects_of_other_numbers_of_columns_are_refused(case, columns):
     taught = arm_of_dataset(case.source)
     with pytest.raises(ValueError, match=r"objects\.cup\.columns=.* must have 3, 6 or 7"):
         MultipliedColumns(case.source, taught, panda, {"cup": columns})
+
+
+def test_changes_of_the_tool_pose_are_no_commands_of_poses(tmp_path):
+    q = joints(0)
+    place = panda.forward(torch.from_numpy(q)).position.numpy()
+    steps = np.diff(place, axis=0, append=place[-1:])
+    features = {"action.tool": TOOL[:3]}
+    with DatasetWriter(tmp_path / "set", FPS, "panda", panda.joint_names, features) as writer:
+        writer.start_episode("go")
+        for k in range(FRAMES):
+            writer.add_frame(
+                joint_position=q[k], position=place[k], **{"action.tool": steps[k]}
+            )
+        writer.save_episode()
+    source = open_demos(tmp_path / "set")
+    with pytest.raises(ValueError, match=r"action.tool \(ee.x\) holds changes, not commanded"):
+        MultipliedColumns(source, arm_of_dataset(source), panda, {})

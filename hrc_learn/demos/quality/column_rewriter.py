@@ -46,10 +46,7 @@ class Rewritten:
 
 
 def write_copy(
-    out: Path,
-    episodes: Iterable[Rewritten],
-    tasks: Sequence[str],
-    notes_of: Path | None = None,
+    out: Path, episodes: Iterable[Rewritten], tasks: Sequence[str], notes_of: Path | None = None
 ) -> None:
     """Write rewritten episodes into a new dataset.
 

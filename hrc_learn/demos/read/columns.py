@@ -229,11 +229,7 @@ def column_places(
 
 
 def feature_key(
-    role: str,
-    text: str,
-    features: Components,
-    file: str | Path,
-    components: Sequence[str] = (),
+    role: str, text: str, features: Components, file: str | Path, components: Sequence[str] = ()
 ) -> str:
     """Feature with this key, or the only feature with a path that ends in it.
 

@@ -79,10 +79,6 @@ class ComponentContract:
         """Quantity of a demonstration that holds the component; None for an extra column."""
         return _QUANTITIES.get(self.role, self.role) or None
 
-    def unit_as(self, role: str) -> str:
-        """Unit of the component if it is read as this quantity; "" if unknown."""
-        return self.unit if self.quantity == role or self.unit in units_of(role) else ""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Contract:
@@ -133,9 +129,9 @@ class Contract:
         known, units = {part.column: part for part in self.components}, {}
         for role, selection in selections.items():
             parts = [known.get(column) for column in selection.columns]
-            each = tuple(part.unit_as(role) if part else "" for part in parts)
-            if all(each):
-                units[role] = each
+            fits = units_of(role)
+            if all(p and p.unit and (p.quantity == role or p.unit in fits) for p in parts):
+                units[role] = tuple(part.unit for part in parts if part)
         return units
 
     def selections(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:

@@ -18,7 +18,6 @@ from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import Arm
-from hrc_learn.kinematics.registry import arm_of_robot
 
 _FRAMES = 80
 """Number of frames that are compared."""
@@ -68,15 +67,6 @@ def arm_columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
 def _plain(name: str) -> str:
     """A joint's name without case, separators and the word for its position."""
     return re.sub("[^a-z0-9]", "", re.sub(r"[._ ](pos|position|q)$", "", name.lower()))
-
-
-def known_arm(robot: str | None, names: Sequence[str]) -> tuple[Arm, tuple[int, ...]] | None:
-    """Arm of a robot type and the columns of its joints; None if either is unknown."""
-    arm = arm_of_robot(robot)
-    try:
-        return arm and (arm, arm_columns(names, arm))
-    except DatasetError:
-        return None
 
 
 def agreement(

@@ -151,30 +151,22 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
 
 
 def info_content(
-    features: Mapping[str, dict],
-    fps: float,
-    robot_type: str,
-    *,
-    episodes: int,
-    frames: int,
-    tasks: int,
+    features: Mapping[str, dict], fps: float, robot_type: str, counts: Mapping[str, int]
 ) -> dict:
-    """Content of `meta/info.json`."""
+    """Content of `meta/info.json`; `counts` are those of episodes, frames and tasks."""
     has_video = any(feature["dtype"] == "video" for feature in features.values())
     return {
         "codebase_version": VERSION,
         "fps": int(fps) if float(fps).is_integer() else fps,
         "features": dict(features),
-        "total_episodes": episodes,
-        "total_frames": frames,
-        "total_tasks": tasks,
+        **{f"total_{name}": count for name, count in counts.items()},
         "chunks_size": CHUNK_SIZE,
         "data_files_size_in_mb": FILE_SIZE_MB,
         "video_files_size_in_mb": VIDEO_FILE_SIZE_MB,
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if has_video else None,
         "robot_type": robot_type,
-        "splits": {"train": f"0:{episodes}"},
+        "splits": {"train": f"0:{counts['episodes']}"},
     }
 
 
@@ -209,14 +201,9 @@ def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Sta
 
 def _column_statistics(values: np.ndarray) -> dict[str, list]:
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
-    return {
-        "min": values.min(0).tolist(),
-        "max": values.max(0).tolist(),
-        "mean": values.mean(0).tolist(),
-        "std": values.std(0).tolist(),
-        "count": [len(values)],
-        **{name: row.tolist() for name, row in zip(QUANTILES, quantiles, strict=True)},
-    }
+    found = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+    found |= zip(QUANTILES, quantiles, strict=True)
+    return {name: row.tolist() for name, row in found.items()} | {"count": [len(values)]}
 
 
 def _combine(stacked: Mapping[str, np.ndarray]) -> dict[str, list]:

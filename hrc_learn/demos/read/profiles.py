@@ -351,11 +351,7 @@ def track(
         fit = product**2 / (power * answer)
     slope[~moving] = fit[~moving] = np.nan
     return Tracking(
-        delay=delay,
-        residual=residual.astype(np.float32),
-        slope=slope,
-        fit=fit,
-        offset=offset,
+        delay=delay, residual=residual.astype(np.float32), slope=slope, fit=fit, offset=offset
     )
 
 

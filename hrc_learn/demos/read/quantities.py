@@ -1,6 +1,6 @@
 """Quantities of a dataset: their roles, and encodings of orientation."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,7 @@ def demonstration_fields(
         fields["feature_visible"] = values["feature_visible"][:, 0] > 0
     if "pose_matrix" in values:  # only the translation of a transform has a unit
         values["pose_matrix"] = quantities["pose_matrix"]
-        moved = transforms(values["pose_matrix"])[:, :3, 3].numpy()
+        moved = transforms(torch.from_numpy(values["pose_matrix"]))[:, :3, 3].numpy()
         fields.setdefault("position", moved * factors["pose_matrix"])
     for role in [role for role in ORIENTATION_ROLES if role in values][:1]:
         fields["orientation"] = to_quaternion(role, values[role])
@@ -100,36 +100,31 @@ def to_quaternion(
         ValueError: Quaternions are far from unit length, matrices are no transforms, or two
             columns span no plane.
     """
-    numbers = torch.from_numpy(values)
-    match role:
-        case "quaternion_wxyz":
-            orientation = _normalized(numbers)
-        case "quaternion_xyzw":
-            orientation = _normalized(numbers.roll(1, dims=-1))
-        case "rotation_vector":
-            orientation = quaternion.exp(numbers)
-        case "euler_xyz":  # fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)
-            orientation = _from_euler(numbers, (2, 1, 0))
-        case "euler_intrinsic_xyz":  # moving axes: R = Rx Ry Rz
-            orientation = _from_euler(numbers, (0, 1, 2))
-        case "rotation_6d":
-            orientation = _from_two_columns(numbers)
-        case "rotation_6d_rows":  # columns of the transpose
-            orientation = quaternion.conjugate(_from_two_columns(numbers))
-        case "rotation_matrix":
-            orientation = quaternion.from_matrix(_rotations(numbers.reshape(-1, 3, 3)))
-        case _:
-            orientation = quaternion.from_matrix(_rotations(transforms(values)[:, :3, :3]))
-    return quaternion.continuous(orientation).numpy()
+    return quaternion.continuous(_DECODERS[role](torch.from_numpy(values))).numpy()
 
 
-def transforms(values: Float64[np.ndarray, "frames 16"]) -> Tensor:
+_DECODERS: dict[str, Callable[[Tensor], Tensor]] = {
+    "quaternion_wxyz": lambda q: _normalized(q),
+    "quaternion_xyzw": lambda q: _normalized(q.roll(1, dims=-1)),
+    "rotation_vector": quaternion.exp,
+    # Fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll); moving axes: R = Rx Ry Rz.
+    "euler_xyz": lambda angles: _from_euler(angles, (2, 1, 0)),
+    "euler_intrinsic_xyz": lambda angles: _from_euler(angles, (0, 1, 2)),
+    "rotation_6d": lambda columns: _from_two_columns(columns),
+    "rotation_6d_rows": lambda rows: quaternion.conjugate(_from_two_columns(rows)),
+    "rotation_matrix": lambda m: quaternion.from_matrix(_rotations(m.reshape(-1, 3, 3))),
+    "pose_matrix": lambda m: quaternion.from_matrix(_rotations(transforms(m)[:, :3, :3])),
+}
+"""Encoding of an orientation -> function that makes quaternions of its components."""
+
+
+def transforms(values: Float64[Tensor, "frames 16"]) -> Tensor:
     """4x4 transforms from 16 numbers, in row order or, as in libfranka, in column order.
 
     Raises:
         ValueError: In neither order, the last row is (0, 0, 0, 1).
     """
-    by_rows = torch.from_numpy(values).reshape(-1, 4, 4)
+    by_rows = values.reshape(-1, 4, 4)
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=by_rows.dtype)
     for matrices in (by_rows, by_rows.mT):
         # The tolerance allows for float32 and for few printed digits.

@@ -24,7 +24,7 @@ from hrc_learn.demos.read.dataset_folder import (
     select_episodes,
 )
 from hrc_learn.demos.read.frames import RawEpisode, frame_timestamps, raising, read_quantities
-from hrc_learn.demos.read.kinematic_evidence import agreement, arm_columns, known_arm
+from hrc_learn.demos.read.kinematic_evidence import agreement, arm_columns
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, demonstration_fields
@@ -39,6 +39,7 @@ from hrc_learn.demos.read.units import (
     units_of,
 )
 from hrc_learn.kinematics import Arm
+from hrc_learn.kinematics.registry import arm_of_robot
 
 _SAMPLED = 32
 """Number of episodes that decide on units."""
@@ -97,10 +98,13 @@ class OpenedDataset:
         Raises:
             DatasetError: The caller named an arm with other joints.
         """
-        names = self.columns.joint_names
-        if self.robot is not None:
-            return self.robot, arm_columns(names, self.robot)
-        return known_arm(self.folder.robot_type, names)
+        arm = self.robot or arm_of_robot(self.folder.robot_type)
+        try:
+            return arm and (arm, arm_columns(self.columns.joint_names, arm))
+        except DatasetError:
+            if self.robot is None:
+                return None
+            raise
 
     @cached_property
     def contract_note(self) -> str | None:

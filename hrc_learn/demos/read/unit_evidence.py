@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -119,14 +120,9 @@ def _encoder_step(values: Float64[np.ndarray, " frames"]) -> float:
 
 def typical(sizes: Sequence[Sizes]) -> Sizes:
     """Typical sizes over episodes, so that no single episode decides."""
-    return Sizes(
-        peak=np.median([s.peak for s in sizes], axis=0),
-        clipped=np.mean([s.clipped for s in sizes], axis=0),
-        whole=np.all([s.whole for s in sizes], axis=0),
-        unit_length=np.all([s.unit_length for s in sizes], axis=0),
-        opening=np.all([s.opening for s in sizes], axis=0),
-        step=np.quantile([s.step for s in sizes], 0.5, axis=0, method="higher"),
-    )
+    step = partial(np.quantile, q=0.5, method="higher")
+    means = (np.median, np.mean, np.all, np.all, np.all, step)
+    return Sizes(*(f(x, axis=0) for f, x in zip(means, zip(*sizes, strict=True), strict=True)))
 
 
 def is_hobby_arm(robot_type: str, labels: Sequence[str]) -> bool:
@@ -173,14 +169,14 @@ def calibrated_units(
     Raises:
         DatasetError: The file is no calibration, lacks a joint, or does not fit the values.
     """
-    known, units = read_calibration(file), []
+    known = read_calibration(file)
     names = [name if name in known else name.removeprefix("main_") for name in labels]
     if missing := [name for name in names if name not in known]:
         text = f"has no {', '.join(missing)}; there are {', '.join(known)}"
         raise DatasetError(f"{text}: give the calibration of the robot recorded", file=file)
-    spans = np.array([known[name][0] for name in names])
-    # Encoder steps in each recorded step.
-    steps = np.broadcast_to(sizes.step, len(names)) * spans / 200
+    spans, hands = (np.array(x) for x in ([known[n][0] for n in names], [*map(is_hand, names)]))
+    # Encoder steps in each recorded step; LeRobot stores grippers as 0..100.
+    steps = np.broadcast_to(sizes.step, len(names)) * spans / np.where(hands, 100, 200)
     other = (steps > 0) & (np.abs(steps - np.maximum(np.rint(steps), 1)) > 5e-3 * steps)
     if (beyond := sizes.peak > _CLIP + 0.05).any():
         text = f"{labels[beyond.argmax()]} reaches {sizes.peak.max():.4g}: is it in deg, not %?"
@@ -188,11 +184,10 @@ def calibrated_units(
     if other.sum() > 1:
         text = f"the steps of {', '.join(np.array(labels)[other])} are not those of its ranges"
         raise DatasetError(f"does not fit: {text}: another arm, or values in deg?", file=file)
-    for name, span in zip(names, spans / 2, strict=True):
-        sign = -1 if known[name][1] and not _DYNAMIXEL.search(robot_type) else 1
-        deg = f"{sign * span / 100 * STEP_IN_DEGREES:.9g} deg"
-        units.append("%" if is_hand(name) else deg)
-    return tuple(units)
+    turned = [known[n][1] and not _DYNAMIXEL.search(robot_type) for n in names]
+    degrees = np.where(turned, -1, 1) * spans / 200 * STEP_IN_DEGREES
+    parts = zip(hands, degrees, strict=True)
+    return tuple("%" if hand else f"{factor:.9g} deg" for hand, factor in parts)
 
 
 def guess_joints(
