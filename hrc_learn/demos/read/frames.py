@@ -66,25 +66,17 @@ def read_each(
             parquet = open_parquet(folder.root, file, listed[0].index)
             if strict:
                 require_rows(folder, file, parquet.metadata.num_rows)
-            wanted = _columns(parquet, file, keys, strict)
+            existing = parquet.schema_arrow.names
+            for key in (key for key in keys if key not in existing):
+                text = "the column is declared in meta/info.json, but missing"
+                raise DatasetError(text, file=file, key=key)
         except DatasetError as error:
             yield from repeat(error, len(listed))
             continue
+        indices = ("timestamp", "episode_index", "task_index") if strict else ()
+        wanted = [*dict.fromkeys([*keys, *(key for key in indices if key in existing)])]
         for batch in _batches(listed, row_group_starts(parquet.metadata)):
             yield from _read_batch(folder, parquet, batch, wanted, strict)
-
-
-def _columns(
-    parquet: pq.ParquetFile, file: str, keys: Sequence[str], strict: bool
-) -> list[str]:
-    """Columns to read: the wanted ones and, if strict, those of time, episode and task."""
-    existing = parquet.schema_arrow.names
-    for key in keys:
-        if key not in existing:
-            text = "the column is declared in meta/info.json, but missing"
-            raise DatasetError(text, file=file, key=key)
-    indices = ("timestamp", "episode_index", "task_index") if strict else ()
-    return [*dict.fromkeys([*keys, *(key for key in indices if key in existing)])]
 
 
 def _batches(

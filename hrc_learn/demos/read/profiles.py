@@ -390,7 +390,8 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
     rates = (joints[window:] - joints[:-window]) * fps / window
     if position is not None and position.shape == joints.shape:
         found["command_position"] = tracking = track(position, joints, fps)
-        if tracking is None or not _at_once(tracking, fps):
+        late = tracking is None or abs(tracking.delay) / fps > PROMPT
+        if late or (tracking.fit <= FOLLOWS).any():  # the fit is NaN where nothing moves
             found["rates"] = track(_means(position, window), rates, fps)
     if velocity is not None and velocity.shape == joints.shape:
         found["command_velocity"] = track(_means(velocity, window), rates, fps)
@@ -456,9 +457,3 @@ def over_episodes(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " component
     """Median over episodes; components that rest count as 0."""
     with np.errstate(all="ignore"):
         return np.nan_to_num(np.median(np.nan_to_num(np.stack(rows)), axis=0))
-
-
-def _at_once(tracking: Tracking, fps: float) -> bool:
-    """True if all moving joints follow the command within the delay of an arm."""
-    moving = tracking.fit[np.isfinite(tracking.fit)]
-    return abs(tracking.delay) / fps <= PROMPT and bool((moving > FOLLOWS).all())
