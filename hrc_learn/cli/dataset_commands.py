@@ -122,12 +122,8 @@ def check(args: Check) -> int:
     if report.contract is not None:
         print(*report.contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")
-    counts = {
-        "errors": len(report.errors),
-        "warnings": len(report.warnings),
-        "episodes": report.episodes,
-        "frames": report.frames,
-    }
+    counts = {"errors": len(report.errors), "warnings": len(report.warnings)}
+    counts |= {"episodes": report.episodes, "frames": report.frames}
     moved = False
     try:
         if args.keep_contract:
@@ -194,14 +190,9 @@ def repair(args: Repair) -> None:
         progress=partial(track, description="Repairing"),
     )
     print(report)
-    counts = {
-        "mended": len(mended),
-        "episodes": len(report.changes),
-        "episodes_changed": report.changed,
-        "episodes_left_out": len(report.left_out),
-        "frames_before": report.frames_before,
-        "frames": report.frames,
-    }
+    counts = {"mended": len(mended), "episodes": len(report.changes)}
+    counts |= {"episodes_changed": report.changed, "episodes_left_out": len(report.left_out)}
+    counts |= {"frames_before": report.frames_before, "frames": report.frames}
     write_values(args.json, counts)
 
 

@@ -101,12 +101,10 @@ class DatasetWriter:
         )
         self._given: tuple[str, ...] = ()
         self._task: str | None = None
-        self._widths = {
-            **{
-                name: width or len(joint_names) for name, width in recorded.FRAME_WIDTHS.items()
-            },
-            **{key: len(names) for key, names in self.features.items()},
+        widths = {
+            name: width or len(joint_names) for name, width in recorded.FRAME_WIDTHS.items()
         }
+        self._widths = widths | {key: len(names) for key, names in self.features.items()}
         self._frames: list[recorded.Episode] = []
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0

@@ -80,15 +80,9 @@ def lerobot_features(columns: Sequence[RecordedColumn]) -> dict[str, dict]:
     names: dict[str, list[str]] = {}
     for column in columns:
         names.setdefault(column.key, []).extend(column.names)
-    return {
-        key: {
-            # Policies expect float32, in which a Unix stamp has a resolution of two minutes.
-            "dtype": "float64" if key == TIME_KEY else "float32",
-            "shape": [len(components)],
-            "names": components,
-        }
-        for key, components in names.items()
-    }
+    # Policies expect float32, in which a Unix stamp has a resolution of two minutes.
+    types = {key: "float64" if key == TIME_KEY else "float32" for key in names}
+    return {k: {"dtype": types[k], "shape": [len(n)], "names": n} for k, n in names.items()}
 
 
 def encode(
@@ -258,14 +252,9 @@ def write_episode(
     texts, indices = tasks
     number, features = episode_number(path), header.features
     frame = np.arange(len(indices))
-    found = {
-        **values,
-        "timestamp": frame / header.fps,
-        "frame_index": frame,
-        "episode_index": np.full_like(frame, number),
-        "index": frame + frames_before,
-        "task_index": indices,
-    }
+    found = {**values, "timestamp": frame / header.fps, "frame_index": frame}
+    found |= {"episode_index": np.full_like(frame, number), "task_index": indices}
+    found["index"] = frame + frames_before
     shapes = {key: features[key]["shape"] for key in features if key in found}
     own = episode_statistics({k: found[k].reshape(-1, *shape) for k, shape in shapes.items()})
     described = EpisodeDescription(

@@ -5,7 +5,7 @@ understood are left out and listed; a state or an action among them is kept as r
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -131,36 +131,25 @@ def _by_name(
     explicit = _explicit(first, options)
     given = {place[0] for places in explicit.values() for place in places}
     search = FieldSearch(first, hinted)
-    search.add_fields(
-        {
-            name: one
-            for name, one in first.fields.items()
-            if one.kind == "number" and name not in given and not is_time(name, one)
-        }
-    )
+    numbers = {n: f for n, f in first.fields.items() if f.kind == "number" and n not in given}
+    search.add_fields({n: f for n, f in numbers.items() if not is_time(n, f)})
     found = map_columns(search.features)
     taken = replaced_roles(dict.fromkeys(explicit))
-    meaning = Meaning(
-        selections={
-            role: search.located(selection)
-            for role, selection in found.selections.items()
-            if role not in taken
-        },
-        cameras=find_cameras(first, options.images),
-        left_out=search.left_out,
-        # The preview already shows what the other notes say.
-        notes=[
-            search.explained(n)
-            for n in found.notes
-            if "left among" not in n and "assumed" not in n
-        ],
-    )
+    chosen = {r: search.located(s) for r, s in found.selections.items() if r not in taken}
+    # The preview already shows what the other notes say.
+    notes = [n for n in found.notes if "left among" not in n and "assumed" not in n]
+    meaning = Meaning(selections=chosen, left_out=search.left_out)
+    meaning.cameras = find_cameras(first, options.images)
+    meaning.notes += map(search.explained, notes)
     for role, places in explicit.items():
         if role in ROLES:
             meaning.selections[role] = _selection(first, role, places)
         else:
             meaning.kept[role] = (tuple(places), column_names(first, places))
-    meaning.notes += _question_of_angles(meaning.selections, explicit)
+    turn = meaning.selections.get("rotation_vector")
+    if turn and "rotation_vector" not in explicit and _ANGLES.search(turn.columns[0][0]):
+        text = "rx, ry, rz are taken for a rotation vector; if they are angles about x, y, z,"
+        meaning.notes.append(f"{text} name them euler_xyz")
     _add_bare_vectors(meaning, first, search.states)
     _add_fingers(meaning, search)
     states = {"joint_position", "position", *ORIENTATION_ROLES}
@@ -174,17 +163,6 @@ def _by_name(
         meaning.time = first.clock_of(meaning.main)
     _name_joints(meaning, options.joint_names, first)
     return meaning, search
-
-
-def _question_of_angles(
-    selections: Mapping[str, ColumnSelection], explicit: Mapping[str, object]
-) -> list[str]:
-    """A note on columns rx, ry, rz, which may also be angles."""
-    turn = selections.get("rotation_vector")
-    if not turn or "rotation_vector" in explicit or not _ANGLES.search(turn.columns[0][0]):
-        return []
-    text = "rx, ry, rz are taken for a rotation vector; if they are angles about x, y, z,"
-    return [f"{text} name them euler_xyz"]
 
 
 def _explicit(first: Recording, options: ImportOptions) -> dict[str, list[Place]]:

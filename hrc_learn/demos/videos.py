@@ -294,14 +294,8 @@ def video_features(cameras: Mapping[str, tuple[int, int]]) -> dict[str, dict]:
 
     LeRobot reads codec and rate from the files.
     """
-    return {
-        image_key(camera): {
-            "dtype": "video",
-            "shape": [height, width, 3],
-            "names": ["height", "width", "channels"],
-        }
-        for camera, (height, width) in cameras.items()
-    }
+    common = {"dtype": "video", "names": ["height", "width", "channels"]}
+    return {image_key(name): common | {"shape": [*size, 3]} for name, size in cameras.items()}
 
 
 class CameraRecorder:

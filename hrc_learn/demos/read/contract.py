@@ -103,18 +103,10 @@ class Contract:
             names = dict.fromkeys((parts[0].name, parts[-1].name))
             low, high = min(p.low for p in parts), max(p.high for p in parts)
             weakest = min(parts, key=lambda part: part.confidence)
-            rows.append(
-                (
-                    plain_text(f"{key}/{' .. '.join(names)}"),
-                    role,
-                    unit or "-",
-                    f"{low:.3g} .. {high:.3g}",
-                    {1: "+", -1: "-", 0: ""}[sign],
-                    "" if delay is None else f"{1e3 * delay:.0f} ms",
-                    f"{100 * weakest.confidence:.0f} %",
-                    weakest.evidence,
-                )
-            )
+            name, span = plain_text(f"{key}/{' .. '.join(names)}"), f"{low:.3g} .. {high:.3g}"
+            late = "" if delay is None else f"{1e3 * delay:.0f} ms"
+            way, sure = {1: "+", -1: "-", 0: ""}[sign], f"{100 * weakest.confidence:.0f} %"
+            rows.append((name, role, unit or "-", span, way, late, sure, weakest.evidence))
         return rows
 
     def lines(self) -> Iterator[str]:
@@ -293,16 +285,11 @@ def infer_contract(
         levels, names = feature.stack("levels"), folder.features[feature.key].names
         low = np.quantile(levels[:, 0], 0.05, axis=0).tolist()
         high = np.quantile(levels[:, -1], 0.95, axis=0).tolist()
-        for index, (least, most) in enumerate(zip(low, high, strict=True)):
-            unnamed[feature.key, index] = ComponentContract(
-                key=feature.key,
-                index=index,
-                name=names[index] if names else f"joint_{index + 1}",
-                role="other",
-                unit="",
-                low=least,
-                high=most,
-            )
+        labels = names or [f"joint_{index + 1}" for index in range(len(low))]
+        for index, (name, least, most) in enumerate(zip(labels, low, high, strict=True)):
+            place = {"key": feature.key, "index": index, "name": name}
+            part = ComponentContract(role="other", unit="", low=least, high=most, **place)
+            unnamed[part.column] = part
     # A quantity is read in the order of the contract: x, y, z, w on disk become w, x, y, z.
     parts = [
         _describe(unnamed.pop(column), number, decisions[role], profiles, folder.fps)

@@ -187,12 +187,9 @@ def decide_units(
         elif role in sizes:
             decisions[role] = _guess(selection, sizes, robot_type, named)
         else:
-            decisions[role] = UnitDecision(
-                role=role,
-                unit=ROLES[role].unit,
-                confidence=0.8 if selection.assumed else 0.95,
-                evidence=selection.assumed or "by its name",
-            )
+            why, sure = selection.assumed or "by its name", 0.8 if selection.assumed else 0.95
+            unit = ROLES[role].unit
+            decisions[role] = UnitDecision(role=role, unit=unit, confidence=sure, evidence=why)
     return decisions
 
 
