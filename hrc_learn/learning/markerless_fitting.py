@@ -391,10 +391,8 @@ def _tool(
     width = image_size[0]
     for reach in _CLOSER:
         points, agrees = _points(tracks, link.pose, camera, width)
-        places, pixels = (
-            torch.from_numpy(points[agrees]),
-            torch.from_numpy(tracks.pixels[agrees]),
-        )
+        places = torch.from_numpy(points[agrees])
+        pixels = torch.from_numpy(tracks.pixels[agrees])
         cameras = torch.cat([camera[: MARKER.start].expand(len(places), -1), places], dim=-1)
         reach_px = reach * width / 1440
         camera = adjust_bundle(cameras, link.pose, pixels, image_size, reach_px)[0]
@@ -474,8 +472,7 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
     # `marker_pixels` projects a marker on the tool. A marker at the origin of the tool frame
     # and poses at the points give the pixels of the points.
     bare = torch.cat([camera[:10], camera.new_zeros(3)])
-    pixels, _ = marker_pixels(bare, Pose(points, end.orientation.expand(len(depth), 4)))
-    return pixels.numpy()
+    return marker_pixels(bare, Pose(points, end.orientation.expand(len(depth), 4)))[0].numpy()
 
 
 def _common_object(
@@ -526,9 +523,8 @@ def _described(
         pixels = np.array([np.zeros(2) if f is None else f.pixel for f in found])
         extra = dict(demo.extra)
         if item is not None:
-            ones = np.ones((len(demo), 1))
-            extra[OBJECT_FEATURE] = ones * (*item.pixel, 1.0)
-            extra[ANGLE_FEATURE] = ones * (np.nan, item.angle)
+            extra[OBJECT_FEATURE] = np.tile((*item.pixel, 1.0), (len(demo), 1))
+            extra[ANGLE_FEATURE] = np.tile((np.nan, item.angle), (len(demo), 1))
         result.append(replace(demo, feature=pixels, feature_visible=visible, extra=extra))
     return DemonstrationSet(
         result, notes=demos.notes, source=demos.source, joint_unit=demos.joint_unit

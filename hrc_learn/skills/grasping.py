@@ -79,10 +79,13 @@ _CHECK_EVERY = 5
 _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
-UNMARKED = CameraConfig(pixel_noise=0.4, bump=6.0)
-"""Settings for a tool without markers, whose features are found less exactly than the corners
-of a marker. With this noise, the predicted error above the object agrees with the true one
-(bench_markerless.py)."""
+UNMARKED = CameraConfig(pixel_noise=1.0, min_step=0.012, bump=6.0)
+"""Settings for a tool without markers: its reference point is found within 1 px, and errors
+of neighbouring images are alike. With less noise, the predicted error above the object was
+three times the true one."""
+# Settings of servoing with such a tool. Its reference point may be 0.4 m above the object, so
+# the predicted error is larger than with a marker; open fingers leave 15 mm on either side.
+_UNMARKED_SERVO = {"tolerance": 3.0, "object_error": 0.004, "probe_aside": 120.0}
 # `_PROBE_FRACTIONS`: fractions of the probe height to try. `_PROBE_MARGIN`: required distance
 # of the joints from their limits [rad], since the arm is slow close to a limit.
 _PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
@@ -188,6 +191,7 @@ class Grasping:
         config = config or GraspingConfig()
         servo = config.servo.scaled(self._size)
         servo = replace(servo, probe=_reachable_probe(workplace, servo.probe))
+        servo = servo if skill.landmarks is None else replace(servo, **_UNMARKED_SERVO)
         self._config = config = replace(config, servo=servo)
         self._check = check
         # Estimated height of the table in the base frame, and its uncertainty [m].

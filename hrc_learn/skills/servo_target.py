@@ -244,6 +244,9 @@ class VisualServoConfig:
     pixel depends on height."""
     probe_tolerance: float = 30.0
     """Distance of the feature from the target at which a probe begins its descent [px]."""
+    probe_aside: float = 0.0
+    """Distance in the image by which all probes but the first are shifted, roughly towards its
+    middle [px]. Motions across the image and in depth together show the camera's tilt."""
     max_probes: int = 6
     """Largest number of probes."""
     border: float = 80.0

@@ -411,6 +411,13 @@ class ServoStep:
         return replace(target, orientation=quaternion.multiply(state.drawn.turn, tool))
 
 
+def _towards_middle(pixel: Float[np.ndarray, "2"], side: float) -> Float[np.ndarray, "2"]:
+    """Direction 40 degrees to one side (1 or -1) of that to the middle of the image."""
+    u, v = np.array(IMAGE_SIZE) / 2 - pixel
+    angle = np.arctan2(v, u) + 0.7 * side
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
 class VisualServo:
     """Runs visual servoing in a work cell until the marker is at its target.
 
@@ -442,12 +449,15 @@ class VisualServo:
         """
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
-        for _ in range(config.max_probes):
-            # If the camera is not known well, the gripper first passes a point higher up.
+        for k in range(config.max_probes):
+            # If the camera is not known well, the gripper first passes a point higher up, and
+            # after the first probe aside, to either side in turn.
             self._read()
             if self._law.uncertainty(self.state, target) > config.object_error:
-                raised = replace(target, raised=self._law.probe_height(self.state, target))
-                self._pass(raised, start)
+                aside = config.probe_aside * min(k, 1) * _towards_middle(target.item, (-1) ** k)
+                height = self._law.probe_height(self.state, target)
+                item = config.within(target.item + aside)
+                self._pass(replace(target, item=item, raised=height), start)
             reached = self._converge(target, start)
             error = self._law.uncertainty(self.state, target)
             if error <= config.object_error:

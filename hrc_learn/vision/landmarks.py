@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from hrc_learn.vision.markers import as_grey
 
@@ -27,18 +27,18 @@ _SAME_POINT = 0.006
 _REACH, _WIDTH = 5.0, 1440
 # Fewest points that must agree on a tool (`FEWEST_POINTS`) and on an object.
 FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
-# Number of RANSAC samples of four matches each: in clutter, only one match in ten may be right.
-_TRIALS = 5000
+# Largest numbers of samples of matches that are tried, of the clearest matches and of all: an
+# image without the tool takes a fifth of a second.
+_TRIALS = 300, 1000
+# Once a pose is found, features are matched where it expects the tool's points, within these
+# multiples of `_REACH`, if their descriptors differ by less than `_SIMILAR`.
+_GUIDED, _SIMILAR = (2.0, 1.0, 1.0), 270.0
 # Least standard deviation of a feature's position in the image [px].
 _LEAST_NOISE = 0.15
 # Range of an object's size in the image, relative to its size in the view.
 _SCALES = (0.5, 2.0)
 # Margin around the last finding that is searched first [px at the image width `_WIDTH`].
 _MARGIN = 70
-# Number of images between full-resolution searches for items that stay unseen.
-_CLOSE_LOOK_EVERY = 5
-# Only images wider than this are searched at half resolution [px].
-_LARGE = 960
 
 # `_CHANGED`: a pixel counts as changed if its grey level changes by more than this.
 # `_GROWN`: width of the square with which areas of changed pixels are dilated [px].
@@ -54,10 +54,6 @@ class Features:
     pixels: Float[np.ndarray, "n 2"]
     """(u, v) [px]."""
     descriptors: UInt8[np.ndarray, "n 128"]
-
-    def chosen(self, which: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> Features:
-        """A selection of the features."""
-        return Features(pixels=self.pixels[which], descriptors=self.descriptors[which])
 
     @classmethod
     def of(
@@ -81,16 +77,6 @@ class Features:
             return cls(pixels=np.zeros((0, 2)), descriptors=np.zeros((0, 128), np.uint8))
         pixels = np.array([key.pt for key in found]) + np.array([left, top])
         return cls(pixels=pixels, descriptors=descriptors.astype(np.uint8))
-
-    @classmethod
-    def coarse(cls, image: UInt8[np.ndarray, "height width 3"]) -> Features:
-        """Features of an image at half its resolution, in a fraction of the time."""
-        import cv2
-
-        half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        seen = cls.of(np.asarray(half))
-        # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one.
-        return cls(pixels=2.0 * seen.pixels + 0.5, descriptors=seen.descriptors)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,36 +130,58 @@ class Tool:
         points: np.ndarray = self.points[own]
         pixels: np.ndarray = seen.pixels[image]
         reach = _REACH * width / _WIDTH
-        good, turn, shift, inliers = cv2.solvePnPRansac(
-            points,
-            pixels,
-            matrix,
-            lens,
-            iterationsCount=_TRIALS,
-            reprojectionError=reach,
-            flags=cv2.SOLVEPNP_AP3P,
-        )
-        if not good or inliers is None or len(inliers) < FEWEST_POINTS:
+        search = cv2.UsacParams()
+        search.threshold, search.loMethod = reach, cv2.LOCAL_OPTIM_NULL
+        # Clear matches first (PROSAC, Chum and Matas 2005), then any matches.
+        for search.sampler, search.maxIterations in zip(
+            (cv2.SAMPLING_PROSAC, cv2.SAMPLING_UNIFORM), _TRIALS, strict=True
+        ):
+            good, _, turn, shift, inliers = cv2.solvePnPRansac(
+                points, pixels, matrix, lens, params=search
+            )
+            if good and inliers is not None and len(inliers) >= FEWEST_POINTS:
+                break
+        else:
             return None
         kept: np.ndarray = np.asarray(inliers).ravel()
-        for _ in range(3):
-            turn, shift = cv2.solvePnPRefineLM(
-                points[kept], pixels[kept], matrix, lens, turn, shift
-            )
-            there, _ = cv2.projectPoints(points, turn, shift, matrix, lens)
-            kept = np.flatnonzero(np.linalg.norm(there[:, 0] - pixels, axis=1) < reach)
-            if len(kept) < FEWEST_POINTS:
+        points, pixels = points[kept], pixels[kept]
+        for wide in _GUIDED:
+            turn, shift = cv2.solvePnPRefineLM(points, pixels, matrix, lens, turn, shift)
+            there, _ = cv2.projectPoints(self.points, turn, shift, matrix, lens)
+            image, own = self._guided(seen, there[:, 0], wide * reach)
+            if len(own) < FEWEST_POINTS:
                 return None
-        there, slope = cv2.projectPoints(points[kept], turn, shift, matrix, lens)
+            points, pixels = self.points[own], seen.pixels[image]
+        turn, shift = cv2.solvePnPRefineLM(points, pixels, matrix, lens, turn, shift)
+        there, slope = cv2.projectPoints(points, turn, shift, matrix, lens)
         pixel, by_pose = cv2.projectPoints(self.place[None], turn, shift, matrix, lens)
-        error = there[:, 0] - pixels[kept]
-        covariance = _propagated(slope[:, :6], by_pose[:, :6], error)
+        covariance = _propagated(slope[:, :6], by_pose[:, :6], there[:, 0] - pixels)
         if not np.isfinite(covariance).all() or shift[2, 0] <= 0:
             return None
-        return Finding(pixel=pixel[0, 0], covariance=covariance, points=pixels[kept])
+        return Finding(pixel=pixel[0, 0], covariance=covariance, points=pixels)
+
+    def _guided(
+        self, seen: Features, there: Float[np.ndarray, "n 2"], reach: float
+    ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+        """Indices of features, and of the most similar points expected near them.
+
+        Args:
+            seen: Features of the image.
+            there: Expected pixels of the tool's points [px].
+            reach: Largest distance from the expected pixel [px].
+        """
+        apart = np.linalg.norm(seen.pixels[:, None] - there, axis=-1)
+        image, own = np.nonzero(apart < reach)
+        a, b = seen.descriptors[image].astype(np.float32), self.descriptors[own]
+        unlike = np.linalg.norm(a - b, axis=-1)
+        order = unlike.argsort()[: (unlike < _SIMILAR).sum()]
+        # Each feature and each point counts once, in its most similar pair.
+        for side in (image, own):
+            order = order[np.sort(np.unique(side[order], return_index=True)[1])]
+        return image[order], own[order]
 
     def _matches(self, seen: Features) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """Indices of features, and of the tool's points that they match clearly best."""
+        """Indices of features, and of the tool's points that they match, the clearest first."""
         if min(len(seen.pixels), len(self.points)) < FEWEST_POINTS:
             return np.zeros(0, int), np.zeros(0, int)
         # Other views of the same point do not compete with the best match.
@@ -182,8 +190,9 @@ class Tool:
         rival = np.where(apart > _SAME_POINT, distance, distance[:, -1:]).min(axis=1)
         back, _ = nearest(self.descriptors, seen.descriptors, 1)
         mutual = back[index[:, 0], 0] == np.arange(len(index))
-        clear = mutual & (distance[:, 0] < RATIO * rival)
-        return np.flatnonzero(clear), index[clear, 0]
+        clear = np.flatnonzero(mutual & (distance[:, 0] < RATIO * rival))
+        clear = clear[np.argsort(distance[clear, 0] / rival[clear])]
+        return clear, index[clear, 0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,14 +307,12 @@ class Landmarks:
 class LandmarkDetector:
     """Finds landmarks in a stream of images, first near their last position.
 
-    Items not found there are searched for in the whole image, at half resolution and now and
-    then at full resolution. Findings are always refined at full resolution.
+    Items not found there are searched for in the whole image.
     """
 
     def __init__(self, landmarks: Landmarks):
         self.landmarks = landmarks
         self._last: dict[str, Finding] = {}
-        self._in_vain: dict[str, int] = {}
 
     def find(
         self, image: UInt8[np.ndarray, "height width 3"], names: Sequence[str]
@@ -322,25 +329,21 @@ class LandmarkDetector:
                 f"{self.landmarks.image_size[0]}x{self.landmarks.image_size[1]}: set the "
                 "camera to that size."
             )
-        half: Features | None = None
+        whole: Features | None = None
         found: dict[str, Finding] = {}
         for name in names:
             item = self.landmarks.tool if name == "tool" else self.landmarks.objects[name]
-            vain = self._in_vain.get(name, 0)
             finding = _refined(item, image, self._last.pop(name, None))
-            if finding is None and vain % _CLOSE_LOOK_EVERY and size[0] > _LARGE:
-                half = half or Features.coarse(image)
-                finding = _refined(item, image, item.find(half, size[0]))
-            elif finding is None:
-                finding = item.find(Features.of(image), size[0])
-            self._in_vain[name] = 0 if finding is not None else vain + 1
+            if finding is None:
+                whole = whole or Features.of(image)
+                finding = item.find(whole, size[0])
             if finding is not None:
                 found[name] = self._last[name] = finding
         return found
 
 
 def _refined(item: Tool | Object, image: np.ndarray, near: Finding | None) -> Finding | None:
-    """Find an item at full resolution near an earlier or coarser finding; None: not found."""
+    """Find an item near an earlier finding; None: not found."""
     if near is None:
         return None
     height, width = image.shape[:2]
@@ -403,4 +406,5 @@ def changed_features(
     left, top, width, height = cv2.boundingRect(mask)
     seen = Features.of(image, (left, top, left + width, top + height))
     u, v = np.rint(seen.pixels).astype(int).T
-    return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)] > 0)
+    inside = mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)] > 0
+    return Features(pixels=seen.pixels[inside], descriptors=seen.descriptors[inside])
