@@ -316,6 +316,29 @@ def test_the_arm_probes_until_the_target_is_certain(errors):
     assert duration + CONFIG.dwell >= max(step.probes, 1) * CONFIG.dwell
 
 
+def test_probes_after_the_first_pass_beside_the_target_towards_the_middle():
+    step, items = IdealStep(Cell(), [0.02, 0.02, 0.02, 0.001]), []
+    step.config = replace(CONFIG, probe_aside=100.0)
+    move = step.step
+
+    def noting(state, now, target):
+        if target.raised > 0:
+            items.append(target.item)
+        return move(state, now, target)
+
+    step.step = noting
+    item = np.array([300.0, 700.0])
+    with shapes_unchecked():
+        VisualServo(step.cell, step).servo_to(target_above(item=item))
+    away = np.unique(np.stack(items), axis=0) - item
+    assert sorted(np.linalg.norm(away, axis=1)) == pytest.approx([0, 100, 100])
+    middle = np.array(IMAGE_SIZE) / 2 - item
+    aside = away[np.linalg.norm(away, axis=1) > 1]
+    assert (aside @ middle > 0.7 * 100 * np.linalg.norm(middle)).all()
+    across = aside @ np.array([-middle[1], middle[0]])
+    assert across.prod() < 0  # one on either side
+
+
 def test_an_arm_whose_target_stays_uncertain_does_not_descend():
     cell = Cell()
     step = IdealStep(cell, [0.01] * (CONFIG.max_probes + 1))
