@@ -375,10 +375,8 @@ def draw_finding(image: UInt8[np.ndarray, "height width 3"], finding: Finding) -
     turn = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
     cv2.ellipse(image, (u, v), (reach[0], reach[1]), turn, 0, 360, red, size)
     if np.isfinite(finding.angle):
-        end = finding.pixel + 40 * size * np.array(
-            [np.cos(finding.angle), np.sin(finding.angle)]
-        )
-        a, b = np.rint(end).astype(int).tolist()
+        ahead = np.array([np.cos(finding.angle), np.sin(finding.angle)])
+        a, b = np.rint(finding.pixel + 40 * size * ahead).astype(int).tolist()
         cv2.arrowedLine(image, (u, v), (a, b), (40, 120, 255), size)
 
 
