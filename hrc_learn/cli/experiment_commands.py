@@ -257,8 +257,11 @@ def learn(
     ledger = out / "steps.json"
     with suppress(OSError, ValueError):
         done = read_json(ledger)
-    code = _digest(Path(__file__).parents[1], "*.py")
-    made_of = [software_versions(), code, robot.robot]
+    package, file = Path(__file__).parents[1], Path(robot.robot.partition(":")[0])
+    code = [_digest(package, kind) for kind in ("*.py", "*.toml")]
+    made_of = [software_versions(), *code, robot.robot]
+    if file.is_file():
+        made_of.append(hashlib.sha256(file.read_bytes()).hexdigest())
     for number, step in enumerate(_learning_steps(out, robot, markerless), start=1):
         title, work, folders = step
         name, digest = folders[-1].name, [*made_of, *map(_digest, folders)]

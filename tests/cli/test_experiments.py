@@ -303,9 +303,17 @@ def test_learning_records_then_fits_and_repeats_what_has_changed(learned, tmp_pa
     assert learn()[0] == ["jacobian"]
     assert learn(robot=WithRobot(robot="fr3"))[0] == ALL
     learn()
-    (tmp_path / "package/data.toml").write_text("")
+    (tmp_path / "package/page.html").write_text("")
     (tmp_path / "mine.py").write_text("")
     assert learn()[0] == []
+    (tmp_path / "package/limits.toml").write_text("")
+    assert learn()[0] == ALL
+    mine = WithRobot(robot=f"{tmp_path / 'arm.urdf'}:tip")
+    for text in ("<robot/>", "<robot></robot>"):
+        (tmp_path / "arm.urdf").write_text(text)
+        assert learn(robot=mine)[0] == ALL
+    assert learn(robot=mine)[0] == []
+    learn()
     (tmp_path / "package/code.py").write_text("2")
     assert learn()[0] == ALL
     (out / "steps.json").write_text("{")
