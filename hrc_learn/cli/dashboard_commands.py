@@ -165,9 +165,10 @@ def report(args: Report) -> None:
     page = evidence_page(reports) if args.evidence else reports_page(title, reports)
     write_text(args.out, page)
     print(f"{args.out}: {', '.join(report.title for report in reports)}")
-    values = {
-        f"{run.resolve().name}_{m.key}": m.value
-        for run, report in zip(args.runs, reports, strict=True)
-        for m in report.table
-    }
+    names = [run.resolve().name for run in args.runs]
+    values = {}
+    for number, (name, report) in enumerate(zip(names, reports, strict=True), start=1):
+        # Runs in folders of the same name are told apart by their numbers on the page.
+        own = name if names.count(name) == 1 else f"{name}_{number}"
+        values |= {f"{own}_{m.key}": m.value for m in report.table}
     write_values(args.json, values)

@@ -67,6 +67,17 @@ def test_one_page_is_made_from_several_runs(runs, tmp_path):
     }
 
 
+def test_runs_in_folders_of_the_same_name_keep_their_values(runs, tmp_path):
+    named = [tmp_path / place / "run" for place in "ab"]
+    for run, place in zip(runs, named, strict=True):
+        place.parent.mkdir()
+        run.rename(place)
+    figures = tmp_path / "figures.json"
+    done("report", *named, "--out", tmp_path / "page.html", "--json", figures)
+    found = json.loads(figures.read_text())
+    assert (found["run_1_error_mm"], found["run_2_error_mm"]) == (0.3, 3.0)
+
+
 def test_a_single_run_has_its_own_page(runs, tmp_path):
     done("report", runs[0], "--out", tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
