@@ -77,6 +77,8 @@ def play(args: Play) -> int:
 
 def _target(model: FittedModel, words: Sequence[str], option: str) -> Target:
     """Start or goal, given as numbers or as an episode of the demonstrations."""
+    if not words:
+        raise ValueError(f"{option} is empty: give numbers, or the word episode and its number")
     if words[0] != "episode":
         return model.target(words, option)
     try:

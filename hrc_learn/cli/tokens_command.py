@@ -93,8 +93,8 @@ def tokens(args: Tokens) -> None:
         refuse_given(args, ["out", "config", "overwrite"], "belongs to hrc tokens fit")
         if args.model is None:
             raise ValueError("hrc tokens report needs --model, a folder of hrc tokens fit")
+        tokenizer = MotionTokenizer.load(args.model / MODEL)  # refuses other models
         settings = TokenSettings(**read_made_by(args.model)["settings"])
-        tokenizer = MotionTokenizer.load(args.model / MODEL)
         figures = _measured(tokenizer, args.dataset, settings, every)
     else:
         refuse_given(args, ["model"], "belongs to hrc tokens report")

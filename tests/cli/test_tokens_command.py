@@ -66,6 +66,7 @@ def test_a_report_repeats_the_figures_of_the_fit(dataset, fitted, tmp_path):
         (("fit", "--config", "seconds=100"), "shorten seconds"),
         (("fit", "--config", "tolerance=-1"), "tolerance must lie between 0 and 1"),
         (("report", "--model", "nowhere"), "nowhere"),
+        (("report", "--model", "."), "tokens/config.json does not exist"),
     ],
 )
 def test_wrong_words_are_named(dataset, tmp_path, words, message):
