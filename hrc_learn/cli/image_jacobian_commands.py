@@ -194,6 +194,7 @@ _TILT = 0.1
 
 def evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
     """Compare an image Jacobian with the simulator's true one."""
+    refuse_given(args, ["out", "overwrite", "most_nrmse"], "is for primitives: leave it out")
     torch.set_num_threads(1)
     figures = _image_jacobian_figures(args, VisualServoSkill.load(model).jacobian)
     rows = [
@@ -216,7 +217,7 @@ def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[s
     from hrc_learn.sim import World
     from hrc_learn.sim.workplace import Workplace
 
-    demos = load_demos(args.dataset)
+    demos = load_demos(args.dataset, episodes=args.episodes or None)
     if demos[0].position is None:
         raise ValueError(f"{args.dataset}: no end-effector positions to place a grid around.")
     shown = torch.cat([torch.from_numpy(demo.position) for demo in demos]).double()

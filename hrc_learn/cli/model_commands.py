@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hrc_learn.cli._run import refuse_repeats, write_values
-from hrc_learn.cli.arguments import Evaluate, FitPrimitives, Smooth, columns
+from hrc_learn.cli.arguments import Evaluate, FitPrimitives, Smooth, columns, refuse_given
 from hrc_learn.cli.fit_command import fit_silently, open_moving
 from hrc_learn.cli.tokens_command import held_out
 from hrc_learn.demos import DemonstrationSet
@@ -207,6 +207,8 @@ def smooth(args: Smooth) -> None:
     from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
 
     if args.remove and args.checkpoint is not None:
+        others = ["dataset", "scale", "urdf", "calibration", "degrees", "limits"]
+        refuse_given(args, others, "is not used by --remove: leave it out")
         remove_smoothing(args.checkpoint)
         print(f"limits removed from {args.checkpoint}")
         return

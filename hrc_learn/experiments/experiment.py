@@ -17,6 +17,7 @@ from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, eval
 from hrc_learn.experiments.run_recorder import film, record
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, LiveView, Observer
 from hrc_learn.experiments.trials import Trial, TrialRun, repeat
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import MotionLog, PhysicsError, World
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
@@ -180,6 +181,7 @@ def run_experiment[Run: ExperimentRun](
 
     if options.trials < 0:
         raise ValueError(f"--trials must not be negative, but is {options.trials}.")
+    check_settings(options, positive=["processes"])
     configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
     console, study = Console(), experiment.study()
     observer = Observer(tell=console.print)

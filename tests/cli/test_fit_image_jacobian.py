@@ -50,6 +50,8 @@ def test_it_writes_a_model_like_the_camera_of_the_work_cell(tmp_path):
 
     # Compared with the simulator's camera, the pixels were its own.
     evaluate = ("evaluate", "--model", model, "--dataset", tmp_path / "set")
+    asked = done(*evaluate, "--out", tmp_path / "figures", status=2)
+    assert "--out is for primitives" in asked.error
     outcome = done(*evaluate, "--json", tmp_path / "errors.json")
     errors = json.loads((tmp_path / "errors.json").read_text())
     kinds = ("relative_error_median", "relative_error_p95", "within_1_sigma", "within_2_sigma")

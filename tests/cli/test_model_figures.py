@@ -97,6 +97,11 @@ def test_an_episode_without_joints_gives_a_pose_or_nothing(episode):
         play_command._target(model(), ["episode", "7"], "--goal")
 
 
+def test_a_goal_needs_words():
+    with pytest.raises(ValueError, match="--goal is empty: give numbers"):
+        play_command._target(model(), (), "--goal")
+
+
 @pytest.mark.parametrize("words", [["episode"], ["episode", "1", "2"], ["episode", "x"]])
 def test_an_episode_is_one_number(episode, words):
     with pytest.raises(ValueError, match="--start episode needs one number"):
@@ -420,6 +425,7 @@ def test_limits_are_removed_without_a_dataset(limits, tmp_path, capsys):
         ({"remove": True, "limits": Path("x")}, "give --checkpoint, or --limits"),
         ({"limits": Path("x")}, "give --dataset"),
         ({"checkpoint": Path("nowhere")}, "there is no folder nowhere"),
+        ({"checkpoint": Path(), "remove": True, "limits": Path("x")}, "--limits is not used"),
     ],
 )
 def test_smoothing_needs_a_checkpoint_or_a_file_and_a_dataset(limits, given, message):
