@@ -271,11 +271,10 @@ def command_line() -> str:
 
     program, *arguments = sys.argv
     path = Path(program)
+    start = ["python", shortest(program)] if path.suffix == ".py" else [path.name]
     # `python -m hrc_learn.cli` is `hrc`, which is on the path; other programs need Python.
     if path.name == "__main__.py":
         start = ["hrc"]
-    else:
-        start = ["python", shortest(program)] if path.suffix == ".py" else [path.name]
     return shlex.join([*start, *map(shortest, arguments)])
 
 

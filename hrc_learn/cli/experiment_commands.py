@@ -262,8 +262,7 @@ def learn(
     made_of = [software_versions(), *code, robot.robot]
     if file.is_file():
         made_of.append(hashlib.sha256(file.read_bytes()).hexdigest())
-    for number, step in enumerate(_learning_steps(out, robot, markerless), start=1):
-        title, work, folders = step
+    for number, (title, work, folders) in enumerate(_learning_steps(out, robot, markerless), 1):
         name, digest = folders[-1].name, [*made_of, *map(_digest, folders)]
         if not again and done.get(name) == digest:
             _announce(console, number, steps, f"{title}: up to date in {folders[-1]}")

@@ -249,10 +249,8 @@ def serve(args: Serve) -> None:
     connect, safety = _access(args, settings.site, world, SafetyConfig())
     controller, observation = _controller(robot.chain, camera, centre, dt, safety)
     began = time.perf_counter()
-    if settings.step == "eager":
-        runner = EagerRunner(controller, observation)
-    else:
-        runner = open_step(controller, observation)
+    step = EagerRunner if settings.step == "eager" else open_step
+    runner = step(controller, observation)
     opened = time.perf_counter() - began
     with connect() as arm:
         steps = max(1, round(duration * args.rate))

@@ -335,11 +335,10 @@ def _standing(run: CollaborationRun) -> list[str]:
 
 def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
     """Unwanted contacts, by the object that was hit."""
-    begun = [start for start, _ in spans(run.cell.log, RELEASE)]
     released = {
         pick.item.name: start
         for pick in run.picks
-        for start in begun
+        for start, _ in spans(run.cell.log, RELEASE)
         # A person may stop the arm while it lowers an object.
         if pick.release is not None and pick.span[0] <= start < pick.span[1]
     }

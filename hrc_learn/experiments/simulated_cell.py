@@ -236,7 +236,6 @@ def plan_checker(world: World) -> Callable[[Plan], None]:
     """Function that raises `BlockedPathError` if a plan with the held object collides."""
 
     def check(plan: Plan) -> None:
-        held = (item.name for item in world.config.objects if world.holds(item.name))
-        check_plan(plan, world, next(held, None))
+        check_plan(plan, world, next(iter(world.held()), None))
 
     return check

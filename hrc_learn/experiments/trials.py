@@ -124,10 +124,8 @@ class TrialFile(Claim):
 
 
 def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    for name in [*before, *now]:
-        if before.get(name) != now.get(name):
-            return f"{name} is {before.get(name)!r} in the file, but {now.get(name)!r} now"
-    raise AssertionError("nothing differs")
+    name = next(name for name in [*before, *now] if before.get(name) != now.get(name))
+    return f"{name} is {before.get(name)!r} in the file, but {now.get(name)!r} now"
 
 
 def _plain(name: str, value: Any) -> float | int | str:
