@@ -111,8 +111,7 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
 
 def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     """Record visual servoing to an object with an uncalibrated camera."""
-    settings = _Settings(demonstration=ServoDemonstrationConfig())
-    settings = with_settings(args.config, settings)
+    settings = with_settings(args.config, _Settings(demonstration=ServoDemonstrationConfig()))
     config = settings.demonstration
     if config.markerless:
         _film_servoing(args, config, episodes, seed)
@@ -146,8 +145,7 @@ def _film_servoing(
     # The markerless search needs fewer images than a marker tracker.
     config = replace(config, record_every=2 * config.record_every)
 
-    width, height = IMAGE_SIZE
-    cameras = {FILM: (height, width)}
+    cameras = {FILM: IMAGE_SIZE[::-1]}  # height and width
     demonstrate = partial(film_servoing, world, workplace, sensor, camera, config, rng)
     _write(args, workplace, demonstrate, "servo to the box", config.fps, cameras=cameras)
     print(f"{episodes} demonstrations with video in {args.out}")

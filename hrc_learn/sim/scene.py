@@ -357,12 +357,8 @@ def _add_object(spec: mujoco.MjSpec, item: ObjectConfig, printed: bool) -> None:
     add_box(
         body, item.name, item.half_size, item.colour, mass=item.mass, friction=friction, **FIRM
     )
-    top = Plate(
-        marker=item.marker,
-        position=(0.0, 0.0, item.half_size[2] + 0.0005),
-        solid=False,
-        printed=printed,
-    )
+    place = 0.0, 0.0, item.half_size[2] + 0.0005
+    top = Plate(marker=item.marker, position=place, solid=False, printed=printed)
     add_plate(spec, body, f"{item.name}_marker", top)
 
 
