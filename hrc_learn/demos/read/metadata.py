@@ -202,8 +202,8 @@ def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Sta
 def _column_statistics(values: np.ndarray) -> dict[str, list]:
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
     found = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
-    found |= zip(QUANTILES, quantiles, strict=True)
-    return {name: row.tolist() for name, row in found.items()} | {"count": [len(values)]}
+    found |= {"count": np.array([len(values)]), **dict(zip(QUANTILES, quantiles, strict=True))}
+    return {name: row.tolist() for name, row in found.items()}
 
 
 def _combine(stacked: Mapping[str, np.ndarray]) -> dict[str, list]:
