@@ -389,5 +389,5 @@ def test_a_calibration_that_does_not_fit_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="has no elbow_flex; there are shoulder_pan"):
         open_demos(one.percent, units=one.units)
     far = so101_set(tmp_path / "far", [1.6 * np.rint(d) for d in one.degrees])
-    with pytest.raises(DatasetError, match=r"reaches \d+.*: is it in deg, not %"):
+    with pytest.raises(DatasetError, match=r"reaches \d+.*: in deg, not %"):
         open_demos(far, units=other.units)

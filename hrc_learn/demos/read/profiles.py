@@ -390,8 +390,9 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
     rates = (joints[window:] - joints[:-window]) * fps / window
     if position is not None and position.shape == joints.shape:
         found["command_position"] = tracking = track(position, joints, fps)
-        late = tracking is None or abs(tracking.delay) / fps > PROMPT
-        if late or (tracking.fit <= FOLLOWS).any():  # the fit is NaN where nothing moves
+        late = tracking is not None and abs(tracking.delay) / fps > PROMPT
+        # The fit is NaN where nothing moves.
+        if tracking is None or late or (tracking.fit <= FOLLOWS).any():
             found["rates"] = track(_means(position, window), rates, fps)
     if velocity is not None and velocity.shape == joints.shape:
         found["command_velocity"] = track(_means(velocity, window), rates, fps)

@@ -179,7 +179,7 @@ def calibrated_units(
     steps = np.broadcast_to(sizes.step, len(names)) * spans / np.where(hands, 100, 200)
     other = (steps > 0) & (np.abs(steps - np.maximum(np.rint(steps), 1)) > 5e-3 * steps)
     if (beyond := sizes.peak > _CLIP + 0.05).any():
-        text = f"{labels[beyond.argmax()]} reaches {sizes.peak.max():.4g}: is it in deg, not %?"
+        text = f"{labels[int(beyond.argmax())]} reaches {sizes.peak.max():.4g}: in deg, not %?"
         raise DatasetError(f"does not fit: {text}", file=file)
     if other.sum() > 1:
         text = f"the steps of {', '.join(np.array(labels)[other])} are not those of its ranges"
