@@ -15,7 +15,6 @@ from hrc_learn.dmp.coupling import (
     velocity_coupling,
 )
 from hrc_learn.viz import palette
-from hrc_learn.viz.figures import shade
 
 from . import demonstrations
 from .drawing import DEMO, ends, panels, plane
@@ -80,7 +79,7 @@ def stopping(figure: Figure) -> None:
 
         path = run(dmp, 3.0, change)[:, 0]
         t = DT * np.arange(1, len(path) + 1)
-        shade(axes, t, (t > 0.6) & (t < 1.3))
+        axes.axvspan(0.6, 1.3, color=palette.PERSON, alpha=0.13, lw=0)
         axes.plot(t, path, color=palette.BLUE, label="primitive")
         axes.plot(t, followed, color=palette.VERMILION, label="robot, held from 0.6 to 1.3 s")
         axes.set(xlabel="time [s]", title=title)
