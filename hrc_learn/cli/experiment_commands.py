@@ -71,7 +71,7 @@ def run(args: Run) -> int:
     if args.experiment == "placing":
         if not is_real:
             refuse_given(args, ["shelf"], "is for a real arm here: all shelves are simulated")
-        elif len(args.shelf) > 1:
+        elif len(args.shelf) != 1:
             raise ValueError("hrc run placing places one object: give one --shelf")
     if args.arm == "lerobot":
         raise ValueError(

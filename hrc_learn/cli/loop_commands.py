@@ -87,6 +87,7 @@ def _access(
             access_by(args.arm, robot)  # refuses other arms
         site = replace(site, driver=args.arm, ip=args.ip)
         return partial(_real_arm, site, world, robot), site.cell_config().safety
+    assert args.arm not in ("lerobot", "ros2")  # both drive real arms
     access = access_by(args.arm, robot)
     delay = safety.delay + access.delay
     braking = min(safety.braking, access.dynamics)

@@ -145,7 +145,7 @@ def _film_servoing(
     # The markerless search needs fewer images than a marker tracker.
     config = replace(config, record_every=2 * config.record_every)
 
-    cameras = {FILM: IMAGE_SIZE[::-1]}  # height and width
+    cameras = {FILM: (IMAGE_SIZE[1], IMAGE_SIZE[0])}  # height and width
     demonstrate = partial(film_servoing, world, workplace, sensor, camera, config, rng)
     _write(args, workplace, demonstrate, "servo to the box", config.fps, cameras=cameras)
     print(f"{episodes} demonstrations with video in {args.out}")

@@ -199,7 +199,7 @@ class ContinuedTrajectory(Trajectory):
         super().__init__(**motion)
         self._since = since
         if since is not None:
-            reached = Trajectory(**motion | {"s": since[..., None]})
+            reached = Trajectory(**motion | dict[str, Any](s=since[..., None]))
             off = position - reached.position[..., 0, :]
             off_rate = (velocity - reached.velocity[..., 0, :]) * self.duration[..., None]
             self._off = torch.stack([off, off_rate], dim=-1)
