@@ -181,6 +181,7 @@ def test_choices_are_those_of_the_package(alias, known):
             ("run", "placing", "--arm", "ros2", "--shelf", "lower", "upper"),
             "hrc run placing places one object: give one --shelf",
         ),
+        (("run", "placing", "--arm", "ros2", "--shelf"), "places one object: give one --shelf"),
         (("page", "--out", "x", "--arm", "franky"), "--arm franky needs --ip"),
         (("serve", "--arm", "franky"), "--arm franky needs --ip"),
         (("serve", "--config", "site.speeed=1"), "site.speeed: no such setting; did you mean"),
