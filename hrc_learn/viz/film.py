@@ -127,7 +127,7 @@ def camera_inset(camera: CameraRecording, width: int) -> Callable[[int, float], 
                 u, v = (scale * pixel).tolist()
                 draw.ellipse((u - 5, v - 5, u + 5, v + 5), outline=colour, width=3)
         draw.rectangle((0, image.height - 18, image.width, image.height), fill=_SHADE)
-        text, place = "marker red, target green", (5, image.height - 9)
+        text, place = "tool red, target green", (5, image.height - 9)
         draw.text(place, text, font=_font(10), fill="white", anchor="lm")
         return np.asarray(image)
 
