@@ -447,3 +447,19 @@ def test_units_of_components_that_differ():
     assert [decision.unit_of(i) for i in range(3)] == ["deg", "m", "deg"]
     alike = decide_units(chosen, {}, {"joint_position": ["deg"] * 3})["joint_position"]
     assert (alike.units, alike.unit_of(2), alike.factor) == ((), "deg", math.pi / 180)
+
+
+@pytest.mark.parametrize(
+    ("step", "unit"),
+    [
+        # Ranges of a quarter turn to a turn step by 0.049 to 0.195 of -100..100.
+        ((0.049, 0.06, 0.08, 0.1, 0.195), "%"),
+        ((0.04, 0.06, 0.08, 0.1, 0.195), "deg"),
+        ((0.049, 0.06, 0.08, 0.1, 0.21), "deg"),
+    ],
+)
+def test_steps_count_as_fractions_of_a_range_only_if_all_ranges_are_a_joints(step, unit):
+    given = sizes(*[90.0] * 5)._replace(step=np.array(step))
+    labels = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+    found = evidence.guess_joints(given, np.ones(5, bool), labels, "so101_follower")
+    assert (found.unit, found.confidence > 0.9) == (unit, unit == "%")
