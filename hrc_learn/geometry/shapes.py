@@ -169,14 +169,13 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
 
 
 def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
-    """Corners of the triangles in a file that `read_mesh` reads, each once [m].
+    """Corners of the triangles in a file that `read_mesh` reads [m].
 
     Raises:
         ValueError: The file is of another format, broken, or holds no triangle.
         ModuleNotFoundError: trimesh is not installed.
     """
-    corners = [mesh.vertices[mesh.faces].reshape(-1, 3) for mesh, _ in _meshes(path)]
-    return np.unique(np.concatenate(corners), axis=0)
+    return np.concatenate([mesh.vertices[np.unique(mesh.faces)] for mesh, _ in _meshes(path)])
 
 
 def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:

@@ -131,6 +131,7 @@ def hull_of(shape: Shape) -> Hull:
     try:
         hull = ConvexHull(points)
     except QhullError:  # flat: any two of the few points may be an edge
+        points = np.unique(points, axis=0)
         return Hull(points, points[list(combinations(range(min(len(points), 200)), 2))])
     faces = hull.simplices
     pairs = np.unique(np.sort(np.concatenate([faces[:, [i, i - 1]] for i in range(3)])), axis=0)
@@ -185,9 +186,9 @@ def _smallest_capsule(points: Float[np.ndarray, "points 3"]) -> _Capsule:
     for axis in principal_axes(points):
         along = points @ axis
         flat = points - along[:, None] * axis
-        centre = flat.mean(0)
+        centre, squared = flat.mean(0), (flat**2).sum(1)
         for k in range(_CIRCLE_STEPS):
-            furthest = flat[np.linalg.norm(flat - centre, axis=1).argmax()]
+            furthest = flat[(squared - 2 * (flat @ centre)).argmax()]
             centre = centre + (furthest - centre) / (k + 2)
         distance = np.linalg.norm(flat - centre, axis=1)
         radius = float(distance.max()) + _SLACK

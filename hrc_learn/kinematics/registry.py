@@ -210,11 +210,12 @@ def _described(name: str, choice: Mapping[str, Any]) -> Arm:
             f"{name} is written in this package: {', '.join(choice)} cannot be chosen for it"
         )
     source = _sources()[name]
+    choice = {k: v for k, v in choice.items() if k not in ("base", "tip") or v != source[k]}
     path = _locate(name, source["package"], source["file"])
     kept = ("base", "tip", "limits", "ready")
     settings = {key: source[key] for key in kept if key in source}
-    tool, tip = source.get("tool"), source["tip"]
-    if tool and choice.get("tip", tip) == tip:
+    tool = source.get("tool")
+    if tool and "tip" not in choice:
         settings["tool"] = torch.from_numpy(turn_to(np.array(tool["approach"])))
         settings["tool"][:3, 3] = torch.tensor(tool["origin"])
     settings |= choice

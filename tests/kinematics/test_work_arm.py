@@ -191,9 +191,14 @@ def test_the_hand_of_an_so101_replaces_its_jaws():
     across = torch.linalg.cross(held.forward(q).position - axis[:3, 3], axis[:3, 2], dim=-1)
     assert float(across.norm()) < 1e-3
     assert max(c.end[2] for c in held.body.capsules if c.link == 5) <= 0.0
-    # Settings of the hand and the tool belong to the registered tip.
-    assert ArmChoice("so101:gripper_frame_link").work_arm().hand_size == held.hand_size
-    assert ArmChoice("so101:gripper_link").work_arm().hand_size == 1.0
+    assert ArmChoice("so101:gripper_frame_link").work_arm().body.capsules == held.body.capsules
+
+
+@pytest.mark.skipif(find_spec("cmeel") is None, reason="example-robot-data is not installed")
+def test_settings_of_hand_and_tool_belong_to_the_registered_tip():
+    usual = ArmChoice("ur3").work_arm().hand_size
+    assert ArmChoice("ur3:tool0").work_arm().hand_size == usual == 0.6
+    assert ArmChoice("ur3:wrist_3_link").work_arm().hand_size == 1.0
     other = registered("so100", tip="wrist", ready=[0.0, 0.5, -0.5, 0.0])
     assert torch.equal(other.tcp, torch.eye(4, dtype=torch.float64))
 
