@@ -215,40 +215,56 @@ FILTER_ARGUMENTS = {
     "joint_position": lambda q: q,
     "joint_velocity_command": lambda q: 0.3 * torch.ones_like(q),
     "jacobian": panda.jacobian,
-    "human_distance": lambda q: torch.tensor(3.0, dtype=DOUBLE),
+    "human_distance": lambda q: torch.full_like(q[..., 0], 3.0),
     "dt": lambda q: torch.tensor(DT, dtype=DOUBLE),
-    "load": lambda q: torch.tensor([0.0, 0.0, 0.1], dtype=DOUBLE),
+    "load": lambda q: torch.tensor([0.0, 0.0, 0.1], dtype=DOUBLE).expand(*q.shape[:-1], 3),
 }
 
 
-@pytest.mark.parametrize("value", [*POISONS.values(), 1e300])
+FILTER_POISONS = [*POISONS.values(), 1e300]
+
+
 @pytest.mark.parametrize(
-    "name", [*FILTER_ARGUMENTS, "state.velocity", "state.acceleration", "state.position"]
+    ("name", "values"),
+    [
+        *((name, FILTER_POISONS) for name in FILTER_ARGUMENTS if name != "dt"),
+        *(("dt", [value]) for value in FILTER_POISONS),  # one for all arms
+        *(
+            (f"state.{name}", FILTER_POISONS)
+            for name in ("velocity", "acceleration", "position")
+        ),
+    ],
 )
-def test_the_filter_alone_brakes_for_one_tick_and_forgets(name, value):
-    safety, q = SafetyFilter(panda), panda.ready
+def test_the_filter_alone_brakes_for_one_tick_and_forgets(name, values):
+    values = torch.tensor(values, dtype=DOUBLE)
+    safety, q = SafetyFilter(panda), panda.ready.expand(len(values), -1)
     state = safety.initial_state(q)
+    # Far away people stop nobody, and a state that knows no position asks the encoders.
+    harmless = (values > 0) if name == "human_distance" else torch.tensor(False)
+    harmless = (harmless | (name == "state.position")).expand(len(values))
     speeds = []
     for k in range(60):
         inputs = {key: make(q) for key, make in FILTER_ARGUMENTS.items()}
         if k == 30 and name.startswith("state."):
-            state = poisoned(state, name.removeprefix("state."), 0, value)
+            for row, value in enumerate(values.tolist()):
+                state = poisoned(state, name.removeprefix("state."), row, value)
         elif k == 30:
-            broken = _pytree.tree_map(lambda x: torch.full_like(x, value), inputs[name])
-            inputs |= {name: broken}
+            shape = inputs[name].shape
+            inputs[name] = (
+                values.view(-1, *(1 for _ in shape[1:])).expand(shape) if shape else values[0]
+            )
         v, state, report = safety.step(state, **inputs)
         q = q + DT * v
-        speeds.append(v.norm())
+        speeds.append(v.norm(dim=-1))
         assert v.isfinite().all()
         assert all(x.isfinite().all() for _, x in numbers(state))
-        # Far away people stop nobody, and a state that knows no position asks the encoders.
-        harmless = name == "state.position" or (name == "human_distance" and value > 0)
-        assert bool(report.acted("invalid")) == (
-            k == 30 and not harmless and name != "human_distance"
+        expected = (
+            ~harmless if k == 30 and name != "human_distance" else torch.zeros_like(harmless)
         )
-        if k == 30 and not harmless:
-            assert speeds[30] < speeds[29]
-    assert LIMITS.contain(q)
+        assert torch.equal(report.acted("invalid").expand(len(values)), expected)
+        if k == 30:
+            assert (harmless | (speeds[30] < speeds[29])).all()
+    assert LIMITS.contain(q).all()
     torch.testing.assert_close(v, inputs["joint_velocity_command"])
 
 

@@ -88,22 +88,22 @@ def assert_limits_kept(q: Tensor, before: SafetyState, state: SafetyState, dt: f
     torch.testing.assert_close(state.acceleration, a, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("side", [1, -1])
 @shapes_unchecked()  # for speed
-def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder(side):
+def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder():
     """Pushed across its limits at full speed, no admissible motion keeps them: those of
     acceleration and jerk hold all the same, the joints come to rest, and back when asked to."""
-    dt, safety = 0.001, SafetyFilter(LIMITS)
-    wall = LIMITS.upper if side > 0 else LIMITS.lower
+    dt, safety = 0.002, SafetyFilter(LIMITS)
+    side = torch.tensor([[1.0], [-1.0]], dtype=torch.float64)
+    wall = torch.stack([LIMITS.upper, LIMITS.lower])
     q = wall + side * 0.05
     state = safety.initial_state(q, side * 0.9 * LIMITS.velocity)
-    hardest = torch.zeros(7, dtype=torch.float64)
-    for k in range(2500):
+    hardest = torch.zeros(2, 7, dtype=torch.float64)
+    for k in range(1250):
         before = state
-        asked = side * LIMITS.velocity if k < 1500 else -0.5 * side * LIMITS.velocity
+        asked = side * LIMITS.velocity if k < 750 else -0.5 * side * LIMITS.velocity
         v, state, _ = safety.step(state, q, asked, dt)
         q = q + v * dt
-        if k == 1499:
+        if k == 749:
             assert v.abs().max() < 1e-9
             assert (side * (q - wall) > 0.05).all()
         a = (v - before.velocity) / dt
@@ -111,8 +111,8 @@ def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder(side):
         assert (a.abs() <= LIMITS.acceleration * (1 + 1e-9)).all()
         change = (a - before.acceleration).abs()
         assert (change <= LIMITS.jerk * dt * (1 + 1e-9)).all()
-    torch.testing.assert_close(hardest, LIMITS.acceleration)
-    assert LIMITS.contain(q)
+    torch.testing.assert_close(hardest, LIMITS.acceleration.expand(2, 7))
+    assert LIMITS.contain(q).all()
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.001, 0.002])
@@ -145,9 +145,9 @@ def test_it_stops_short_of_the_limit_by_the_margin():
     q = READY
     state = safety.initial_state(q)
     with shapes_unchecked():
-        for _ in range(2000):
-            v, state, _ = safety.step(state, q, 9 * torch.ones(7, dtype=torch.float64), 0.004)
-            q = q + v * 0.004
+        for _ in range(800):
+            v, state, _ = safety.step(state, q, 9 * torch.ones(7, dtype=torch.float64), 0.01)
+            q = q + v * 0.01
     v_hat = LIMITS.acceleration**2 / (2 * LIMITS.jerk)
     room = v_hat / config.rate + v_hat**2 / (2 * LIMITS.acceleration)
     torch.testing.assert_close(q, LIMITS.upper - 0.05 - room, rtol=0, atol=1e-6)
@@ -190,7 +190,7 @@ def test_outside_its_limits_a_stopped_arm_rests_and_returns_when_asked(halt, dep
     if depth < 0.02:
         v, state, _ = safety.step(state, **usual, dt=dt)
         assert (v * inwards >= 0).all()
-    for _ in range(400):
+    for _ in range(100 if depth > 0 else 400):
         v, state, _ = safety.step(state, q, inwards, dt)
         q = q + v * dt
     assert ((q > LIMITS.lower + 0.02) & (q < LIMITS.upper - 0.02)).all()

@@ -178,7 +178,7 @@ def test_above_its_cap_the_tool_brakes_as_for_a_stop():
     distance = torch.full((200,), 0.8, dtype=torch.float64)
     cap = SeparationConfig().highest_speed(distance)
     with shapes_unchecked():
-        for k in range(240):
+        for k in range(120):
             if k % 30 == 0:
                 u = 3 * torch.randn(200, 7, generator=rng, dtype=torch.float64)
             J = panda.jacobian(q)

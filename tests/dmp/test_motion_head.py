@@ -243,7 +243,9 @@ def test_derivatives_of_any_order(head):
         made = head(z, time, start, velocity, since=0.3, origin=0.5 * start)
         return made.position, made.velocity
 
-    assert torch.autograd.gradcheck(motion, inputs, check_forward_ad=True, atol=1e-6)
+    assert torch.autograd.gradcheck(
+        motion, inputs, check_forward_ad=True, atol=1e-6, fast_mode=True
+    )
     assert torch.autograd.gradgradcheck(motion, inputs, atol=1e-5, fast_mode=True)
 
 

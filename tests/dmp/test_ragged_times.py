@@ -89,7 +89,12 @@ def test_derivatives_of_any_order_and_direction(basis, approach):
             return motion(response, s, x, order)
 
         assert torch.autograd.gradcheck(
-            y, (s, x), atol=1e-6, check_forward_ad=True, check_batched_grad=True
+            y,
+            (s, x),
+            atol=1e-6,
+            check_forward_ad=True,
+            check_batched_grad=True,
+            fast_mode=True,
         )
         assert torch.autograd.gradgradcheck(y, (s, x), atol=1e-4, rtol=1e-3, fast_mode=True)
 
