@@ -1,5 +1,6 @@
 """Taking a thing from a person's hand, whose motion says when and where."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -131,6 +132,27 @@ def test_passes_over_another_movement_and_meets_the_hand(model):
     assert cell.load is not None
 
 
+def test_two_images_in_a_row_make_a_hand_over_certain(model):
+    certain, observed = [True, False, True, True], []
+
+    class Told:
+        kinds = model.kinds
+
+        def observe(self, times, *others):
+            observed.append(times[-1])
+            sure = certain[min(len(observed), len(certain)) - 1]
+            handed = [float(sure == (kind == "hand over")) for kind in self.kinds]
+            return replace(model.observe(times, *others), probability=torch.tensor(handed))
+
+    cell = Cell([(1.0, 1.0, np.array([0.3, 0.4, 0.33]) + BESIDE)])
+    taker = receiving(cell, Told(), timeout=1.5)
+    with pytest.raises(MissedGraspError):
+        taker.receive(ITEM)
+    receipt = taker.receipt
+    assert receipt.seen - receipt.set_off == pytest.approx(observed[3])
+    assert receipt.passed_over == 0
+
+
 @shapes_unchecked()
 def test_closes_on_nothing_as_often_as_told(model):
     met = np.array([0.2, 0.5, 0.25])
@@ -180,6 +202,23 @@ def test_movements_are_cut_from_rest_to_rest_of_a_body_that_stands():
     assert 2.8 < moving[-1] < 3.4
     assert np.ptp(np.diff(moving)) < 1e-9
     assert watch.times == []
+
+
+@pytest.mark.parametrize("images", [4, 5])
+@pytest.mark.parametrize(
+    ("hand", "body", "moves"),
+    [(1.02, 0.0, True), (0.98, 0.0, False), (3.0, 0.98, True), (3.0, 1.02, False)],
+)
+def test_a_displacement_is_twice_that_of_the_mean_of_half_the_images(images, hand, body, moves):
+    """The middle one of an odd number of images counts in neither half."""
+    config = ReceivingConfig()
+    watch, along = MovementWatch(config, 0, 1), np.array([0.0, 0.0, config.motion_threshold])
+    steps = np.arange(images)
+    shift = np.where(2 * steps == images - 1, 0.9, 0.5 * (2 * steps > images - 1))
+    for time, part in zip(config.window * steps / (images - 1), shift, strict=True):
+        seen_now = seen(time, REST + part * hand * along, REST + part * body * along)
+        moving = watch.see(seen_now)
+    assert moving == moves
 
 
 @pytest.mark.parametrize("leaves", [True, False])

@@ -94,6 +94,27 @@ def test_outside_the_box_the_excess_decays_at_the_rate_on_any_side(detected, axi
     _, gradient = goals.position.feedback(wall + beyond)
     torch.testing.assert_close(-gradient, -CONFIG.rate * beyond, rtol=5e-3, atol=1e-9)
     assert not goals.position.feedback(wall - beyond)[1].any()
+    # So does the excess over the tolerated angle.
+    turn = torch.zeros(3, dtype=torch.float64)
+    turn[axis] = side
+    for excess in (-1e-3, 1e-3):
+        tilted = quaternion.multiply(
+            quaternion.exp((CONFIG.angle + excess) * turn), above.orientation
+        )
+        _, gradient = goals.orientation.feedback(tilted)
+        expected = CONFIG.rate * max(excess, 0.0) * turn
+        torch.testing.assert_close(gradient, expected, rtol=5e-3, atol=1e-9)
+
+
+def test_lengths_of_a_hand_scale_with_it_but_no_heights_above_the_table():
+    half = CONFIG.scaled(0.5)
+    (a, b, c), (d, e, f) = CONFIG.half_size, CONFIG.acquisition_half_size
+    assert half.half_size == pytest.approx((a / 2, b / 2, c))
+    assert half.acquisition_half_size == pytest.approx((d / 2, e / 2, f))
+    assert (half.height_tolerance, half.probe) == pytest.approx(
+        (CONFIG.height_tolerance / 2, CONFIG.probe / 2)
+    )
+    assert CONFIG.scaled(1.0) == CONFIG
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -199,9 +220,13 @@ def test_a_turn_waits_where_it_would_move_the_marker_out_of_the_image(law, pixel
     ("pixel", "missing", "out"),
     [
         ((700.0, 500.0), 5.0, False),
-        ((700.0, 1000.0), 0.5, False),
-        ((700.0, 1000.0), 1.5, True),
-        ((100.0, 500.0), 1.5, True),
+        ((700.0, 1000.0), CONFIG.lost_after, False),
+        ((700.0, 1000.0), CONFIG.lost_after + 1e-3, True),
+        # Marker's distance from the border: at most twice the least of a target.
+        ((2 * CONFIG.border, 500.0), 1.5, True),
+        ((2 * CONFIG.border + 1, 500.0), 1.5, False),
+        ((700.0, IMAGE_SIZE[1] - 2 * CONFIG.border), 1.5, True),
+        ((700.0, IMAGE_SIZE[1] - 2 * CONFIG.border - 1), 1.5, False),
         ((np.nan, np.nan), 1.5, True),
     ],
 )
