@@ -1,5 +1,6 @@
 """Single steps of a grasp on stand-ins of the cell: paths, heights, attempts, refusals."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -286,6 +287,33 @@ def test_a_grasp_is_tried_three_times_and_each_mishap_is_noted(made, misses, att
     assert notes.count("missed grasp") == misses
     tries = min(misses + 1, 3)
     assert notes.count("object not detected") == (tries if wait > 0.3 else 0)
+
+
+@dataclass
+class Target:
+    posture: Any = "above"
+
+
+@pytest.mark.parametrize(
+    ("time", "off", "postures"),
+    [(0.0, 9.0, ["above"]), (2.0, 1.99, ["above"]), (2.0, 2.01, ["above", None])],
+)
+def test_after_time_for_a_person_it_servos_again_if_it_was_pushed_away(
+    made, time, off, postures
+):
+    """Errors are multiples of the tolerance."""
+    servoed, held = [], []
+    error = off * made._config.servo.tolerance
+    made._servo = lambda job, target: servoed.append(target.posture)
+    made.servo.hold = lambda target, duration: held.append(duration)
+    made.servo.error = lambda target: error
+    made.locate, made.close_on, made.lift = lambda item: Target(), lambda item: None, list
+    job: Any = GraspJob(item=SimpleNamespace(name="box"), time_for_person=time)
+    made.grasp(job)
+    assert servoed == postures
+    assert held == [time] * (time > 0)
+    assert job.time_for_person == 0.0  # another attempt gives none
+    assert job.pixel_error == error
 
 
 @pytest.mark.parametrize(
