@@ -7,8 +7,8 @@ Jerk is that of the planned joint positions. `--replay` carries out the actions 
 a program of its own: Parquet in, MuJoCo's servos, success by the height of the object and the
 contacts of both fingers.
 
-    bench_multiply.py five --attempts 50 --json outputs/multiply.json
-    bench_multiply.py five --replay thousand --attempts 200
+    bench_multiply.py --dataset five --attempts 50 --json outputs/multiply.json
+    bench_multiply.py --dataset five --replay thousand --attempts 200
 """
 
 import json
