@@ -89,8 +89,7 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
         console.print(f"note: the {better} model predicts {channel} instead of the mean")
     for channel in channels:
         motions.require(channel)
-        made = predict(model, channel, motions, demos)
-        errors[channel] = motions.error(channel, made)
+        errors[channel] = motions.error(channel, predict(model, channel, motions, demos))
         figures |= errors[channel].summary(channel)
         console.print(_table(channel, demos, errors[channel]))
     if args.out is not None:

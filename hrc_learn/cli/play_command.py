@@ -86,8 +86,7 @@ def _target(model: FittedModel, words: Sequence[str], option: str) -> Target:
     except ValueError:
         raise ValueError(f"{option} episode needs one number, such as: episode 2") from None
     made_by = fitted_from(model.folder)
-    demos = open_demos(made_by["dataset"], episodes=[episode], **as_fitted(made_by))
-    (demo,) = demos
+    (demo,) = open_demos(made_by["dataset"], episodes=[episode], **as_fitted(made_by))
     row = 0 if option == "--start" else -1
     columns = {
         "joints": demo.joint_position if model.joint is not None else None,

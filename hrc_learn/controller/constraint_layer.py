@@ -379,8 +379,7 @@ def constrained_velocity(
         return within, ConstraintReport(slowed=zero, violation=zero, solved=solved)
 
     basis = _unit_cost_directions(J, task, config)
-    rows = _limit_rows(basis, gradient, m, config)
-    change = least_change(rows, least, most, config.steps)
+    change = least_change(_limit_rows(basis, gradient, m, config), least, most, config.steps)
     y, solved = change.point, change.solved
     u = wanted + matmul(y[..., None, :-1], basis).squeeze(-2)
     # Without a solution the arm brakes towards zero; the clamp also removes rounding of the

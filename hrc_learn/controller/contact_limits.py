@@ -126,9 +126,7 @@ class SeparationConfig:
         check_settings(self, positive=["deceleration"], not_negative=terms, one_of=one_of)
 
     def protective_distance(
-        self,
-        speed: Float[Tensor, "*batch"],
-        human_speed: Float[Tensor, "*batch"] | None = None,
+        self, speed: Float[Tensor, "*batch"], human_speed: Float[Tensor, "*batch"] | None = None
     ) -> Float[Tensor, "*batch"]:
         """S_p = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r [m].
 
@@ -237,8 +235,7 @@ def contact_speed(
         separation: Surface, reaction time and deceleration of the arm.
     """
     config, T, a = separation.contact, separation.reaction_time, separation.deceleration
-    table = _TABLE.like(inverse_mass)[region]
-    force, pressure, stiffness, mass, _ = table.unbind(-1)
+    force, pressure, stiffness, mass, _ = _TABLE.like(inverse_mass)[region].unbind(-1)
     k = 1e3 / (1 / stiffness + 1 / config.padding)
     F = config.used * torch.minimum(force, pressure * config.area)
     free = _TRANSIENT * F * ((1 / mass + inverse_mass) / k).sqrt()

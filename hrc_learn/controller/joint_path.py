@@ -321,8 +321,7 @@ def _return_goals(
     # Short lists are padded with the first sample.
     k = torch.where(k <= last, k, 0)
     others = paths.position[path.expand_as(k), k]
-    far = (others - joint_position).norm(dim=-1)
-    order = far.argsort(dim=0, stable=True)
+    order = (others - joint_position).norm(dim=-1).argsort(dim=0, stable=True)
     others = others.gather(0, order.unsqueeze(-1).expand_as(others))
     samples = k.gather(0, order).to(progress.dtype)
     here = paths.interpolated(paths.position, path, progress)

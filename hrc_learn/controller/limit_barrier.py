@@ -385,8 +385,7 @@ class SpeedBarrier(nn.Module):
     def _turning(self, R: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Sum over i, j of R_max(i,j) x_i y_j, computed from partial sums up to each joint."""
         up_to_x, up_to_y = ((v.unsqueeze(-2) * self.distal.mT).sum(-1) for v in (x, y))
-        pairs = x * up_to_y + y * up_to_x - x * y
-        return torch.linalg.vecdot(R, pairs.unsqueeze(-2))
+        return torch.linalg.vecdot(R, (x * up_to_y + y * up_to_x - x * y).unsqueeze(-2))
 
 
 def _peak(M: Tensor, gamma: Tensor) -> Tensor:

@@ -448,8 +448,7 @@ class SafetyFilter(nn.Module):
 
     def _stopping(self, given: _Inputs) -> Tensor:
         """The velocity after one step of the hardest possible braking to rest [rad/s]."""
-        still = torch.zeros_like(given.command)
-        return self._limit_acceleration(given, still, given.bounds)[0]
+        return self._limit_acceleration(given, torch.zeros_like(given.command), given.bounds)[0]
 
     def _easing(self, given: _Inputs) -> Tensor:
         """The velocity after one step of gentle braking, as in the speed barrier [rad/s]."""

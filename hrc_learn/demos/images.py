@@ -243,8 +243,7 @@ def thumbnails(
     # The images are evenly spaced; an episode has at most one per frame.
     count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
     frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})
-    size = thumbnail_size(*reader.size(camera))
-    found = reader.stream(demo.episode, camera, frames, size)
+    found = reader.stream(demo.episode, camera, frames, thumbnail_size(*reader.size(camera)))
     time = np.interp(frames, np.linspace(0, last, len(demo)), demo.time)
     return CameraImages("jpeg", time, tuple(jpeg(image) for _, image in found))
 

@@ -78,10 +78,7 @@ class IOLayout:
     """
 
     def __init__(
-        self,
-        fields: Sequence[Field],
-        batch: Sequence[int],
-        dtype: torch.dtype = torch.float64,
+        self, fields: Sequence[Field], batch: Sequence[int], dtype: torch.dtype = torch.float64
     ):
         self.fields, self.batch, self.dtype = tuple(fields), tuple(batch), dtype
         # Batch axes of a tensor, and of a vector.

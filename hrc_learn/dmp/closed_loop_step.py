@@ -159,10 +159,7 @@ def numpy_step(
 
 
 def uncoupled_step(
-    state: DMPState,
-    dt: float,
-    response: Response,
-    weights: Float[Tensor, "*#batch D N"],
+    state: DMPState, dt: float, response: Response, weights: Float[Tensor, "*#batch D N"]
 ) -> DMPState | None:
     """`step` for one motion without coupling, computed with NumPy in a third of the time.
 

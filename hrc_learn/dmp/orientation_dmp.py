@@ -361,10 +361,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         twist = via_values(velocity, now, "velocity", columns=E.stop)
         error, rate = _via_errors(self.reference, now[..., E], rotation, twist[..., P.stop :])
         place, body = via_values(place, now[..., P]), via_values(None, now[..., B])
-        return (
-            torch.cat([place, error, body], -1),
-            torch.cat([twist[..., P], rate, body], -1),
-        )
+        return torch.cat([place, error, body], -1), torch.cat([twist[..., P], rate, body], -1)
 
     @classmethod
     def restore[S: "OrientedPrimitive"](cls: type[S], saved: SavedModel) -> S:

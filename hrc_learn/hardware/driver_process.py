@@ -211,9 +211,7 @@ def opened[Driver](connection: Connection, open_driver: Callable[[], Driver]) ->
 
 
 def answer_calls(
-    connection: Connection,
-    carry_out: Callable[..., object],
-    news: Callable[[], int] = int,
+    connection: Connection, carry_out: Callable[..., object], news: Callable[[], int] = int
 ) -> None:
     """Answer calls until the calling process closes the connection or dies.
 

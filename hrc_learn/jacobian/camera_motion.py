@@ -182,10 +182,7 @@ def _reference(
     points = torch.cat([marker_points(camera, demo.seen()[0]) for demo in demonstrations])
     lower, upper = (tuple(corner.tolist()) for corner in (points.amin(0), points.amax(0)))
     return CameraReference(
-        camera=tuple(camera.tolist()),
-        threshold=threshold,
-        lower=lower,
-        upper=upper,
+        camera=tuple(camera.tolist()), threshold=threshold, lower=lower, upper=upper
     )
 
 
@@ -329,9 +326,7 @@ def camera_placements(
         CameraPlacement(
             episodes=tuple(index[i] for i in group),
             motion=CameraMotion.of(
-                camera,
-                _median(twists[group]) - first,
-                torch.cat([points[i] for i in group]),
+                camera, _median(twists[group]) - first, torch.cat([points[i] for i in group])
             ),
         )
         for group in groups

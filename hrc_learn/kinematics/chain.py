@@ -61,7 +61,7 @@ def transform_and_jacobian(
     frame = _product(frame, tip)
     point = [row[3] for row in frame]
     linear = [
-        axis if slide else _cross(axis, _minus(point, o))
+        axis if slide else _cross(axis, [x - y for x, y in zip(point, o, strict=True)])
         for axis, o, slide in zip(axes, origins, slides, strict=True)
     ]
     angular = [[zero] * 3 if s else axis for axis, s in zip(axes, slides, strict=True)]
@@ -98,16 +98,8 @@ def _turned(frame: list[_Row], cosine: Tensor, sine: Tensor) -> list[_Row]:
     return [[x * cosine + y * sine, y * cosine - x * sine, z, p] for x, y, z, p in frame]
 
 
-def _minus(a: _Row, b: _Row) -> _Row:
-    return [x - y for x, y in zip(a, b, strict=True)]
-
-
 def _cross(a: _Row, b: _Row) -> _Row:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def _matrix(rows: list[_Row]) -> Tensor:
@@ -358,9 +350,7 @@ class SerialChain:
         return frames
 
     def _screw_jacobian(
-        self,
-        frames: Float[Tensor, "*batch some 3 4"],
-        tip: Float[Tensor, "*batch 3 4"],
+        self, frames: Float[Tensor, "*batch some 3 4"], tip: Float[Tensor, "*batch 3 4"]
     ) -> Float[Tensor, "*batch 6 some"]:
         """Jacobian of a tip: column i is the twist of the tip at unit speed of joint i.
 

@@ -407,7 +407,8 @@ def separation(
     arm_radius, links = arm.radius.to(q), arm.links
     if grasped is not None:
         box, fraction = _nearest_on_box(frames[..., -1, :, :], ends, grasped)
-        arm_point = _stacked(arm_point, box)
+        box = box[..., None, :, :].expand(*arm_point.shape[:-3], 1, -1, -1)
+        arm_point = torch.cat([arm_point, box], dim=-3)
         t = torch.cat([t, fraction[..., None, :].expand(*t.shape[:-2], 1, -1)], dim=-2)
         person_point = _between(other.expand(*t.shape, 2, 3), t)
         arm_radius = torch.nn.functional.pad(arm_radius, (0, 1))
@@ -438,11 +439,6 @@ def _between(segment: Tensor, fraction: Tensor) -> Tensor:
     """Point at a fraction of a segment."""
     first, second = segment.unbind(-2)
     return first + fraction.unsqueeze(-1) * (second - first)
-
-
-def _stacked(points: Tensor, last: Tensor) -> Tensor:
-    """Append one row (*batch, H, 3) to points (*batch, C, H, 3)."""
-    return torch.cat([points, last[..., None, :, :].expand(*points.shape[:-3], 1, -1, -1)], -3)
 
 
 def _nearest_on_box(tool: Tensor, ends: Tensor, box: GraspedBox) -> tuple[Tensor, Tensor]:

@@ -46,9 +46,7 @@ class MassMatrix:
         self._turns = Constant((~slides)[:, None, None].double())
 
     def __call__(
-        self,
-        q: Float[Tensor, "*batch joints"],
-        load: Float[Tensor, "*#batch"] | float = 0.0,
+        self, q: Float[Tensor, "*batch joints"], load: Float[Tensor, "*#batch"] | float = 0.0
     ) -> Float[Tensor, "*batch joints joints"]:
         """Mass matrix at joint positions [kg m^2]; rows of sliding joints in kg and kg m.
 

@@ -317,11 +317,7 @@ def _in_rows(pose: Pose, batch: Sequence[int]) -> Pose:
 
 
 def _step(
-    chain: SerialChain,
-    goal: Pose,
-    q: Tensor,
-    task: TaskSpace,
-    wish: Tensor | None = None,
+    chain: SerialChain, goal: Pose, q: Tensor, task: TaskSpace, wish: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Joint positions after one iteration, and the error before it [m, rad]."""
     error, J = task_error_and_jacobian(chain, q, goal, task)
@@ -437,9 +433,7 @@ def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor,
 
 
 def arm_angle_and_motion(
-    chain: SerialChain,
-    q: Float[Tensor, "*batch 7"],
-    jacobian: Float[Tensor, "*batch 6 7"],
+    chain: SerialChain, q: Float[Tensor, "*batch 7"], jacobian: Float[Tensor, "*batch 6 7"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 7"]]:
     """`arm_angle`, and the joint motion that turns it at 1 rad/s with the tool at rest.
 

@@ -405,10 +405,7 @@ def _tool(
         place = origin + ((place - origin) @ direction) * direction
     f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
     tool = Tool(
-        points=points,
-        descriptors=tracks.descriptors[agrees],
-        place=place,
-        optics=(f, u, v, k),
+        points=points, descriptors=tracks.descriptors[agrees], place=place, optics=(f, u, v, k)
     )
     return tool, camera
 

@@ -115,11 +115,7 @@ def play_path(
 
 
 def play_on_arm(
-    model: FittedModel,
-    robot: Arm,
-    start: Target | None,
-    goal: Target,
-    duration: float | None,
+    model: FittedModel, robot: Arm, start: Target | None, goal: Target, duration: float | None
 ) -> PlayedMotion:
     """Motion of an arm within its limits, from rest to rest.
 

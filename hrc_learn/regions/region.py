@@ -265,9 +265,7 @@ class VisionRegion(Region):
 
     @classmethod
     def inside_image(
-        cls,
-        target: Float[Tensor, "*batch rows"],
-        image_size: tuple[int, int],
+        cls, target: Float[Tensor, "*batch rows"], image_size: tuple[int, int]
     ) -> VisionRegion:
         """Largest ellipse around the target that stays inside the image.
 

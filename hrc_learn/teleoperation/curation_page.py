@@ -56,12 +56,7 @@ class CurationPage:
         url: Address of the page, including its secret.
     """
 
-    def __init__(
-        self,
-        ranking: Ranking,
-        out: Path,
-        address: AddressConfig | None = None,
-    ):
+    def __init__(self, ranking: Ranking, out: Path, address: AddressConfig | None = None):
         """Read the decisions made so far and bind the server to its port.
 
         Args:

@@ -95,10 +95,7 @@ class ScriptedPerturbation(Human):
     """Person whose only input is pulling the arm at given times."""
 
     def __init__(
-        self,
-        chain: SerialChain,
-        forces: Sequence[ScriptedForce],
-        begin: float | None = 0.0,
+        self, chain: SerialChain, forces: Sequence[ScriptedForce], begin: float | None = 0.0
     ):
         """Prepare the script.
 
@@ -211,11 +208,7 @@ class ScriptedExpert(Human):
     """
 
     def __init__(
-        self,
-        chain: SerialChain,
-        path: GuidedPath,
-        orientation: Orientation,
-        tremor: Tremor,
+        self, chain: SerialChain, path: GuidedPath, orientation: Orientation, tremor: Tremor
     ):
         """Prepare the script.
 

@@ -248,9 +248,7 @@ class _Posture:
         return cls(jacobian=jacobian, elbow=elbow, null=basis[len(jacobian) :].T)
 
     def explained(
-        self,
-        torque: Float[np.ndarray, " joints"],
-        unknown: Float[np.ndarray, "joints joints"],
+        self, torque: Float[np.ndarray, " joints"], unknown: Float[np.ndarray, "joints joints"]
     ) -> tuple[Explanation, Explanation]:
         """Explain torques [N m] by a force at the elbow, and by a load of the end effector."""
         forces, moments = np.full(3, _PUSHES), np.full(3, _MOMENTS)

@@ -289,10 +289,7 @@ def page_templates(package: str = "hrc_learn.viz") -> Any:
     from jinja2 import Environment, PackageLoader
 
     return Environment(
-        loader=PackageLoader(package, ""),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=PackageLoader(package, ""), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
 
 
