@@ -186,7 +186,8 @@ class AdaptiveController(nn.Module):
             joint_region: Region within the joint limits; default: from the arm's limits.
 
         Raises:
-            ValueError: The arm has too few joints for the goals.
+            ValueError: The arm has too few joints for the goals, or the estimator's feature has
+                another number of points than the goals' target.
         """
         super().__init__()
         self.chain = arm
@@ -227,6 +228,12 @@ class AdaptiveController(nn.Module):
 
     def _check_task(self, goals: Goals) -> None:
         task, n = goals.task, len(self.chain.joint_names)
+        wanted, seen = goals.vision.target.shape[-1], self.estimator.network.rows
+        if wanted != seen:
+            raise ValueError(
+                f"the goals' target has {wanted} coordinates, the estimator's feature {seen}: "
+                "pass u and v of each point as target (with_vision(False) then ignores them)"
+            )
         if task == "pose" and n < 6 and not self._nearest:
             left = self.null_space_dimension("position+axis")
             raise ValueError(

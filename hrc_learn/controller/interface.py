@@ -185,8 +185,9 @@ class Goals:
         Args:
             centre: Centre of the box for the tool centre point [m].
             orientation: Orientation of the tool, a unit quaternion (w, x, y, z).
-            target: Target of the feature in the image [px], u and v of each of its points; None
-                switches vision feedback off.
+            target: Target of the feature in the image [px], u and v of each of its points. None
+                stands for one point and switches vision feedback off; with several points,
+                `with_vision(False)` does.
             half_size: Half edges of the box [m].
             image_size: Width and height of the image [px].
             task: Controlled part of the tool pose: all of it, position and z axis, or position.

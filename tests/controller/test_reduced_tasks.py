@@ -12,7 +12,7 @@ from unchecked import shapes_unchecked
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
+from hrc_learn.jacobian import FixedEstimator, KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, task_rank
 
 pytestmark = pytest.mark.simulation
@@ -191,3 +191,22 @@ def test_a_pose_of_five_joints_is_refused(five):
     q = torch.zeros(5, dtype=DOUBLE)
     with pytest.raises(ValueError, match="needs six joints"):
         controller.step(controller.initial_state(q), observe(q, goals=goals))
+
+
+def test_a_target_of_another_number_of_points_is_refused():
+    """Also without a target: the image's middle is one point."""
+    four = RBFImageJacobian.from_jacobian(torch.ones(8, 6), paper_grid(), 0.1)
+    one = Goals.at(CENTRE, DOWN)
+    with pytest.raises(
+        ValueError, match="target has 2 coordinates, the estimator's feature 8:"
+    ):
+        AdaptiveController(panda, FixedEstimator(four), one)
+    target = torch.full((8,), 500.0, dtype=DOUBLE)
+    goals = Goals.at(CENTRE, DOWN, target).with_vision(False)
+    controller = AdaptiveController(panda, FixedEstimator(four), goals)
+    state = controller.initial_state(panda.ready)
+    feature = torch.full((8,), 9.0, dtype=DOUBLE)
+    moved, _ = controller.step(state, observe(panda.ready, feature=feature))
+    assert moved.joint_velocity.isfinite().all()
+    with pytest.raises(ValueError, match="has 2 coordinates"):
+        controller.step(state, observe(panda.ready, feature=feature, goals=one))
