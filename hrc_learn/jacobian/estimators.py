@@ -507,6 +507,10 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             bias, weight = self.config.bias_std, self.config.weight_std
             neurons = weight_covariance(network.centers, bias, weight)
             covariance = torch.block_diag(*[neurons] * 6)
+        else:  # from px per metre of the fit's rotations to px per metre of this filter's
+            scale = component_scale(covariance, network.rotation_scale) / self.scale
+            scale = scale.repeat_interleave(len(network.centers))
+            covariance = scale * covariance * scale[:, None]
         covariance = (covariance + covariance.mT) / 2  # exactly symmetric
         self.register_buffer("first_covariance", covariance, persistent=False)
         # All neurons drift equally; the six components drift independently.

@@ -67,6 +67,8 @@ class RBFImageJacobian(nn.Module):
     covariance: Tensor | None
     """Posterior covariance of the weights of one image row, (6 K, 6 K) in (component, neuron)
     order, with rotation scaled to metres (`rotation_scale`); None if not fitted."""
+    rotation_scale: float = 0.15
+    """Length by which `covariance` converts rotations, that of the fit [m/rad]."""
     camera: Tensor | None
     """Vector of the camera and its marker (see `perspective`), (13,); None: no camera."""
     camera_covariance: Tensor | None
@@ -182,7 +184,7 @@ class RBFImageJacobian(nn.Module):
         rows = mean.mT.unflatten(-1, (6, -1))  # (2, 6, K)
         scale = component_scale(rows, config.rotation_scale)
         network.weight.data = (rows * scale[:, None]).flatten(0, 1)
-        network.covariance = covariance
+        network.covariance, network.rotation_scale = covariance, config.rotation_scale
         network.report = report
         return network.to(neurons.centers.dtype)
 
@@ -237,14 +239,11 @@ class RBFImageJacobian(nn.Module):
             self._inputs(r), self.centers, self.width, normalized=self.normalized
         )
 
-    def uncertainty(
-        self, r: Pose | Float[Tensor, "*batch 6"], rotation_scale: float = 0.15
-    ) -> Float[Tensor, "*batch 6"]:
+    def uncertainty(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
         """Posterior standard deviation of each column of J_s_hat, larger value of both rows.
 
         Args:
             r: Pose, as for `forward`.
-            rotation_scale: `rotation_scale` of the fit's configuration [m/rad].
 
         Raises:
             ValueError: The network was not fitted.
@@ -257,7 +256,7 @@ class RBFImageJacobian(nn.Module):
         blocks = self.covariance.unflatten(0, (6, -1)).unflatten(-1, (6, -1))
         blocks = blocks.diagonal(dim1=0, dim2=2)  # (K, K, 6)
         variance = torch.einsum("...k,klj,...l->...j", theta, blocks, theta)
-        variance = variance.clamp_min(0) * component_scale(variance, rotation_scale) ** 2
+        variance = variance.clamp_min(0) * component_scale(variance, self.rotation_scale) ** 2
         if self.camera is not None and self.camera_covariance is not None:
             pose, batch = _frames(r)
             # Steps of one standard deviation along independent directions.
@@ -277,6 +276,7 @@ class RBFImageJacobian(nn.Module):
             "units": _UNITS,
             "input_indices": list(self.input_indices),
             "normalized": self.normalized,
+            "rotation_scale": self.rotation_scale,
             "report": None if self.report is None else asdict(self.report),
         }
         write_model(folder, _KIND, config, self.state_dict())
@@ -304,6 +304,8 @@ class RBFImageJacobian(nn.Module):
             raise saved.invalid(error) from error
         if "covariance" in saved.tensors:
             network.covariance = saved.tensor("covariance")
+        # Older files have the default.
+        network.rotation_scale = saved.config.get("rotation_scale", network.rotation_scale)
         return network
 
     def _inputs(self, r: Pose | Tensor) -> Tensor:

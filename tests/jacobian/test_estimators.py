@@ -19,6 +19,7 @@ from hrc_learn.jacobian import (
     CompositeConfig,
     CompositeEstimator,
     FixedEstimator,
+    ImageJacobianFitConfig,
     KalmanConfig,
     KalmanEstimator,
     Measurement,
@@ -448,6 +449,23 @@ def test_kalman_filter_starts_from_the_fit():
     network = RBFImageJacobian.fit(image_demonstrations(poses, x), RBFCenters.paper())
     state = KalmanEstimator(network).initial_state(2)
     assert_close(state.covariance[1], network.covariance)
+
+
+def test_a_filter_converts_rotations_of_the_fit_by_its_own_lever_arm():
+    """The covariance in px/rad is that of the fit, whatever length each counts with."""
+    poses = wander(300, 4, rng=generator(26))
+    recorded = image_demonstrations(poses, CAMERA.project(poses))
+    config = ImageJacobianFitConfig(rotation_scale=0.3)
+    network = RBFImageJacobian.fit(recorded, RBFCenters.paper(), config)
+    own = KalmanEstimator(network, KalmanConfig(rotation_scale=0.1)).initial_state().covariance
+    fitted, own = (
+        np.outer(size, size) * covariance.numpy()
+        for covariance, size in (
+            (network.covariance, np.repeat([1, 1, 1, 0.3, 0.3, 0.3], 9)),
+            (own, np.repeat([1, 1, 1, 0.1, 0.1, 0.1], 9)),
+        )
+    )
+    np.testing.assert_allclose(own, fitted, rtol=1e-12)
 
 
 @pytest.mark.parametrize("Estimator", ALL)

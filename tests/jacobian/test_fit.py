@@ -96,12 +96,13 @@ def test_posterior_covers_the_truth():
     assert 0.3 < float(z.square().mean().sqrt()) < 2.0
 
 
-def test_uncertainty_is_the_spread_of_the_posterior():
-    network = fit(*record(2, noise=0.5))
+@pytest.mark.parametrize("lever", [0.15, 0.4])
+def test_uncertainty_is_the_spread_of_the_posterior(lever):
+    network = fit(*record(2, noise=0.5), rotation_scale=lever)
     root = torch.linalg.cholesky(network.covariance)
     draws = torch.randn(20_000, root.shape[0], generator=generator(6), dtype=torch.float64)
     rows = (draws @ root.mT).unflatten(-1, (6, 9))
-    rows = rows * torch.tensor([1, 1, 1, 0.15, 0.15, 0.15], dtype=torch.float64)[:, None]
+    rows = rows * torch.tensor([1, 1, 1, lever, lever, lever], dtype=torch.float64)[:, None]
     r = wander(3, rng=generator(7)).vector()
     spread = torch.einsum("njk,tk->ntj", rows, network.basis(r)).std(0)
     # A standard deviation from 20,000 draws is known to half a percent.
@@ -225,7 +226,7 @@ def test_single_demonstration_is_held_out_by_fifths():
 
 
 def test_fit_survives_saving_with_its_uncertainty(tmp_path):
-    network = fit(*record(2, noise=0.5))
+    network = fit(*record(2, noise=0.5), rotation_scale=0.4)
     network.save(tmp_path / "model")
     loaded = RBFImageJacobian.load(tmp_path / "model")
     r = wander(3, rng=generator(10)).vector()
