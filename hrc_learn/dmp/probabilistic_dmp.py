@@ -402,7 +402,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         batch = (value.position if isinstance(value, Pose) else value).shape[:-2]
         if batch:
             densities = [self.log_prob(time, value[i], noise=noise) for i in range(batch[0])]
-            return torch.stack(densities)
+            return torch.stack(densities) if densities else self.mean.new_zeros(batch)
         via = self._via(time, value, None)
         motion = self.primitive.motion
         mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])

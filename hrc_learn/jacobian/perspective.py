@@ -308,9 +308,7 @@ def fit_camera(
     error = pixel - marker_pixels(cameras, pose)[0]
     best = int(error.norm(dim=-1).median(-1).values.nan_to_num(torch.inf).argmin())
     return CameraFit(
-        camera=cameras[best],
-        covariance=torch.linalg.inv(gram[best]),
-        noise=float(noise[best]),
+        camera=cameras[best], covariance=torch.linalg.inv(gram[best]), noise=float(noise[best])
     )
 
 
@@ -537,6 +535,8 @@ def _sampled(
     demonstrations: Sequence[ImageDemonstration],
 ) -> tuple[Pose, Float[Tensor, "frames 2"]]:
     """Poses and pixels of about `_FRAMES` frames with a visible marker, evenly chosen."""
+    if not len(demonstrations):
+        raise ValueError("there are no demonstrations to fit a camera to: record some")
     every = -(-len(demonstrations) // _FRAMES)
     each = -(-_FRAMES // len(demonstrations))
     positions, orientations, pixels = [], [], []

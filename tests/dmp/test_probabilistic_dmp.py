@@ -175,6 +175,12 @@ def test_log_prob_is_that_of_the_gaussian(distribution):
     assert got.item() == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("batch", [(0,), (2, 0), (0, 2)])
+def test_no_motions_have_no_densities(distribution, batch):
+    values = torch.zeros(*batch, 3, 2)
+    assert distribution.log_prob([0.1, 0.2, 0.3], values, noise=0.1).shape == batch
+
+
 def test_conditioning_is_differentiable(distribution):
     def passed(value):
         return distribution.condition([0.7, 1.5], value, noise=0.05).mean

@@ -325,6 +325,8 @@ def test_demonstrations_without_the_marker_are_refused():
     with pytest.raises(ValueError, match="visible in 9 frames"):
         fit_camera([unseen], IMAGE)
     fit_camera([enough], IMAGE)
+    with pytest.raises(ValueError, match="no demonstrations to fit a camera to"):
+        fit_camera([], IMAGE)
 
 
 @pytest.mark.long
