@@ -226,7 +226,8 @@ class MotionTokenizer(nn.Module):
         than a quarter of the range.
 
         Args:
-            ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.
+            ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored. An
+                empty list is one sequence without tokens: the coarsest motion.
             time: Time since the start [s], (T,) or (*batch, T), at any sampling rate. After
                 its end, a motion rests.
             start: (*batch, D); by default the mean start, or the encoded one.
@@ -321,7 +322,7 @@ class MotionTokenizer(nn.Module):
         Raises:
             ValueError: A token that is not in the vocabulary.
         """
-        if isinstance(ids, Sequence) and any(isinstance(row, Sequence) for row in ids):
+        if isinstance(ids, Sequence) and any(map(np.ndim, ids)):
             rows, batch = [[int(i) for i in row] for row in ids], (len(ids),)
         else:
             tokens = to_tensor(ids).long()
@@ -394,7 +395,8 @@ class ActionProcessor:
         """Tokens of chunks (B, T, D), or of one (T, D)."""
         chunks = to_tensor(action_chunk).double()
         chunks = chunks.reshape(-1, *chunks.shape[-2:])
-        ids = self.tokenizer.encode(np.arange(chunks.shape[1]), chunks).tolist()
+        frames = np.arange(chunks.shape[1])
+        ids = self.tokenizer.encode(frames, chunks).tolist() if len(chunks) else []
         return [row[: self.tokenizer.length(row)] for row in ids]
 
     def decode(
@@ -406,7 +408,8 @@ class ActionProcessor:
     ) -> Float[np.ndarray, "B T D"]:
         """Chunks of `time_horizon` frames, by default T, from any tokens."""
         frames = np.arange(time_horizon or self.time_horizon)
-        return self.tokenizer.decode([list(row) for row in tokens], frames).numpy()
+        ids = [list(row) for row in tokens] or torch.zeros(0, 0)  # no chunks, no motion
+        return self.tokenizer.decode(ids, frames).numpy()
 
     def save_pretrained(self, save_directory: str | Path) -> None:
         """Write the tokenizer's folder."""

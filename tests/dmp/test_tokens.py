@@ -372,6 +372,8 @@ def test_processors_keep_fasts_interface(processor, tmp_path):
     loaded = ActionProcessor.from_pretrained(tmp_path / "processor")
     assert (loaded.vocab_size, loaded.time_horizon, loaded.action_dim) == (VOCABULARY, 21, 3)
     assert np.array_equal(loaded.decode(tokens), made)
+    assert processor.decode([]).shape == (0, 21, 3)
+    assert processor(chunks[:0]) == []
 
 
 def test_a_processor_has_the_accuracy_of_fasts_scale():
@@ -756,3 +758,12 @@ def test_batches_of_any_shape_are_learned_and_no_sequences_decode_to_no_motions(
     assert flat.encode(time, y).tolist() == nested.encode(time, y).tolist()
     none = tokenizer.decode(np.zeros((0, 4), int), time)
     assert none.shape == (0, len(time), 3)
+    # Like a tokenizer of words: an empty list is one sequence, the motion of no components.
+    torch.testing.assert_close(tokenizer.decode([], time), tokenizer.decode([0], time))
+
+
+def test_sequences_of_different_length_may_be_tensors_or_arrays(tokenizer):
+    rows = [[3, 5, 7], [9]]
+    expected = tokenizer.decode(rows, TIME)
+    for kind in (torch.tensor, np.array):
+        torch.testing.assert_close(tokenizer.decode([kind(r) for r in rows], TIME), expected)
