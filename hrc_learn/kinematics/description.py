@@ -159,7 +159,8 @@ class Description:
 
         Raises:
             ValueError: A name is used twice, a joint names a link that does not exist, a link
-                has two parents, joints form a cycle, or parts are 100 m or more apart.
+                has two parents, joints form a cycle or mimic each other in one, or parts are
+                100 m or more apart.
         """
         if not links:
             raise ValueError(f"{path} has no links: is it complete, and is its xacro expanded?")
@@ -182,6 +183,17 @@ class Description:
                 f"{path}: link {cycle[0]} is its own ancestor (joint "
                 f"{self._above[cycle[0]].name}): the joints form a cycle, but a robot is a tree"
             )
+        leaders = {joint.name: joint.follows[0] for joint in joints if joint.follows}
+        for name in leaders:
+            row = [name]
+            while row[-1] in leaders and row[-1] not in row[:-1]:
+                row.append(leaders[row[-1]])
+            if row[-1] in row[:-1]:
+                first, *others = row[row.index(row[-1]) :]
+                raise ValueError(
+                    f"{path}: joint {first} follows {', which follows '.join(others)}: let one "
+                    "of them move by itself (remove its <mimic>, or the <equality>)"
+                )
 
     def _check_names(self, what: str, names: Sequence[str]) -> None:
         if len(set(names)) < len(names):

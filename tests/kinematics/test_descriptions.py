@@ -204,6 +204,16 @@ REFUSED = {
         changed(joint(3), joint(3, more='<mimic joint="j2"/>')),
         "j3 only follows j2",
     ),
+    "own leader": (
+        ARM + TOOL + jaw("left", "a").replace("</joint>", '<mimic joint="left"/></joint>'),
+        "joint left follows left: let",
+    ),
+    "ring of leaders": (
+        ARM + TOOL
+        + jaw("left", "a").replace("</joint>", '<mimic joint="right"/></joint>')
+        + jaw("right", "b").replace("</joint>", '<mimic joint="left"/></joint>'),
+        "joint left follows right, which follows left: let",
+    ),
     "negative mass": (
         changed('<link name="l2"/>', f'<link name="l2">{LIGHT}</link>'),
         "link l2 has the negative mass -1 kg",
