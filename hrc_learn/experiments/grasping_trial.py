@@ -46,6 +46,8 @@ _OBJECT_REACH = (0.10, 0.08, 0.0)
 # Distance of the start from the joint limits [rad], and smallest height of the end effector
 # there [m].
 _LIMIT_MARGIN, _START_HEIGHT = 0.02, 0.15
+_MOST_STARTS = 200
+"""Largest number of random joint positions that are tried as a start."""
 START_DISTANCE = 0.35
 """Smallest distance of the end effector at the start from its goal [m]."""
 
@@ -98,6 +100,9 @@ class GraspingScene:
             rng: Random generator.
             camera: Kind of camera that checks if the object is hidden.
             imperfections: Imperfections of arm, calibration, camera and object; None: none.
+
+        Raises:
+            ValueError: The camera sees the object from no start, or no start has a free path.
         """
         scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
         # A separate generator, so that the scenes do not depend on the imperfections.
@@ -118,7 +123,11 @@ class GraspingScene:
                 return cls(
                     workplace=workplace, start=start, object_pose=pose, imperfections=drawn
                 )
-        raise AssertionError("the sequence of starts is endless")
+        raise ValueError(
+            f"from none of {_MOST_STARTS} random starts does the camera see the object and a "
+            "free path lead home: turn the camera to the table (scene.random_camera=false keeps"
+            " it in place), or move table and cabinet away from the arm"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +238,7 @@ def _starts(
     """Joint positions [rad] with the end effector high enough, and far enough from its goal."""
     limits, hover = workplace.robot.chain.limits, workplace.hover().position
     lower, upper = limits.lower + _LIMIT_MARGIN, limits.upper - _LIMIT_MARGIN
-    while True:
+    for _ in range(_MOST_STARTS):
         q = rng.uniform(lower, upper)
         tool = workplace.robot.chain.forward(torch.from_numpy(q)).position
         size = workplace.robot.hand_size

@@ -150,6 +150,16 @@ def test_a_scene_is_remote_unhurt_and_seen():
     assert 0 < tilt < 0.25
 
 
+def test_a_camera_that_never_sees_the_object_is_named():
+    scene = WORKPLACE.scene
+    pose = scene.camera.pose @ np.diag([1.0, -1, -1, 1])  # upwards
+    blind = replace(scene, camera=replace(scene.camera, pose=pose))
+    with pytest.raises(ValueError, match=r"does the camera see the object .* turn the camera"):
+        GraspingScene.draw(
+            replace(WORKPLACE, scene=blind), GraspingSceneConfig(), np.random.default_rng(0)
+        )
+
+
 def test_a_roll_turns_the_image_about_its_middle(grasp):
     camera, shown = grasp.scene.workplace.scene.camera, WORKPLACE.scene.camera
     point = WORKPLACE.hover().position.numpy()
