@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
 from hrc_learn.experiments.run_recorder import film, record
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, LiveView, Observer
-from hrc_learn.experiments.trials import Trial, TrialRun, repeat
+from hrc_learn.experiments.trials import Trial, TrialFile, TrialRun, repeat
 from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import MotionLog, PhysicsError, World
@@ -190,11 +190,14 @@ def run_experiment[Run: ExperimentRun](
         observer = replace(observer, view=view)
     # Next to the folder, which exists only after the run, so that interrupted trials resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
+    made_by: dict[str, Any] = asdict(study.trial)  # pyright: ignore[reportArgumentType]
+    if options.trials and trial_file.exists():  # refuse other settings before the run
+        TrialFile(trial_file, made_by).release()
     try:
         with new_folder(options.out, configuration, options.overwrite) as folder:
             with console.status(f"{experiment.title}: running"):
                 run = experiment.run(options.seed, observer)
-            trials = _run_trials(study, trial_file, options) if options.trials else []
+            trials = _run_trials(study, trial_file, made_by, options) if options.trials else []
             results = evaluate_all(experiment, run, options.seed, trials)
             with console.status("Writing recordings and report"):
                 parts = _write_recordings(folder, experiment, run, options.film)
@@ -265,12 +268,12 @@ def live_view(title: str, on_open: Callable[[str], None]) -> LiveView:
     return watch
 
 
-def _run_trials(study: Study, file: Path, options: RunOptions) -> list[Trial]:
+def _run_trials(study: Study, file: Path, made_by: dict, options: RunOptions) -> list[Trial]:
     return repeat(
         study.trial,
         range(options.seed, options.seed + options.trials),
         file,
-        made_by=asdict(study.trial),  # pyright: ignore[reportArgumentType]
+        made_by=made_by,
         processes=options.processes,
         failures=(TaskFailedError, PhysicsError),
         title=study.title,

@@ -206,6 +206,25 @@ def test_negative_numbers_of_trials_are_refused_before_anything_runs(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_trials_with_other_settings_are_refused_before_anything_runs(tmp_path, monkeypatch):
+    options, seeds = RunOptions(out=tmp_path / "run", trials=2, film=False), []
+
+    def run(self, seed, observer=UNOBSERVED):
+        seeds.append(seed)
+        if len(seeds) == 2:
+            raise KeyboardInterrupt
+        return Throw(self.target)
+
+    monkeypatch.setattr(ThrowExperiment, "run", run)
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(ThrowExperiment(), options)
+    with pytest.raises(
+        ValueError, match=r"run\.trials\.jsonl holds trials with other settings"
+    ):
+        run_experiment(ThrowExperiment(target=2.0), options)
+    assert seeds == [0, 0]
+
+
 def test_an_older_run_is_replaced_only_on_request(tmp_path, work):
     work(ThrowExperiment())
     with pytest.raises(FileExistsError):
