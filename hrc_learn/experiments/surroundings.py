@@ -103,6 +103,8 @@ _ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
 # Distance that people keep from a resting arm that they see, the thickness of a sleeve [m];
 # time between checks of this distance [s]; and workers drawn until one can reach and keep it.
 _KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 200
+# Drawn workers of whom at least one can reach under the arm: where there is room, one in three.
+_HOPELESS = 30
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
 # push creep.
 _AT_REST = 0.01
@@ -222,10 +224,12 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
     lengths = (origins[1:] - origins[:-1]).norm(dim=-1)
     # The forearm is the last long link.
     elbow = int((lengths > lengths.max() / 2).nonzero()[-1])
-    x, y, _ = origins[elbow : elbow + 2].mean(dim=0).tolist()
+    x, y, z = origins[elbow : elbow + 2].mean(dim=0).tolist()
     (a, b, c), (half_a, half_b, half_c) = table.centre, table.half_size
     bench = replace(table, centre=(b, -a, c), half_size=(half_b, half_a, half_c))
-    for _ in range(_DRAWS):
+    number, reached = 0, False
+    while number < (_DRAWS if reached else _HOPELESS):
+        number += 1
         worker = Worker(WorkerConfig.draw(rng))
         radius = torch.from_numpy(worker.radius)
 
@@ -247,13 +251,15 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
             )
         except ValueError:
             continue  # for example, the arm is in the way of a small person
+        reached = True
         on_the_way = np.arange(visit.begin, visit.end, _CHECKED_EVERY)
         if is_clear(visit.capsules_at(on_the_way).ends):
             return visit.turned(np.pi / 2)
     raise ValueError(
-        f"none of {_DRAWS} workers can reach under the arm that waits over "
-        f"({workplace.table_centre[0]:g}, {workplace.table_centre[1]:g}) m: move the table's "
-        "centre away from the arm's base."
+        f"none of {number} workers can reach under the arm that waits over "
+        f"({workplace.table_centre[0]:g}, {workplace.table_centre[1]:g}) m, its forearm "
+        f"{z - c - half_c:.2f} m above the table: move the table's centre away from the arm's "
+        "base, or choose an arm with a higher elbow (panda, ur5e, iiwa7 or gen3)."
     )
 
 

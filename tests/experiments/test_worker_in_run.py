@@ -178,7 +178,7 @@ def test_a_worker_reaches_under_the_forearm_of_any_arm(monkeypatch):
     monkeypatch.setattr(surroundings, "random_visit", random_visit)
     monkeypatch.setattr(Workplace, "hover_joints", lambda place: robot.ready)
     scene = replace(WORKPLACE.scene, arm=ArmModelConfig(robot=robot))
-    with pytest.raises(ValueError, match="none of 200 workers"):
+    with pytest.raises(ValueError, match=r"none of 30 workers .* its forearm 0\.\d+ m above"):
         draw_visit(replace(WORKPLACE, scene=scene), np.random.default_rng(0))
     world = World(scene)
     world.reset(robot.ready.numpy())
