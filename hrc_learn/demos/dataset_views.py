@@ -59,10 +59,10 @@ class DatasetArm:
             return None
         if self.gripper.unit in ("%", "1"):
             return np.clip(demo.gripper, 0.0, 1.0)
-        travel = sum(
-            abs(f.opened - f.closed) for f in self.arm.shape.gripper if f.kind == "prismatic"
-        )
+        fingers = [f for f in self.arm.shape.gripper if f.kind == "prismatic"]
+        travel = sum(abs(f.opened - f.closed) for f in fingers)
         width = _FRANKA_WIDTH if self.arm.is_franka else travel
+        width *= self.gripper.si_unit == "m"  # of an angle, the data tell
         return np.clip(demo.gripper / (width or max(demo.gripper.max(), 1e-9)), 0.0, 1.0)
 
 

@@ -41,7 +41,7 @@ class Demonstration:
     orientation: Float64[np.ndarray, "_frames _wxyz"] | None = None
     """Unit quaternion (w, x, y, z), its sign continuous along the demonstration."""
     gripper: Float64[np.ndarray, " _frames"] | None = None
-    """Opening of the gripper [m], or 0 to 1 if the robot reports no width."""
+    """Opening of the gripper [m], or 0 to 1 or an angle [rad] if the robot reports no width."""
     feature: Float64[np.ndarray, "_frames _uv"] | None = None
     """Image feature (u right, v down) [px]; undefined where `feature_visible` is False."""
     feature_visible: Bool[np.ndarray, " _frames"] | None = None

@@ -149,12 +149,44 @@ def test_velocities_follow_the_unit_of_positions(role, unit):
     assert decisions[role].factor == pytest.approx(math.pi / 180)
 
 
-@pytest.mark.parametrize("unit", ["%", "1"])
+@pytest.mark.parametrize(
+    ("unit", "factor", "si_unit"),
+    [("%", 1e-2, "1/s"), ("1", 1.0, "1/s"), ("1.5 deg", 1.5 * math.pi / 180, "rad/s")],
+)
 @pytest.mark.parametrize("role", ["joint_velocity", "command_velocity"])
-def test_velocities_of_joints_given_as_a_share_keep_their_own_unit(role, unit):
-    decisions = decided({role: 1.0, "joint_position": 90.0}, {"joint_position": unit})
-    assert decisions[role].unit == "rad/s"
-    assert decisions[role].evidence == ""
+def test_velocities_of_joints_given_as_a_share_are_shares_per_second(
+    role, unit, factor, si_unit
+):
+    decision = decided({role: 1.0, "joint_position": 90.0}, {"joint_position": unit})[role]
+    assert (decision.unit, decision.si_unit) == (f"{unit}/s", si_unit)
+    assert decision.factor == pytest.approx(factor)
+
+
+def test_velocities_follow_each_joint_and_finger():
+    joints = ColumnSelection(
+        role="joint_position", columns=(("q", 0), ("q", 1)), labels=("a", "b")
+    )
+    rates = ColumnSelection(
+        role="joint_velocity", columns=(("v", 0), ("v", 1)), labels=("a", "b")
+    )
+    stated = {"joint_position": ("deg", "%")}
+    decision = decide_units({"joint_position": joints, "joint_velocity": rates}, {}, stated)
+    np.testing.assert_allclose(decision["joint_velocity"].factor, [math.pi / 180, 1e-2])
+
+
+def test_commands_of_joints_given_as_a_share_are_shares():
+    peaks = {"command_position": 1.0, "joint_position": 1.0}
+    assert decided(peaks, {"joint_position": "1"})["command_position"].si_unit == "1"
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("deg", math.pi / 180), ("rad", 1.0)])
+def test_a_gripper_that_names_an_angle_keeps_its_unit(unit, factor):
+    selection = ColumnSelection(
+        role="gripper", columns=(("s", 0),), labels=("gripper",), units=(unit,)
+    )
+    decision = decide_units({"gripper": selection}, {}, {})["gripper"]
+    assert (decision.unit, decision.si_unit) == (unit, "rad")
+    assert decision.factor == pytest.approx(factor)
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,10 @@ _SCALED = re.compile(r"(?:(-?\d+\.?\d*(?:e-?\d+)?) )?(.+?)(/step)?")
 """Unit with an optional factor: 1.1 deg for -100..100 of a calibrated motor, 0.05 rad/step for
 scaled commands that are added to the joint positions."""
 
-_FOLLOWERS = ("joint_velocity", "command_position", "command_velocity")
-"""Quantities that take over the unit of the joint positions if nothing is declared."""
 _JOINTS = ("joint_position", "command_position")
+_RATES = ("joint_velocity", "command_velocity")
+_FOLLOWERS = ("command_position", *_RATES)
+"""Quantities that take over the unit of the joint positions if nothing is declared."""
 _GUESSABLE = (*_JOINTS, *unit_evidence.GUESSED_BY_SIZE)
 
 
@@ -100,8 +101,14 @@ class UnitDecision:
 
     @property
     def si_unit(self) -> str:
-        """Unit after the conversion: that of the quantity, or "1" for a fraction of a range."""
-        own = "1" if self.unit in DIMENSIONS["ratio"] else ROLES[self.role].unit
+        """Unit after the conversion: that of the quantity, "1" for a fraction of a range ("1/s"
+        for its rate), or "rad" for a gripper that is measured as an angle.
+        """
+        own, unit = ROLES[self.role].unit, self.unit.removesuffix("/s")
+        if unit in DIMENSIONS["ratio"]:
+            own = "1" + self.unit[len(unit) :]
+        elif self.role == "gripper" and unit in DIMENSIONS["angle"]:
+            own = "rad"
         return own + "/step" * bool(self.steps.any())
 
     @property
@@ -126,9 +133,9 @@ def unit_factor(role: str, unit: str) -> float:
             f"units are given for the unknown quantity {role!r}; known are {', '.join(ROLES)}"
         )
     scaled = _SCALED.fullmatch(unit)
-    known = ("command_position",) if scaled and scaled[3] else _JOINTS
+    known = ("command_position",) if scaled and scaled[3] else (*_JOINTS, *_RATES)
     if role in known and scaled and scaled[2] != unit:
-        return float(scaled[1] or 1) * unit_factor("joint_position", scaled[2])
+        return float(scaled[1] or 1) * unit_factor(role, scaled[2])
     options = units_of(role)
     if unit not in options:
         raise DatasetError(
@@ -139,12 +146,14 @@ def unit_factor(role: str, unit: str) -> float:
 
 def units_of(role: str) -> dict[str, float]:
     """Units of a quantity and their factors, without the units per step of commands."""
+    if role in _RATES:
+        return {f"{unit}/s": factor for unit, factor in units_of("joint_position").items()}
     own = ROLES[role].unit
     options = next(units for units in DIMENSIONS.values() if own in units)
-    if role in ("gripper", "joint_position", "command_position"):
-        # Grippers and hands report a fraction of their opening, hobby arms a fraction of
-        # their range. Sliding fingers report metres.
-        options = options | DIMENSIONS["ratio"] | {"m": 1.0}
+    if role in ("gripper", *_JOINTS):
+        # Grippers and hands report an angle or a fraction of their opening, hobby arms a
+        # fraction of their range. Sliding fingers report metres.
+        options = options | DIMENSIONS["ratio"] | DIMENSIONS["angle"] | {"m": 1.0}
     return options
 
 
@@ -195,7 +204,7 @@ def decide_units(
 
 def _named_units(selection: ColumnSelection) -> tuple[str, ...]:
     """Unit that the name of each component states, if the quantity can have it; else ""."""
-    rate = "/s" if selection.role.endswith("velocity") else ""
+    rate = "/s" if selection.role in _RATES else ""
     known = units_of(selection.role)
     return tuple(
         next((u for u in (unit, unit.removesuffix("/s") + rate) if unit and u in known), "")
@@ -211,18 +220,15 @@ def _stated(role: str, unit: str | Sequence[str]) -> UnitDecision:
 
 
 def _following(role: str, leader: UnitDecision) -> UnitDecision:
-    """Decision to take over the unit of the leading quantity, if this quantity can have it."""
-    velocity = role.endswith("velocity")
-    unit = leader.unit + "/s" if velocity else leader.unit
-    # A position given as a fraction of its range does not tell the unit of the velocity.
-    followed = leader.unit != "1" and unit in units_of(role)
+    """Decision to take over the unit of the leading quantity, per second for velocities."""
+    rate = "/s" if role in _RATES else ""
     return UnitDecision(
         role=role,
-        unit=unit if followed else ROLES[role].unit,
-        units=() if velocity else leader.units,
+        unit=leader.unit + rate,
+        units=tuple(unit + rate for unit in leader.units),
         confidence=leader.confidence,
         leader=leader.role,
-        evidence=f"that of {leader.role}" if followed or not velocity else "",
+        evidence=f"that of {leader.role}",
     )
 
 
