@@ -465,7 +465,7 @@ HELD_OUT = {
     "ShiZifeng/PICO_TELE_LEROBOT": (
         "so101_follower_dual",
         {f"observation.{k}.pos": Vector(None, [a], [b]) for k, (a, b) in PICO.items()},
-        UNREAD,
+        {"joint_position": "%", "gripper": "%"},
     ),
     "kingdom-of-warriors/microvla": (
         "panda",
@@ -481,7 +481,7 @@ HELD_OUT = {
     "modanqing/ur_pick_merge": (
         "ur5",
         {"joint.state": Vector([*motors(6), "gripper"], UR_LOW, UR_HIGH)},
-        UNREAD,
+        {"joint_position": "rad", "gripper": "1"},
     ),
     "mjuarez4/stack_single_mini": (
         "xarm",

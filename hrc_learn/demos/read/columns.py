@@ -24,7 +24,7 @@ or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the rol
 
 _RANGE = re.compile(r"(.+)\[([^\[\]]*)\]")
 _BOUNDS = re.compile(r"(?=.)(\d{0,9})(:?)(\d{0,9})")
-_STATE_KEYS = ("observation.state", "observation.states", "state", "states")
+_STATE_KEY = re.compile(r"(?:observation\.)?(?:joint[._])?states?")
 _ACTION_KEYS = ("action", "actions")
 _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
 _POSES = ("position", *ORIENTATION_ROLES)
@@ -267,12 +267,20 @@ class _Conventions:
         """Joints that an action names."""
         whole: dict[str, ColumnSelection] = {}
         by_component: dict[str, ColumnSelection] = {}
-        for feature in features.values():
+        # A state of joints comes before a state that may hold anything.
+        for feature in sorted(features.values(), key=lambda f: "joint" not in f.key):
             meanings, known = self._whole_feature(feature), whole
             if meanings is None:
                 meanings, known = self._components(feature), by_component
             for selection in self._grouped(feature, meanings):
-                known.setdefault(selection.role, selection)
+                before = known.setdefault(selection.role, selection)
+                apart = all(features[key].width == 1 for key, _ in before.columns)
+                new = {*selection.labels}.isdisjoint(before.labels)
+                if selection.role in JOINT_FIELDS and feature.width == 1 and apart and new:
+                    # One feature for each joint.
+                    columns = before.columns + selection.columns
+                    labels = before.labels + selection.labels
+                    known[selection.role] = replace(before, columns=columns, labels=labels)
         return by_component | whole
 
     def _whole_feature(self, feature: Feature) -> list[ComponentMeaning | None] | None:
@@ -304,7 +312,7 @@ class _Conventions:
 
     def _components(self, feature: Feature) -> list[ComponentMeaning | None]:
         """Meanings in a feature of mixed content, such as `observation.state`."""
-        mixed = feature.key in (*_STATE_KEYS, *_ACTION_KEYS)
+        mixed = bool(_STATE_KEY.fullmatch(feature.key)) or feature.key in _ACTION_KEYS
         names = feature.names
         if names is None:
             if not mixed:
@@ -318,7 +326,8 @@ class _Conventions:
             # In other features x, y, z may belong to an object: only explicit names count.
             return [
                 meaning
-                if naming.names_joint_quantity(name) or name.lower().startswith("ee")
+                if (naming.names_joint_quantity(name) and not naming.names_no_joint(name))
+                or name.lower().startswith("ee")
                 else None
                 for name, meaning in zip(names, meanings, strict=True)
             ]

@@ -9,6 +9,7 @@ meta/hrc_learn.json                        sidecar (`read.contract`)
 """
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -21,6 +22,7 @@ from jaxtyping import Shaped, UInt8
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH, write_parquet
+from hrc_learn.demos.read.naming import names_joint_quantity, role_of_key
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 NUMERIC = ("float", "int", "uint", "bool")
@@ -28,6 +30,7 @@ NUMERIC = ("float", "int", "uint", "bool")
 # Largest numbers of components and of axes of a numeric column. The force field of a wrist
 # sensor has some hundred components.
 _WIDEST, _MOST_AXES = 100_000, 8
+_WORDS_BEFORE = re.compile(r"^(?:observations?|actions?)[./](?:states?[./])?")
 SIDECAR_PATH = "meta/hrc_learn.json"
 
 
@@ -85,6 +88,10 @@ def read_feature(key: str, declared: dict) -> Feature:
     names = flatten_names(declared.get("names")) if numeric else None
     if names is not None and len(names) != width:
         names = None  # openpi's converters name the vector, not its components
+    own = _WORDS_BEFORE.sub("", key)
+    if numeric and names is None and width == 1 and role_of_key(key) is None:
+        # A feature for each joint: observation.elbow.pos.
+        names = (own,) if names_joint_quantity(own) else None
     return Feature(key=key, dtype=dtype, shape=shape, names=names)
 
 
