@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,11 @@ from hrc_learn.experiments.placing_trial import (
     SimulatedPlacing,
     demonstrated_path,
 )
-from hrc_learn.experiments.run_measures import limit_violations, place_angle
+from hrc_learn.experiments.run_measures import (
+    limit_violations,
+    place_angle,
+    place_pitch_and_yaw,
+)
 from hrc_learn.experiments.run_recorder import demonstrated_joints
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.log import LoggedSteps
@@ -40,6 +45,8 @@ class PlacingOutcome:
     """Horizontal distance of the object on its board from its intended place [m]."""
     place_tilt: float
     """Angle of the object from its intended orientation [rad]."""
+    place_turns: tuple[float, float] | None = None
+    """Its pitch and its yaw [rad]; None with more than five joints."""
     violations: int
     """Steps in which a joint was outside its range of position or velocity."""
     contacts: tuple[Touch, ...]
@@ -59,6 +66,7 @@ class PlacingOutcome:
         # The load crosses the front edge of the boards before the end effector does.
         edge = workplace.scene.cabinet.front + workplace.scene.objects[0].half_size[2]
         error = run.object_pose[:3, 3] - run.goal.position.numpy()
+        turns = place_pitch_and_yaw(run.object_pose, run.goal.orientation)
         speed = np.abs(run.cell.log["joint_velocity"]) / run.cell.chain.limits.velocity.numpy()
         done, demonstrated = (
             log_dimensionless_jerk(time, path)
@@ -68,6 +76,7 @@ class PlacingOutcome:
             deviation=approach_deviation(run.path, run.goal.position.numpy(), shown, edge),
             place_error=float(np.linalg.norm(error[:2])),
             place_tilt=place_angle(run.object_pose, run.goal.orientation),
+            place_turns=turns if scene.skill.robot.task == "nearest pose" else None,
             violations=limit_violations(run.cell),
             contacts=run.contacts,
             peak_speed=float(speed.max()),
@@ -168,6 +177,7 @@ def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
             at_most=PLACE_TILT_DEG,
             essential=True,
         ),
+        *_turn_metrics(),
         never("joint limit violations", count(lambda o: o.violations)),
         never(
             "contacts",
@@ -192,6 +202,19 @@ def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
             at_least=len(shelves),
             essential=True,
         ),
+    ]
+
+
+def _turn_metrics() -> list[Metric[ByShelf]]:
+    """Largest pitch and yaw of the objects; no rows with more than five joints."""
+
+    def largest(outcomes: ByShelf, which: int) -> float | None:
+        turns = [o.place_turns[which] for o in outcomes.values() if o.place_turns]
+        return math.degrees(max(turns)) if turns else None
+
+    return [
+        Metric(f"place {name}", partial(largest, which=k), "deg", at_most=PLACE_TILT_DEG)
+        for k, name in enumerate(("pitch", "yaw"))
     ]
 
 

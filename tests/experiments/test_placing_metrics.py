@@ -64,6 +64,17 @@ def test_pitch_and_yaw_of_a_placed_box_are_turns_about_horizontal_and_vertical(h
         assert place_angle(pose, goal) == pytest.approx(0.02)
 
 
+def test_five_joints_have_rows_for_pitch_and_yaw():
+    keys = {"place_pitch_deg", "place_yaw_deg"}
+    outcomes = dict.fromkeys(SHELVES, GOOD)
+    assert not keys & evaluate(placing_metrics(SHELVES), outcomes).values.keys()
+    outcomes = dict.fromkeys(SHELVES, replace(GOOD, place_turns=(0.02, 0.0)))
+    outcomes["upper"] = replace(GOOD, place_turns=(0.01, 0.03))
+    values = evaluate(placing_metrics(SHELVES), outcomes).values
+    assert values["place_pitch_deg"] == pytest.approx(np.rad2deg(0.02))
+    assert values["place_yaw_deg"] == pytest.approx(np.rad2deg(0.03))
+
+
 TOUCH = Touch(first="box", second="board_middle", start=6.1, end=6.2, depth=0.0121)
 
 
