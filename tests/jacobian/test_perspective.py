@@ -25,6 +25,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.jacobian.perspective import (
     FOCAL,
+    RADIAL,
     CameraFit,
     _cube_rotations,
     _from_prior,
@@ -572,6 +573,14 @@ def test_points_behind_a_camera_have_finite_pixels_far_off():
     far = np.exp(7.0) * np.array([100.0, 200.0]) + [700, 500]
     np.testing.assert_allclose(pixel, np.tile(far, (3, 1)))
     assert bool(slope.isfinite().all())
+    # Derivatives by the camera are those of these pixels, which are linear in the lens.
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(3, 4)
+    _, by_step = marker_pixels(view, Pose(points, upright))
+    lens = torch.zeros_like(view)
+    lens[RADIAL] = 1e-4
+    through, _ = pixels_and_depth(view + lens, points)
+    np.testing.assert_allclose(by_step[..., 3], (through - pixel) / 1e-4, rtol=1e-9)
+    np.testing.assert_allclose(by_step[..., 0], np.tile(far - [700, 500], (3, 1)))
 
 
 def test_a_camera_is_left_out_of_a_feature():
