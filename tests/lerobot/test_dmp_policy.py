@@ -73,6 +73,15 @@ def test_losses_chunks_and_gradients_whatever_it_sees(episodes):
     assert policy.select_action(now).shape == (2, 2)
 
 
+def test_training_sees_the_first_and_the_present_observation():
+    samples = windows(fitted_policy(SHOWN), SHOWN)
+    seen = samples.batch(torch.arange(len(samples)))
+    for key in (STATE, GOAL):
+        present = torch.cat([e[key] for e in SHOWN])
+        first = torch.cat([e[key][:1].expand_as(e[key]) for e in SHOWN])
+        torch.testing.assert_close(seen[key], torch.stack([first, present], dim=1))
+
+
 def test_padding_is_not_learned():
     policy = fitted_policy(SHOWN)
     samples = windows(policy, SHOWN)

@@ -350,6 +350,25 @@ def test_padding_is_not_learned():
     torch.testing.assert_close(policy.forward(batch)[0], loss, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("most", [50_000, 150])
+def test_the_closed_form_counts_each_frame_or_evenly_spaced_ones(monkeypatch, most):
+    """Against a loop over frames; a chunk that ends after its episode repeats the last action."""
+    module = "hrc_learn.lerobot.policy.motion_chunk_policy"
+    monkeypatch.setattr(f"{module}.MOST_CHUNKS", most)
+    policy, chunks = chunk_policy(SHOWN), []
+    for episode in SHOWN:
+        coordinates = policy.encoding.to_coordinates(episode["action"])
+        last = len(coordinates) - 1
+        for k in range(len(coordinates)):
+            ahead = [min(k + j, last) for j in range(policy.decoder.samples)]
+            chunks.append(coordinates[ahead])
+    counted = torch.stack(chunks[:: math.ceil(len(chunks) / most)])
+    assert len(counted) <= most
+    coefficients = policy.decoder.project(counted)
+    torch.testing.assert_close(policy.network.mean, coefficients.mean(0))
+    torch.testing.assert_close(policy.network.spread, coefficients.std(0))
+
+
 def test_training_takes_up_what_the_closed_form_leaves():
     """Goals in the cube root of what is seen: no straight line fits, the network does."""
     bent = [e | {GOAL: e[GOAL].sign() * e[GOAL].abs() ** 3} for e in SHOWN]
