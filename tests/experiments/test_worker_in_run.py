@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from hrc_learn.controller import SeparationConfig
+from hrc_learn.controller.contact_limits import ContactLimits, region_numbers
 from hrc_learn.experiments import surroundings
 from hrc_learn.experiments.surroundings import (
     draw_visit,
     near_worker,
     worker_contacts,
 )
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda, separation
 from hrc_learn.kinematics.registry import arm
 from hrc_learn.log import StepLog
@@ -27,7 +29,7 @@ from hrc_learn.sim import (
 )
 from hrc_learn.sim.arm_model import ArmModelConfig
 from hrc_learn.sim.worker import PARTS, REGIONS
-from hrc_learn.sim.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace, gripper_down
 from hrc_learn.skills.grasping import as_load
 
 WORKPLACE = Workplace()
@@ -109,6 +111,40 @@ def test_contacts_within_the_limits_need_no_margin_those_of_the_head_do():
     assert (both >= apart).all()
     assert (both > apart + 0.05).sum() > 5
     np.testing.assert_array_equal(margins("ssm+pfl", ("head",) * len(REGIONS)), apart)
+
+
+@pytest.mark.simulation
+def test_force_of_contacts_grows_with_the_speed_of_both_and_is_zero_without_contact():
+    """By differences of distances, relative to the speed at which a contact reaches its limit."""
+    arm, rng, log, steps, h = whole_arm(SCENE.arm), np.random.default_rng(2), StepLog(), 24, 1e-6
+    time = VISIT.begin + np.linspace(3.0, 3.2, steps)
+    hand = torch.from_numpy(VISIT.capsules_at(time[:1]).ends[0, HAND].mean(axis=0))
+    there = WORKPLACE.robot.inverse(Pose(hand, gripper_down()), near=WORKPLACE.hover_joints())
+    wide = np.where(np.arange(steps) < 12, 0.04, 0.5)[:, None]  # near his hand, anywhere
+    q = there.numpy() + wide * rng.standard_normal((steps, 7))
+    v = 0.4 * rng.standard_normal((steps, 7))
+    for k in range(steps):
+        log.append(time=time[k], joint_position=q[k], joint_velocity=v[k])
+    config = SeparationConfig(mode="ssm+pfl")
+    found = near_worker(log, VISIT, arm, config, encoder_offset=np.zeros(7), loads={}).force
+    whole = replace(config, contact=replace(config.contact, used=1.0))
+    person = VISIT.capsules_at(time)
+    pairs = separation(
+        arm, torch.from_numpy(q), *map(torch.from_numpy, (person.ends, person.radius))
+    )
+    regions, limits = region_numbers(REGIONS), ContactLimits(arm, whole, ())
+    limit = limits.speeds(pairs, torch.from_numpy(q), regions, False).first.numpy()
+    now = distances_at(arm, q, time, None)
+    closing = (now - distances_at(arm, q + h * v, time, None)) / h
+    gone, come = (distances_at(arm, q, time + t, None) for t in (-1e-4, 1e-4))
+    relative = np.maximum(closing + (gone - come) / 2e-4, 0.0)
+    touched, pushed = now <= 0, closing > 0.01
+    with np.errstate(divide="ignore", invalid="ignore"):
+        expected = np.where(touched & pushed, relative / limit, 0.0).max((1, 2))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+    assert (np.isfinite(found) & (found > 0)).sum() > 2
+    assert (touched & ~pushed).any()
+    assert pushed[found == 0].any()
 
 
 @pytest.mark.parametrize("held", [True, False])
