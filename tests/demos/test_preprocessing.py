@@ -481,6 +481,10 @@ def test_motions_keep_a_margin_at_either_end(keep):
     assert np.abs(np.subtract(first, [100 - margin, 300 - margin])).max() <= 8
     assert len(split_at_rest(at_speed(speed), shortest=0.6)) == 1
     assert len(split_at_rest(at_speed(speed), shortest=1.2)) == 0
+    demo, longest = at_speed(speed), split_at_rest(at_speed(speed), keep=0.0)[0]
+    begin = int(np.flatnonzero(demo.time == longest.start_time)[0])
+    duration = demo.time[begin + len(longest) - 1] - demo.time[begin]
+    assert len(split_at_rest(demo, shortest=duration)) == 1
     one = trim_rest(at_speed(speed), keep)
     assert abs(round(100 * one.start_time) - 100 + margin) <= 8
     assert abs(len(one) - 240 - 2 * margin) <= 16
