@@ -116,7 +116,6 @@ class StepLog(LoggedSteps):
         self._dtype: np.dtype | None = None
         # Name, shape of a value, and values of each column of the last block.
         self._columns: list[tuple[str, tuple[int, ...], np.ndarray]] = []
-        self._first = 0  # rows before the last block
 
     def snapshot(self, rows: int | None = None) -> LoggedSteps:
         """View of the present rows, which does not grow.
@@ -182,7 +181,7 @@ class StepLog(LoggedSteps):
         rows = np.zeros(self._block, dtype=self._dtype)
         self._blocks.append(rows)
         self._columns = [(name, rows[name].shape[1:], rows[name]) for name in self.names]
-        self._first = (len(self._blocks) - 1) * self._block
+        self._first = (len(self._blocks) - 1) * self._block  # rows before the last block
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
