@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
@@ -74,6 +75,28 @@ def test_points_that_move_with_a_link_are_found_where_they_are_on_it():
     point, good = _points(tracks_of(pixels), pose, CAMERA, WIDTH)
     assert good.all()
     np.testing.assert_allclose(point, POINTS, atol=2e-4)
+
+
+def test_near_and_far_frames_count_by_the_angles_between_their_lines_of_sight():
+    """Against the least squares of SciPy, with noise too small to be weighed down."""
+    _, position, turns = motion(30)
+    position[::2] -= 0.7 * TURN.inv().apply([0.0, 0.0, 1.0])  # half of them are near the camera
+    pose = Pose(torch.from_numpy(position), torch.from_numpy(turns.as_quat(scalar_first=True)))
+    pixels = projected(position + turns.apply(POINTS[0]))
+    pixels += np.random.default_rng(6).normal(0, 0.05, pixels.shape)
+    plain = cv2.undistortPoints(pixels, MATRIX, np.array([RADIAL, 0, 0, 0]))[:, 0]
+    sight = np.column_stack([plain, np.ones(len(plain))])
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+
+    def angles(point):
+        seen = TURN.apply(position + turns.apply(point)) + SHIFT
+        return np.cross(sight, seen / np.linalg.norm(seen, axis=1, keepdims=True)).ravel()
+
+    expected = least_squares(angles, POINTS[0], x_scale=0.1, xtol=1e-12, ftol=1e-12).x
+    found, _ = _points(tracks_of(pixels[None]), pose, CAMERA, WIDTH)
+    off = np.linalg.norm(expected - POINTS[0])
+    # Frames are weighted by the distance of the link, which is some centimetres from the point.
+    np.testing.assert_allclose(found[0], expected, atol=0.2 * off)
 
 
 @pytest.mark.parametrize(
