@@ -40,10 +40,11 @@ def grasping():
 
 
 def lying(x, y, **others):
-    """A still motion beside a box that lies somewhere, and other places."""
+    """A slow motion from home beside a box that lies somewhere, and other places."""
     pose = np.array([x, y, 0.025, np.cos(0.2), 0.0, 0.0, np.sin(0.2)])
     objects = {"box": pose} | others
-    return Trial(joints=np.tile(HOME, (5, 1)), gripper=np.full(5, 0.08), objects=objects)
+    joints = HOME + 0.02 * np.arange(5)[:, None]
+    return Trial(joints=joints, gripper=np.full(5, 0.08), objects=objects)
 
 
 def test_the_object_is_in_the_gripper_for_placing_and_on_the_table_for_grasping(judge):
