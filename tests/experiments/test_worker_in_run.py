@@ -115,14 +115,9 @@ def test_contacts_within_the_limits_need_no_margin_those_of_the_head_do():
 
 @pytest.mark.simulation
 def test_force_of_contacts_grows_with_the_speed_of_both_and_is_zero_without_contact():
-    """By differences of distances, relative to the speed at which a contact reaches its limit."""
-    arm, rng, log, steps, h = (
-        whole_arm(SCENE.arm),
-        np.random.default_rng(2),
-        StepLog(),
-        24,
-        1e-6,
-    )
+    """By differences of distances, relative to the speed of a contact at its limit."""
+    arm, rng, log = whole_arm(SCENE.arm), np.random.default_rng(2), StepLog()
+    steps, h = 24, 1e-6
     time = VISIT.begin + np.linspace(3.0, 3.2, steps)
     hand = torch.from_numpy(VISIT.capsules_at(time[:1]).ends[0, HAND].mean(axis=0))
     there = WORKPLACE.robot.inverse(Pose(hand, gripper_down()), near=WORKPLACE.hover_joints())

@@ -352,7 +352,7 @@ def test_padding_is_not_learned():
 
 @pytest.mark.parametrize("most", [50_000, 150])
 def test_the_closed_form_counts_each_frame_or_evenly_spaced_ones(monkeypatch, most):
-    """Against a loop over frames; a chunk that ends after its episode repeats the last action."""
+    """Against a loop over frames; a chunk longer than its episode repeats the last action."""
     module = "hrc_learn.lerobot.policy.motion_chunk_policy"
     monkeypatch.setattr(f"{module}.MOST_CHUNKS", most)
     policy, chunks = chunk_policy(SHOWN), []
