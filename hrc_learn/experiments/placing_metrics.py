@@ -76,7 +76,7 @@ class PlacingOutcome:
             deviation=approach_deviation(run.path, run.goal.position.numpy(), shown, edge),
             place_error=float(np.linalg.norm(error[:2])),
             place_tilt=place_angle(run.object_pose, run.goal.orientation),
-            place_turns=turns if scene.skill.robot.task == "nearest pose" else None,
+            place_turns=turns if workplace.robot.task == "nearest pose" else None,
             violations=limit_violations(run.cell),
             contacts=run.contacts,
             peak_speed=float(speed.max()),
