@@ -44,7 +44,8 @@ def to_tensor(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Convert like `torch.as_tensor`; arrays may be read-only or have negative strides.
+    """Convert like `torch.as_tensor`; arrays may be read-only or have negative strides or any
+    byte order.
 
     Raises:
         ValueError: Values that are not real numbers, or booleans where `dtype` is floating.
@@ -54,7 +55,7 @@ def to_tensor(
     if isinstance(values, np.ndarray):
         if values.dtype.kind not in "biuf":
             raise ValueError(f"expected real numbers, got an array of {values.dtype}")
-        values = np.require(values, requirements=["C", "W"])
+        values = np.require(values, values.dtype.newbyteorder("="), ["C", "W"])
     tensor = torch.as_tensor(values)
     if tensor.is_complex() or (tensor.dtype == torch.bool and dtype in FLOATING):
         raise ValueError(f"expected real numbers, got {tensor.dtype}")

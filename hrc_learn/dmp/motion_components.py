@@ -138,6 +138,8 @@ class MotionComponents(nn.Module):
         Raises:
             ValueError: A wrong number of columns, more than P parameters, or bad times.
         """
+        if order not in (0, 1, 2):
+            raise ValueError(f"order must be 0, 1 or 2, got {order}")
         polygon, duration = self.polygon(parameters, start, start_velocity)
         s = seconds(time, polygon.device) / duration[..., None]
         y = spline(s.clamp(max=1), self.points, order) @ polygon

@@ -19,6 +19,7 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
+    check_not_negative,
     positive,
     seconds,
     to_tensor,
@@ -29,6 +30,7 @@ from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES, MotionPrimitive
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
 from hrc_learn.dmp.pose_dmp import PoseDMP
+from hrc_learn.dmp.samples import expanded
 from hrc_learn.dmp.via_points import ViaPoints
 from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel, write_model
@@ -303,7 +305,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         mean, root = self._observe(torch.cat([H[:, 0], H[:, 1] / tau]))
         wanted = torch.cat([via.position, via.rate / tau]).reshape(-1)
         given = ~wanted.isnan()
-        deviation = positive("noise", noise, mean).expand_as(via.position)
+        deviation = positive("noise", noise, mean)
+        deviation = expanded("noise", deviation, via.position.shape, via.position)
         deviation = deviation.repeat(2, 1).reshape(-1)[given]
         # Rows are in units of the noise. The unknowns z are factors on the columns of the
         # spread, with a unit Gaussian as prior.
@@ -519,6 +522,7 @@ def _linear_coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D 
 
 def _free_forcing(primitive: LinearPrimitive, slack: float) -> Float[Tensor, "DM DN"]:
     """Spread of independent weights that makes the forcing vary equally at all times."""
+    check_not_negative("slack", slack)
     basis, amplitude = primitive.basis, primitive.amplitude.detach().double()
     D, N = len(amplitude), basis.count
     unit = 1 / basis.phase(basis.centre_times().to(amplitude))

@@ -173,9 +173,9 @@ def padded(time: Any, mask: Mask | None, *columns: Any) -> tuple[Any, Mask | Non
         return time, mask, list(columns)
     parts = [None if x is None else [to_tensor(row) for row in x] for x in columns]
     lengths = [len(x) for x in first]
-    if not isinstance(time, list | tuple) or not hasattr(time[0], "shape"):
+    if not isinstance(time, list | tuple) or not any(map(np.ndim, time)):
         time = [time] * len(first)
-    parts.append([to_tensor(row) for row in time])
+    parts.append([to_tensor(row, torch.float64) for row in time])
     valid = [torch.ones(n, dtype=torch.bool) for n in lengths]
     if mask is not None:
         valid = [to_tensor(row).bool() for row in mask]
@@ -227,13 +227,13 @@ def check_samples(
             "(T,) and (T, D)"
         )
     *batch, T, D = position.shape
-    time = _expand("time", time, (*batch, T), position)
+    time = expanded("time", time, (*batch, T), position)
     complete = mask is None
     if mask is None:
         mask = torch.ones_like(time, dtype=torch.bool)
     else:
         mask = to_tensor(mask, device=time.device).bool()
-        mask = _expand("mask", mask, (*batch, T), position)
+        mask = expanded("mask", mask, (*batch, T), position)
         complete = bool(mask.all())
     if position.numel() == 0:
         raise ValueError(f"{name} has shape {(*batch, T, D)}: there is nothing to fit")
@@ -244,7 +244,7 @@ def check_samples(
     position = _check_finite(name, position.reshape(-1, T, D).mT.contiguous(), mask, batch)
     if velocity is not None:
         velocity = to_tensor(velocity, position.dtype, position.device)
-        velocity = _expand("velocity", velocity, (*batch, T, D), position)
+        velocity = expanded("velocity", velocity, (*batch, T, D), position)
         velocity = velocity.reshape(-1, T, D).mT.contiguous()
         velocity = _check_finite("velocity", velocity, mask, batch)
     s, duration = _normalised(time, mask, complete, batch)
@@ -285,13 +285,14 @@ def _floating(values: Points) -> Tensor:
     return to_tensor(tensor, dtype)  # refuses booleans, which are no positions
 
 
-def _expand(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:
+def expanded(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:
+    """Values in this shape; ValueError, with the shape of `position`, if they do not fit."""
     try:
         return values.expand(shape)
     except RuntimeError:
         raise ValueError(
             f"{name} has shape {tuple(values.shape)}, position {tuple(position.shape)}: "
-            f"{name} must be {shape}, where leading axes may be left out"
+            f"{name} must be {tuple(shape)}, where leading axes may be left out"
         ) from None
 
 

@@ -30,7 +30,7 @@ from hrc_learn.dmp._arguments import (
     to_tensor,
 )
 from hrc_learn.dmp.motion_components import MARGIN, MotionComponents
-from hrc_learn.dmp.samples import Samples, check_samples, padded
+from hrc_learn.dmp.samples import Samples, check_samples, expanded, padded
 from hrc_learn.dmp.token_code import END, HEADROOM, TokenCode
 from hrc_learn.model_files import SavedModel, write_model
 
@@ -145,7 +145,8 @@ class MotionTokenizer(nn.Module):
         smooth = [i for i in range(y.shape[-1]) if i not in chosen]
         velocity = None
         if start_velocity is not None:
-            velocity = checked_vector("start_velocity", start_velocity, y[:, 0])[:, smooth]
+            velocity = checked_vector("start_velocity", start_velocity, y[:, 0])
+            velocity = expanded("start_velocity", velocity, y[:, 0].shape, y[:, 0])[:, smooth]
         parts = replace(samples, position=samples.position[:, smooth])
         accuracy = REPRESENTED * tolerance
         units = _units(seen[:, smooth])
@@ -196,6 +197,8 @@ class MotionTokenizer(nn.Module):
         Raises:
             ValueError: Shapes that differ from the fit's, or values that are not finite.
         """
+        if length is not None and length < 0:
+            raise ValueError(f"length must not be negative, got {length}")
         samples = _samples(time, motion)
         z = self._encoded(samples, start_velocity).reshape(len(samples.s), -1)
         bits, config = self._code.bits()[self._own :], self.config
@@ -322,10 +325,10 @@ class MotionTokenizer(nn.Module):
         Raises:
             ValueError: A token that is not in the vocabulary.
         """
-        if isinstance(ids, Sequence) and any(map(np.ndim, ids)):
+        if isinstance(ids, Sequence) and {*map(np.ndim, ids)} == {1}:
             rows, batch = [[int(i) for i in row] for row in ids], (len(ids),)
         else:
-            tokens = to_tensor(ids).long()
+            tokens = torch.atleast_1d(to_tensor(ids)).long()
             batch = tokens.shape[:-1]
             rows = tokens.reshape(batch.numel(), tokens.shape[-1]).tolist()
         wrong = {i for row in rows for i in row if not 0 <= i < self.vocabulary_size}

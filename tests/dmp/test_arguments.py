@@ -98,6 +98,8 @@ def test_numbers_are_converted_without_a_copy_where_none_is_needed():
     assert arguments.to_tensor(backwards).tolist() == [5, 3, 1]
     backwards.flags.writeable = False
     assert arguments.to_tensor(backwards, torch.float32).tolist() == [5, 3, 1]
+    foreign = np.array([1.5, 2.0], dtype=">f8")  # as instruments on a network write them
+    assert arguments.to_tensor(foreign).tolist() == [1.5, 2.0]
     assert arguments.to_tensor(np.array([True, False])).tolist() == [True, False]
     assert arguments.to_tensor([True], torch.int64).tolist() == [1]
     for wrong in ([True, False], np.zeros(2, bool)):

@@ -202,6 +202,13 @@ def test_what_cannot_be_is_refused(distribution):
         distribution.condition([0.5], [0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="non-negative"):
         distribution.position([-1.0])
+    with pytest.raises(ValueError, match=r"noise has shape \(3,\), .* must be \(1, 2\)"):
+        distribution.condition([0.5], [[0.0, 0.0]], noise=[0.1, 0.1, 0.1])
+    for slack in (float("nan"), -1.0):
+        with pytest.raises(ValueError, match="slack must be finite and not negative"):
+            ProbabilisticDMP.fit(JointDMP.fit(time, both), slack=slack)
+        with pytest.raises(ValueError, match="slack must be finite and not negative"):
+            ProbabilisticDMP.around(JointDMP.fit(time, position), slack=slack)
 
 
 def test_a_known_duration_conditions_before_the_ends(distribution):

@@ -55,6 +55,8 @@ def test_what_is_no_list_of_arrays_stays():
     assert position.shape == (2, 5, 3)
     one_grid, _, _ = padded(times[0], None, motions)
     np.testing.assert_array_equal(one_grid, np.stack([times[0]] * 2))
+    listed, _, _ = padded([t.tolist() for t in times], None, motions)
+    np.testing.assert_array_equal(listed, np.stack(times))
     for columns in ([], [1.0, 2.0], np.stack(motions), [np.float64(1), np.float64(2)]):
         assert padded(times, None, columns)[2][0] is columns
     with pytest.raises(ValueError, match=r"have \[5, 5\] samples, but time, mask or another"):

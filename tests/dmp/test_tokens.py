@@ -767,3 +767,24 @@ def test_sequences_of_different_length_may_be_tensors_or_arrays(tokenizer):
     expected = tokenizer.decode(rows, TIME)
     for kind in (torch.tensor, np.array):
         torch.testing.assert_close(tokenizer.decode([kind(r) for r in rows], TIME), expected)
+    torch.testing.assert_close(tokenizer.decode([[[9]], [[0]]], TIME)[0, 0], expected[1])
+    torch.testing.assert_close(tokenizer.decode(9, TIME), expected[1])  # as in transformers
+
+
+@pytest.mark.parametrize("order", [-1, 3])
+def test_orders_beyond_acceleration_are_refused(tokenizer, order):
+    with pytest.raises(ValueError, match=f"order must be 0, 1 or 2, got {order}"):
+        tokenizer.decode([1, 2], TIME, order=order)
+
+
+def test_a_negative_length_is_refused_and_one_velocity_starts_all_motions(tokenizer):
+    y = motions(12)[0]
+    with pytest.raises(ValueError, match="length must not be negative, got -1"):
+        tokenizer.encode(TIME, y, length=-1)
+    one, all_ = (
+        MotionTokenizer.fit(TIME, y, start_velocity=velocity)
+        for velocity in (np.ones(3), np.ones((12, 3)))
+    )
+    torch.testing.assert_close(one.components.prediction, all_.components.prediction)
+    with pytest.raises(ValueError, match=r"start_velocity has shape \(5, 3\), .* be \(12, 3\)"):
+        MotionTokenizer.fit(TIME, y, start_velocity=np.ones((5, 3)))
