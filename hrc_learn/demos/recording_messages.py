@@ -132,8 +132,7 @@ def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, T
             at = np.maximum(np.searchsorted(own, times, side="right") - 1, 0)
             poses = np.stack([one[k if frame in moving else -1][2] for k in at]) @ poses
         received, stamps, _ = map(list, zip(*main, strict=True))
-        name = f"tf/{base}/{tip}"
-        paths[name] = Topic(received=received, stamps=stamps, values=[*poses])
+        paths[f"tf/{base}/{tip}"] = Topic(received=received, stamps=stamps, values=[*poses])
     return paths
 
 

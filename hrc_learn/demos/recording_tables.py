@@ -120,8 +120,7 @@ def _parsed(
     from pyarrow.csv import ConvertOptions, ParseOptions, ReadOptions, read_csv
 
     text = io.StringIO()
-    writer = csv.writer(text, delimiter="\t")
-    writer.writerows(fields)
+    csv.writer(text, delimiter="\t").writerows(fields)
     comma = bool(re.search(r"\d,\d", text.getvalue()))
     options = {
         "read_options": ReadOptions(column_names=names, use_threads=False),

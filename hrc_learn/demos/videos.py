@@ -266,8 +266,7 @@ def rgb_image(image: Any, size: tuple[int, int] | None = None) -> Image:
     height, width = size or (image.height, image.width)
     # PyAV caches a reformatter. A process that is forked after its first use, such as a data
     # loader, lacks its threads and would wait for them forever: make a new one.
-    rgb = VideoReformatter().reformat(image, width, height, "rgb24")
-    return rgb.to_ndarray()
+    return VideoReformatter().reformat(image, width, height, "rgb24").to_ndarray()
 
 
 def subsampled(image: Image) -> Image:

@@ -89,8 +89,7 @@ def export_step(
 def _compile(step: PackedStep, observation: StepObservation, folder: Path) -> None:
     """Write machine code, header and description of a step."""
     few, fewer = _few_arms(step, observation)
-    dtype = step.layouts.state.dtype
-    program = scalar_program(trace(few, fewer), dtype)
+    program = scalar_program(trace(few, fewer), step.layouts.state.dtype)
     lanes = lanes_of(np.dtype(program.number)) if step.layouts.state.batch else 1
     native = NativeCode(program, StepLayouts._fields, lanes)
     (folder / CODE).write_bytes(assemble(native.text))

@@ -142,8 +142,7 @@ def _restored_state(dmp: MotionPrimitive, tensors: Tensors) -> Any:
     """State from its tensors; the inverse of `state_tensors`."""
     columns = DMPState(**{name: tensors[name] for name in STATE})
     # The frame of orientations, of moving goals, or None for joints.
-    frame = tensors.get("reference", tensors.get("goal_velocity"))
-    return dmp.state_of(columns, frame)
+    return dmp.state_of(columns, tensors.get("reference", tensors.get("goal_velocity")))
 
 
 def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:

@@ -208,5 +208,4 @@ def _smooth_deviations(
     modes = vectors[:, -MODES:] * values[-MODES:].clamp(min=0).sqrt()
     motions = (size[:, :, None] * modes).mT.reshape(-1, len(s), 1)
     x = dmps.refit(s, motions).coordinates().detach().view(F, MODES, -1)
-    eye = torch.eye(D).to(x)
-    return torch.einsum("frm,de->fdmre", x, eye).flatten(-2)
+    return torch.einsum("frm,de->fdmre", x, torch.eye(D).to(x)).flatten(-2)

@@ -160,8 +160,7 @@ class InteractionPrimitive:
         spread = model.spread.view(*model.mean.shape, -1)[: self.observed]
         seen = ~values.isnan().flatten()
         root = torch.einsum("gnm,hmr->gnhr", rows, spread).flatten(1, 2)[:, seen]
-        known = gaussian(mean.flatten(1)[:, seen], root, noise)
-        return known.log_prob(values.flatten()[seen])
+        return gaussian(mean.flatten(1)[:, seen], root, noise).log_prob(values.flatten()[seen])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

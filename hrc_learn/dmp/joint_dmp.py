@@ -94,8 +94,7 @@ def _fit(
     samples, noise = recorded, None
     if smooth or (smooth is None and not chosen):
         samples, noise = smoothed(recorded)
-    dense = densified(samples, basis.count)
-    fitted = fit_samples(method, response, dense, regularization)
+    fitted = fit_samples(method, response, densified(samples, basis.count), regularization)
     return response, samples, noise, *fitted
 
 

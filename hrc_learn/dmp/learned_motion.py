@@ -137,8 +137,7 @@ def learn(
         n_basis = _basis_count(times, linear)
     options = {"smooth": True, **options}
     tried = APPROACHES if approach is None else (approach,)
-    fits = [fit(n_basis, approach=b, **options) for b in tried]
-    return choose(fits, context, frames)
+    return choose([fit(n_basis, approach=b, **options) for b in tried], context, frames)
 
 
 def choose(

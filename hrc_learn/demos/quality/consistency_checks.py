@@ -132,8 +132,7 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
         for number in np.flatnonzero(odd.any(1)).tolist():
             places = np.flatnonzero(odd[number]).tolist()
-            names = listed(feature.names, places)
-            text = f"is {what} than in the other episodes: {names}"
+            text = f"is {what} than in the other episodes: {listed(feature.names, places)}"
             yield feature.issue(number, text, places, float(len(places)))
 
 

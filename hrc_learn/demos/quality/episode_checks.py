@@ -96,8 +96,7 @@ def episode_length(
     """Report episodes that are too short for a demonstration."""
     seconds = entry.length / folder.fps
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
-        text = f"only {entry.length} frames ({seconds:.2g} s): a false start?"
-        yield entry.warning(text)
+        yield entry.warning(f"only {entry.length} frames ({seconds:.2g} s): a false start?")
 
 
 def recorded_stamps(

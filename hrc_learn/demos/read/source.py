@@ -77,8 +77,7 @@ class OpenedDataset:
                 damaged.
         """
         sidecar = read_sidecar(folder.root)
-        declared = sidecar.selections(folder.features)
-        columns = map_columns(folder.features, mapping, declared)
+        columns = map_columns(folder.features, mapping, sidecar.selections(folder.features))
         return cls(
             folder=folder,
             sidecar=sidecar,

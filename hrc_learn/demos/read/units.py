@@ -366,8 +366,7 @@ def units_from_episodes(
         for role, file in files.items()
         if (own := sizes.get(role)) is not None
     }
-    stated = {**declared, **given, **read}
-    decisions = decide_units(selections, sizes, stated, step, robot_type)
+    decisions = decide_units(selections, sizes, {**declared, **given, **read}, step, robot_type)
     faults = [
         fault
         for role, own in sizes.items()
