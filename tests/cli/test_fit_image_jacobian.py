@@ -40,6 +40,7 @@ def test_it_writes_a_model_like_the_camera_of_the_work_cell(tmp_path):
     options = ("--no-learn", "--json", tmp_path / "values.json")
     output = done("fit", "image-jacobian", tmp_path / "set", "--out", model, *options).output
     assert "held-out error, relative to image motion" in output
+    assert "too few to learn" not in output
     (focal,) = re.findall(r"focal length (\d+) px", output)
     assert int(focal) == pytest.approx(camera.focal[0], rel=0.02)
     metrics = json.loads((model / "metrics.json").read_text())
@@ -61,6 +62,8 @@ def test_it_writes_a_model_like_the_camera_of_the_work_cell(tmp_path):
         assert 0 < median < most < 0.05
         assert 0 < within[0] <= within[1] <= 1
     assert errors["tilted_relative_error_median"] != errors["upright_relative_error_median"]
+    done(*evaluate, "--episodes", "2", "--json", tmp_path / "one.json")
+    assert errors != json.loads((tmp_path / "one.json").read_text())  # another place of poses
     (limited,) = [row for row in outcome.output.splitlines() if " ok " in row]
     assert "upright relative error median" in limited
     assert "0.05" in limited
