@@ -1,8 +1,11 @@
 """Lens, noise and the camera without OpenGL."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from marker_scenes import MARKER, camera_on, corners_of, overhead, poses_in_view
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.protocols import Camera
 from hrc_learn.vision import (
@@ -184,6 +187,24 @@ def test_the_nearer_plate_covers_the_farther():
 def test_extreme_positions_are_drawn_or_left_out_without_error(position):
     image = camera_on(overhead(), {7: facing(position)}, MARKER).read()
     assert image.shape == (1080, 1440, 3)
+
+
+@pytest.mark.parametrize(("lower", "drawn"), [(0.04, False), (0.08, True)])
+def test_a_plate_that_reaches_behind_the_camera_is_not_drawn(lower, drawn):
+    """Tilted, one corner up: the projection of a plate through the camera's plane diverges."""
+    pose = np.eye(4)
+    turn = Rotation.from_euler("y", -75, degrees=True) * Rotation.from_euler("z", np.pi / 4)
+    pose[:3, :3] = turn.as_matrix()
+    pose[:3, 3] = [0.53, 0.0, 1.3 - lower]
+    plate = Marker(7, 0.06)
+    corners = plate.plate_corners @ pose[:3, :3].T + pose[:3, 3]
+    assert (corners[:, 2].max() > 1.28) == (not drawn)
+    small = replace(
+        overhead(), width=320, height=240, focal=(320.0, 320.0), principal=(160.0, 120.0)
+    )
+    assert small.in_view(corners).any()
+    camera = camera_on(small, {7: pose}, plate, noise=CLEAN)
+    assert (camera.read() != table_top(320, 240)).any() == drawn
 
 
 def test_a_marker_cut_by_the_edge_reaches_it():
