@@ -372,3 +372,36 @@ def test_an_arm_whose_target_stays_uncertain_does_not_descend():
         pytest.raises(MissedGraspError, match=r"may still be 10\.0 mm off"),
     ):
         VisualServo(cell, step).servo_to(target_above())
+
+
+@pytest.mark.parametrize(
+    ("limits", "waits", "away", "passed", "text"),
+    [
+        ((1.0, 9.0), 1, 0.0, 1.0, "after 1 s the marker is still 50.0 px from its target"),
+        ((1.0, 9.0), 2, 0.0, 2.0, "after 1 s the marker is still"),
+        ((1.0, 9.0), 1, 0.4, 1.4, "after 1 s the marker is still"),
+        ((9.0, 0.5), 1, 0.0, 0.5, f"marker {MARKER} was not detected"),
+        ((9.0, 0.5), 1, 0.4, 0.9, "was not detected"),
+    ],
+)
+def test_it_gives_up_after_its_own_time_and_counts_no_time_of_people(
+    limits, waits, away, passed, text
+):
+    """People make the arm wait, or lead it away by a drawing."""
+    cell = Cell(waits)
+    cell.time = cell.task_time = begun = 100.0  # of an earlier task
+    step = IdealStep(cell, [0.001])
+    timeout, occlusion_timeout = limits
+    step.config = replace(CONFIG, timeout=timeout, occlusion_timeout=occlusion_timeout)
+    step.pixel_error = lambda state, now, target: 50.0
+    move = step.step
+
+    def led(state, now, target):
+        result, state = move(state, now, target)
+        led_away = cell.time - begun < away
+        return result, replace(state, drawn=SimpleNamespace(away=led_away))
+
+    step.step = led
+    with shapes_unchecked(), pytest.raises(MissedGraspError, match=text):
+        VisualServo(cell, step).servo_to(target_above())
+    assert cell.time - begun == pytest.approx(passed, abs=0.05)
