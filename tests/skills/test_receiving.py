@@ -74,7 +74,7 @@ class Cell:
 
     def __init__(self, moves, brings=True):
         self.config, self.chain = SimpleNamespace(dt=0.02), panda
-        self.time, self.load, self.closed = 0.0, None, []
+        self.time, self.load, self.closed, self.path = 0.0, None, [], []
         self.pose = Pose(START.clone(), gripper_down())
         self.gripper = SimpleNamespace(move=self._grip)
         self._moves, self._brings = list(moves), brings
@@ -98,6 +98,7 @@ class Cell:
 
     def track_pose(self, goal, twist):
         before, self.pose = self.pose, goal
+        self.path.append(goal.position.numpy())
         self.time += self.config.dt
         still = torch.equal(before.position, goal.position)
         over = self.time > self._moves[-1][0] + self._moves[-1][1] + 1.5
@@ -127,6 +128,13 @@ def test_passes_over_another_movement_and_meets_the_hand(model):
     # Before half of the movement had passed, and not before it had begun.
     assert 5.0 < receipt.recognised < 5.0 + 0.8
     assert np.linalg.norm(cell.pose.position.numpy() - met) < 0.03
+    # On the way it keeps the limits of speed and acceleration, and uses them.
+    config, dt = ReceivingConfig(), cell.config.dt
+    velocity = np.diff(cell.path, axis=0) / dt
+    speed = np.linalg.norm(velocity, axis=1).max()
+    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() / dt
+    assert 0.1 < speed < config.speed
+    assert acceleration == pytest.approx(config.acceleration)
     assert receipt.attempts == 1
     assert cell.closed == [pytest.approx(receipt.taken - 0.7)]
     assert cell.load is not None
