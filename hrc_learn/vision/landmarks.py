@@ -284,7 +284,8 @@ def _propagated(
         by_unknowns: Derivative of the pixel with respect to the unknowns.
         error: Errors of the fitted pixels [px].
     """
-    freedom = max(error.size - slope.shape[1], 1)
+    # Findings have at least `_FEWEST_MATCHES` points, so there are degrees of freedom left.
+    freedom = error.size - slope.shape[1]
     variance = max((error**2).sum() / freedom, _LEAST_NOISE**2)
     # With columns of equal norm, the inverse is accurate enough.
     size = np.linalg.norm(slope, axis=0) + 1e-12

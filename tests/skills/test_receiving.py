@@ -140,8 +140,8 @@ def test_passes_over_another_movement_and_meets_the_hand(model):
     assert cell.load is not None
 
 
-def test_two_images_in_a_row_make_a_hand_over_certain(model):
-    certain, observed = [True, False, True, True], []
+def test_two_images_in_a_row_make_a_hand_over_certain_and_twice_its_duration_is_seen(model):
+    certain, duration, observed = [True, False, True, True], 0.6, []
 
     class Told:
         kinds = model.kinds
@@ -150,15 +150,23 @@ def test_two_images_in_a_row_make_a_hand_over_certain(model):
             observed.append(times[-1])
             sure = certain[min(len(observed), len(certain)) - 1]
             handed = [float(sure == (kind == "hand over")) for kind in self.kinds]
-            return replace(model.observe(times, *others), probability=torch.tensor(handed))
+            estimate = model.observe(times, *others)
+            return replace(estimate, probability=torch.tensor(handed), duration=duration)
 
-    cell = Cell([(1.0, 1.0, np.array([0.3, 0.4, 0.33]) + BESIDE)])
-    taker = receiving(cell, Told(), timeout=1.5)
+    class Wandering(Cell):
+        """A hand that never rests."""
+
+        def hand(self):
+            return REST + max(self.time - 1.0, 0.0) * np.array([0.2, -0.2, 0.2])
+
+    taker = receiving(Wandering([(0.0, 0.1, REST)], brings=False), Told(), timeout=3.0)
     with pytest.raises(MissedGraspError):
         taker.receive(ITEM)
     receipt = taker.receipt
     assert receipt.seen - receipt.set_off == pytest.approx(observed[3])
     assert receipt.passed_over == 0
+    last = receipt.set_off + observed[-1]
+    assert last == pytest.approx(receipt.seen + 2 * duration, abs=2 / RATE)
 
 
 @shapes_unchecked()
