@@ -90,9 +90,7 @@ class PickAndPlaceConfig:
     """Duration of each wait [s]."""
 
 
-def place_along(
-    cell: WorkCell, plan: Plan, goal: Pose, lowering: float, size: float = 1.0
-) -> float:
+def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float, size: float) -> float:
     """Carry the grasped object along a plan, put it down and retreat.
 
     Args:

@@ -143,6 +143,22 @@ def test_an_object_is_carried_put_down_and_left_along_the_same_path(scene):
     assert job.release is scene.pose
 
 
+@pytest.mark.parametrize("size", [0.5, 1.0])
+def test_an_object_is_put_down_and_the_hand_goes_back_by_its_size(scene, size):
+    scene.time, goal = 4.0, Pose(SHELF.position + 0.01, DOWN)
+    plan = SimpleNamespace(path=PATHS[0])
+    assert pick_and_place.place_along(scene, plan, goal, 0.03, size) == 4.0
+    assert scene.phases == ["transfer", "release", "retreat"]
+    steps = "follow move_straight move_until_contact hand move_straight"
+    assert scene.names() == steps.split()
+    reached, below, _, back = (values[0] for name, *values in scene.did[1:])
+    assert reached is goal
+    heights = [float(pose.position[2] - goal.position[2]) for pose in (below, back)]
+    assert heights == pytest.approx([-0.03, 0.08 * size])
+    torch.testing.assert_close(back.position[:2], goal.position[:2])
+    assert scene.load is None
+
+
 def test_a_person_has_time_at_the_first_objects_only(scene):
     jobs = run(scene, orders=3)
     assert [job.time_for_person for job in jobs] == [7.0, 0.0, 0.0]
