@@ -5,7 +5,7 @@ import pytest
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import ColumnSelection, map_columns
-from hrc_learn.demos.read.metadata import Feature
+from hrc_learn.demos.read.metadata import Feature, read_features
 from hrc_learn.demos.read.naming import without_unit
 
 STATE = "observation.state"
@@ -342,3 +342,29 @@ def test_texts_images_and_index_columns_have_no_meaning():
 def test_blanks_around_a_name_hide_no_unit():
     assert without_unit(" q_deg ") == ("q", "deg")
     assert without_unit("q") == ("q", "")
+
+
+def test_joints_with_a_feature_each_are_read_together():
+    keys = ("observation.elbow.pos", "observation.elbow.vel", "observation.cube.pos")
+    keys += ("action.elbow.pos", "observation.state.wrist.pos", "action.wrist.pos", "reward")
+    declared = {key: {"dtype": "float32", "shape": [1], "names": None} for key in keys}
+    declared["observation.hip.pos"] = declared["reward"] | {"names": ["value"]}  # says no joint
+    found = map_columns(read_features({"features": declared}))
+    assert found.joint_names == ("elbow", "wrist")
+    assert {role: [key for key, _ in s.columns] for role, s in found.selections.items()} == {
+        "joint_position": ["observation.elbow.pos", "observation.state.wrist.pos"],
+        "command_position": ["action.elbow.pos", "action.wrist.pos"],
+    }
+    assert not found.selections["joint_position"].numbered
+    assert "joint_velocity" in found.unmatched  # the wrist has none
+    assert {"observation.cube.pos", "observation.hip.pos", "reward"} <= {*found.extra}
+
+
+@pytest.mark.parametrize("key", ["joint.state", "observation.joint_states"])
+def test_a_state_of_joints_comes_before_any_state(key):
+    found = mapped({"observation.state": 7, key: 6})
+    assert {k for k, _ in found.selections["joint_position"].columns} == {key}
+    assert mapped({key: "a.pos a.vel"}).selections.keys() == {
+        "joint_position",
+        "joint_velocity",
+    }
