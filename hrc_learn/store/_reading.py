@@ -101,7 +101,7 @@ def _content(path: Path, advice: str) -> bytes:
         raise ValueError(f"{path} is not a file")
     if path.stat().st_size > MAX_SIZE:
         raise ValueError(f"{path} is larger than {MAX_SIZE >> 20} MiB; {advice}")
-    return path.read_bytes()
+    return path.read_bytes().removeprefix(b"\xef\xbb\xbf")  # as editors of Windows write
 
 
 def _finite(text: str) -> float:

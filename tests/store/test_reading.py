@@ -108,6 +108,12 @@ def test_text_in_another_encoding_is_called_so(tmp_path, read, suffix):
         read(file)
 
 
+@pytest.mark.parametrize(("read", "text"), [(read_json, '{"a": "Ä"}'), (read_toml, 'a = "Ä"')])
+def test_a_byte_order_mark_is_no_content(tmp_path, read, text):
+    (tmp_path / "file").write_text(text, encoding="utf-8-sig")
+    assert read(tmp_path / "file") == {"a": "Ä"}
+
+
 def test_only_files_of_a_sensible_size_are_read(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no file .*none\.json"):
         read_json(tmp_path / "none.json")
