@@ -396,10 +396,11 @@ def new_folder(
         BusyError: Another process is writing this folder.
         InTheWayError: `path` exists and may not be replaced.
     """
+    inputs = json_text(made_by)  # before the work, which an error here would lose
     with replacing(path, RESULTS, overwrite) as folder:
         folder.mkdir()
         yield folder
-        (folder / MADE_BY).write_text(json_text(made_by), encoding="utf-8")
+        (folder / MADE_BY).write_text(inputs, encoding="utf-8")
 
 
 def read_made_by(folder: str | os.PathLike[str]) -> dict[str, Any]:

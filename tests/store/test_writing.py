@@ -165,6 +165,16 @@ def test_results_say_what_they_were_made_from(tmp_path):
     assert contents(out)["model"] == "weights"
 
 
+def test_inputs_that_cannot_be_saved_are_refused_before_the_work(tmp_path):
+    name = os.fsdecode(b"caf\xe9")  # a folder of an older system, not in UTF-8
+    with (
+        pytest.raises(ValueError, match="surrogates"),
+        new_folder(tmp_path / "results", {"dataset": Path(name)}),
+    ):
+        pytest.fail("the work began")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_remembers_the_identifier_of_its_source(tmp_path):
     with replacing(tmp_path / "made", KIND, source="recording 7") as folder:
         folder.mkdir()
