@@ -60,6 +60,9 @@ def test_a_line_in_joint_space_keeps_its_speed():
     torch.testing.assert_close(path[-1], goal)
     speed = path.diff(dim=0).abs().max() / 0.01
     assert 0.45 < float(speed) < 0.51
+    # It ends within the last samples, and does not linger.
+    duration = 1.875 * float((goal - start).abs().max()) / 0.5
+    assert duration <= 0.01 * (len(path) - 1) <= duration + 0.0151
     same = joint_line(start, start, speed=0.5, dt=0.01)
     torch.testing.assert_close(same, start.expand_as(same))
 

@@ -87,6 +87,19 @@ def test_near_an_end_of_the_range_the_tool_is_not_turned_to_and_fro(end):
     assert abs(far - turns[-1]) > 1.0
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize(("beyond", "kept"), [(0.03, True), (0.14, True), (0.16, False)])
+def test_a_turn_is_kept_up_to_its_margin_outside_the_range(side, beyond, kept):
+    skill, end = MarkerAngle(offset_rad=0.0, spread_rad=0.0), math.pi / 2
+    upright, yaw = torch.tensor([1.0, 0.0, 0.0, 0.0]), side * (end + beyond)
+    half_turn = yaw - side * math.pi
+    before = yaw + 0.02
+    turn = skill.turn(half_turn, upright, before, (-end, end), before)
+    assert turn == pytest.approx(yaw if kept else half_turn)
+    # Without an earlier choice, it is a turn within the range.
+    assert skill.turn(yaw, upright, before, (-end, end), None) == pytest.approx(half_turn)
+
+
 def test_the_turn_about_the_vertical_is_that_of_the_rotation():
     for yaw in (-2.5, -0.3, 0.0, 1.2, 3.0):
         lean = quaternion.exp(torch.tensor([0.1, -0.2, 0.0], dtype=torch.float64))
