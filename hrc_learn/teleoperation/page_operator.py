@@ -227,7 +227,8 @@ class HeadsetHands:
             turned = grip.orientation if grip.joint is None else None
             before = self._grips.get(hand)
             if before is None or (before.joint, before.start) != (grip.joint, grip.start):
-                if grip.joint is not None and grip.joint >= len(links.position):
+                # Flange and tool centre point, the last two, have no joint.
+                if grip.joint is not None and grip.joint > len(links.position) - 2:
                     raise MessageError(f"the arm has no joint {grip.joint}")
                 start, turned_from = np.array(grip.start), None if turned is None else _AT_REST
                 self._held.grab(key, grip.joint, start, pointer, turned_from)

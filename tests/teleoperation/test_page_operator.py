@@ -10,9 +10,11 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig
+from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError
 from hrc_learn.teleoperation.hand_guiding import gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
 from hrc_learn.teleoperation.page_operator import (
+    HeadsetHands,
     HeldGizmo,
     HeldGizmos,
     gizmo_command,
@@ -253,3 +255,76 @@ def test_people_hold_independently_of_each_other(grips):
     assert len(grips.held()) == 2
     grips.release(1)
     assert [holder for holder, _ in grips.held()] == [2]
+
+
+LINKS = panda.link_poses(panda.ready)
+TOOL = LINKS.position[-1].numpy()
+
+
+def hands_holding(*grips):
+    return Hands(grips=tuple(Grip(**grip) for grip in grips))
+
+
+def led(hand="right", by=(0.0, 0.0, 0.0), turn=None, start=TOOL):
+    """A hand that holds the end effector and has moved and turned since."""
+    turned = None if turn is None else tuple(rotation(*turn).tolist())
+    start, pointer = tuple(start), tuple(start + by)
+    return {"hand": hand, "joint": None, "start": start, "pointer": pointer} | {
+        "orientation": turned
+    }
+
+
+def test_hands_pull_links_and_lead_and_turn_the_end_effector():
+    held = HeldGizmos(links=lambda: LINKS)
+    hands = HeadsetHands(held, guides=True)
+    point = LINKS.position[3].numpy() + 0.02
+    left = {"hand": "left", "joint": 4, "start": tuple(point), "pointer": (0.5, 0.1, 0.6)}
+    # The rotation of a hand that pulls a link turns nothing.
+    left["orientation"] = tuple(rotation(0.5, 0.0, 0.0).tolist())
+    hands.hear(hands_holding())
+    hands.hear(hands_holding(left, led(by=(0.1, 0.0, 0.2), turn=(0.0, 0.3, 0.0))))
+    elbow, tool = held.held()["headset", "left"], held.held()["headset", "right"]
+    assert (elbow.joint, tool.joint) == (4, None)
+    at = LINKS[3].apply(torch.from_numpy(elbow.held_at))
+    np.testing.assert_allclose(at, point, atol=1e-12)
+    np.testing.assert_allclose(elbow.pointer, (0.5, 0.1, 0.6))
+    np.testing.assert_allclose(tool.held_at, 0, atol=1e-12)
+    np.testing.assert_allclose(tool.pointer, np.add(TOOL, (0.1, 0.0, 0.2)))
+    np.testing.assert_allclose(held.turn_vector, (0.0, 0.3, 0.0), atol=1e-12)
+    hands.hear(hands_holding(led(by=(0.3, 0.0, 0.0), turn=(0.0, 0.5, 0.0))))
+    assert [*held.held()] == [("headset", "right")]
+    np.testing.assert_allclose(held.turn_vector, (0.0, 0.5, 0.0), atol=1e-12)
+    # The next hold begins with another point, and its rotation comes on top.
+    hands.hear(hands_holding(led(turn=(0.0, 0.2, 0.0), start=TOOL + 0.01)))
+    np.testing.assert_allclose(held.turn_vector, (0.0, 0.7, 0.0), atol=1e-12)
+    hands.hear(hands_holding())
+    assert not held.held()
+    assert not held.turning
+
+
+def test_what_hands_hold_from_the_beginning_moves_nothing():
+    held = HeldGizmos(links=lambda: LINKS)
+    hands = HeadsetHands(held, guides=True)
+    for _ in range(2):
+        for by in (0.1, 0.2):
+            hands.hear(hands_holding(led(by=(by, 0.0, 0.0), turn=(0.1, 0.0, 0.0))))
+        assert not held.held()
+        assert held.turn_vector is None
+        hands.forget()  # as after a change of control
+
+
+def test_without_an_end_effector_to_hold_hands_pull_links_only():
+    held = HeldGizmos(links=lambda: LINKS)
+    hands = HeadsetHands(held, guides=False)
+    last = {"hand": "left", "joint": 7, "start": tuple(TOOL)}
+    last["pointer"] = tuple(TOOL)
+    hands.hear(hands_holding())
+    hands.hear(hands_holding(led(), last))
+    assert [*held.held()] == [("headset", "left")]
+    with pytest.raises(MessageError, match="the arm has no joint 8"):
+        hands.hear(hands_holding(last | {"joint": 8}))
+    # What is held can be asked of the arm.
+    assert gizmo_command(panda.chain, Q, held.held().values(), InteractionForceConfig()).held
+    unknown = HeldGizmos()  # before the first reading of the arm
+    HeadsetHands(unknown, guides=True).hear(hands_holding(led()))
+    assert not unknown.held()
