@@ -267,6 +267,7 @@ class PersonTracker(Protocol):
 
     def read(self) -> PersonObservation | None:
         """Return the newest observation that has arrived; None if there is none for any reason.
+        An observation without capsules means that no person is near the arm.
 
         Callers must allow for the largest motion of a person since the time of exposure.
         """

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,6 +20,11 @@ from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
+# Distance that is reported while no person is seen: no protective distance is that large [m].
+_NO_PERSON = 100.0
+# Largest time by which the tracker's clock may be ahead of the arm's [s]. The age of an
+# observation that comes from further ahead is unknown.
+_CLOCK_ERROR = 0.05
 # Time in which an arm comes to rest [s]: as drivers plan, a joint of a Panda brakes from 0.8
 # rad/s with 0.7 of its highest acceleration. This time determines a speed scale near people.
 # Without the scale, the arm came too close to a worker in up to 7 of 60 jobs.
@@ -93,7 +99,7 @@ class PersonWatch:
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
     ) -> WatchedPeople:
-        """People near the arm now.
+        """People near the arm now; the arm brakes after an observation that is not usable.
 
         Args:
             time: Reading of the clock [s].
@@ -101,30 +107,33 @@ class PersonWatch:
             load: Object in the gripper; None: no object.
         """
         seen, number = self._tracker.read(), self._config.pairs
-        if seen is None:
-            unknown = joints.new_full((number,), _NAN)
+        age = _NAN if seen is None else time - seen.time
+        usable = seen is not None and age >= -_CLOCK_ERROR
+        usable = usable and bool(np.isfinite([seen.ends, seen.velocity]).all())
+        if seen is None or not usable or not len(seen.ends):
+            distance = joints.new_full((number,), _NO_PERSON if usable else _NAN)
             return WatchedPeople(
                 distances=Distances(
-                    distance=unknown,
-                    gradient=unknown[:, None].expand(number, len(joints)),
-                    approach_speed=unknown,
-                    person=torch.ones_like(unknown, dtype=torch.bool),
+                    distance=distance,
+                    gradient=joints.new_zeros(number, len(joints)),
+                    approach_speed=torch.zeros_like(distance),
+                    person=torch.ones_like(distance, dtype=torch.bool),
                 ),
-                nearest=unknown[0],
-                age=unknown[0],
+                nearest=distance[0],
+                age=joints.new_tensor(age),
                 speed_scale=joints.new_tensor(1.0),
                 speed_cap=joints.new_tensor(math.inf),
             )
         ends, radius, velocity = (
             torch.from_numpy(x).to(joints) for x in (seen.ends, seen.radius, seen.velocity)
         )
-        found, age = separation(self._arm, joints, ends, radius, load), time - seen.time
+        found = separation(self._arm, joints, ends, radius, load)
         contact = None
         if self._limits is not None and seen.regions:
             regions = region_numbers(seen.regions)
             contact = self._limits.speeds(found, joints, regions, load is not None)
-        age = joints.new_tensor(age)
-        return watched_people(found, velocity, age, self._separation, self._config, contact)
+        late = joints.new_tensor(max(age, 0.0))
+        return watched_people(found, velocity, late, self._separation, self._config, contact)
 
 
 def watched_people(

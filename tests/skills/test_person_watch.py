@@ -71,6 +71,36 @@ def test_nothing_seen_is_nothing_known():
     assert np.isnan([found.nearest, found.age]).all()
 
 
+def test_an_observation_of_no_person_leaves_the_arm_free():
+    nobody = np.zeros((0, 2, 3))
+    seen = PersonObservation(time=1.0, ends=nobody, radius=np.zeros(0), velocity=nobody)
+    found = watch(seen, acceleration=5.0, pairs=8).look(1.1, WORKPLACE.hover_joints())
+    assert found.distances.known()
+    assert found.distances.closing_speed(ConstraintConfig(), SEPARATION).min() > 5.0
+    assert found.speed_scale == 1.0
+    assert found.nearest > 10.0
+    assert found.age == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "lost", "known"),
+    [(0.04, None, True), (0.06, None, False), (0.0, "ends", False), (0.0, "velocity", False)],
+)
+def test_what_cannot_be_is_nothing_known(ahead, lost, known):
+    """A tracker whose clock is ahead of the arm's, or that lost one of many body parts."""
+    seen = observed()
+    if lost is not None:
+        broken = getattr(seen, lost).copy()
+        broken[3, 0] = np.nan
+        seen = replace(seen, **{lost: broken})
+    pfl = replace(SEPARATION, mode="ssm+pfl")
+    for person in (seen, replace(seen, regions=("hand",) * len(seen.ends))):
+        tracker = SimpleNamespace(read=lambda person=person: person)
+        found = PersonWatch(tracker, ARM, pfl).look(1.0 - ahead, WORKPLACE.hover_joints())
+        assert bool(found.distances.known()) == known
+        assert math.isfinite(found.nearest) == known
+
+
 def test_people_who_keep_their_speed_are_nowhere_nearer_than_thought():
     """Of an observation that is 0.2 s old, against where he really is by then."""
     q, age, reaction = WORKPLACE.hover_joints(), 0.2, 0.03
