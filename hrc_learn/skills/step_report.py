@@ -148,7 +148,7 @@ class PersonFeedback:
             pushed: True if the person asks for a motion.
             person_distance: Distance of the nearest person [m], NaN while it is not known;
                 None: people are not tracked.
-            pace: Speed scale imposed on the task, 0 to 1.
+            pace: Speed scale of the task due to people near the arm, 0 to 1.
             load: Object in the gripper; None: no object.
             contact_expected: True while the task searches for a contact, or shortly after.
         """

@@ -473,7 +473,7 @@ class WorkCell:
             self.jacobian,
             pushed=reading.explain,
             person_distance=None if watched is None else float(watched.nearest),
-            pace=float(self.pace.scale),
+            pace=float(self.pace.people_scale),
             load=self.load,
             contact_expected=self.time < self._contact_expected,
         )

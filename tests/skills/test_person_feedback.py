@@ -13,7 +13,7 @@ from hrc_learn.controller import ControllerConfig, SafetyFilter
 from hrc_learn.kinematics import GraspedBox, panda
 from hrc_learn.protocols import HINDRANCES, ArmState, Human, HumanInput, PersonObservation
 from hrc_learn.sim import ArmModelConfig, whole_arm
-from hrc_learn.skills import WorkCell
+from hrc_learn.skills import WorkCell, WorkCellConfig
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.step_report import PersonFeedback
 
@@ -163,6 +163,23 @@ def test_who_pushes_the_arm_at_somebody_is_told_so(towards):
         assert words["person"].startswith(f"a person is {told.person_distance:.1f} m away")
     else:
         assert "person" not in {reason.hindrance for reason in told.reasons}
+
+
+@pytest.mark.parametrize(("speed", "pause"), [(0.5, False), (1.0, True)])
+def test_people_far_away_are_no_reason_of_a_slow_or_paused_task(speed, pause):
+    class Operator(Pusher):
+        def read(self, state):
+            return replace(super().read(state), pause=pause)
+
+    arm, person = ObedientArm(Q.numpy()), Operator(1.0 * self_motion(Q))
+    watch = PersonWatch(Bystander(arm, [9.0, 0, 0]), whole_arm(ArmModelConfig(robot=panda)))
+    config = WorkCellConfig(speed=speed)
+    with shapes_unchecked():
+        cell = cell_of(person, arm, watch=watch, config=config)
+        cell.hold_pose(0.5)
+    assert cell.pace.scale == speed * (not pause)
+    assert person.told[-1].pace == 1.0
+    assert person.told[-1].reasons == ()
 
 
 READY = Q.numpy()
