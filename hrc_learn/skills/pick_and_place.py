@@ -223,7 +223,6 @@ class PickAndPlace:
     def _receive(self, job: PickPlaceJob) -> Phase | None:
         """Take the object from a person's hand."""
         receiving, robot = self._receiving[job.item.name], self._workplace.robot
-        job.receipt = receiving.receipt
         self._cell.gripper.move(OPEN)
         posture = robot.inverse(receiving.wait, near=self._workplace.hover_joints())
         self._grasping.move_joints(posture)
@@ -234,6 +233,8 @@ class PickAndPlace:
             job.failure = str(error)
             self._grasping.start_over()
             return None
+        finally:
+            job.receipt = receiving.receipt
         receiving.wait_until_away()
         job.picked_up = self._cell.pose
         return self._home

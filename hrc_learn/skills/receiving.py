@@ -105,20 +105,16 @@ class MovementWatch:
         recent.append(seen)
         while recent[-1].time - recent[0].time > config.window + 1e-6:
             recent.popleft()
-        if len(recent) < 4:  # too few for two means
-            return bool(self.times)
-        stands = self._moved(self._body) < config.motion_threshold
-        moves = self._moved(self._hand) > config.motion_threshold
-        if not stands or not moves:
-            # The hand rests again, or the person walks: the next motion is another movement.
+        enough = len(recent) >= 4  # for two means
+        stands = enough and self._moved(self._body) < config.motion_threshold
+        if not stands or self._moved(self._hand) <= config.motion_threshold:
+            # The hand rests again, the person walks, or images are missing: the next motion is
+            # another movement.
             self.times, self.hand = [], []
             return False
-        if not self.times:
-            self.times = [one.time for one in recent]
-            self.hand = [self.place(one) for one in recent]
-        else:
-            self.times.append(seen.time)
-            self.hand.append(self.place(seen))
+        new = [seen] if self.times else recent
+        self.times += [one.time for one in new]
+        self.hand += [self.place(one) for one in new]
         return True
 
     def place(self, seen: PersonObservation) -> Float[np.ndarray, "3"]:
@@ -171,6 +167,7 @@ class Receiving:
             MissedGraspError: There was no hand-over, or the fingers closed on nothing.
         """
         deadline = self._cell.time + self._config.timeout
+        self.receipt = Receipt()
         self._cell.gripper.move(OPEN)
         estimate = self._recognise(deadline)
         hand_offset = self._meet(estimate, deadline)

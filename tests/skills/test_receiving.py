@@ -179,6 +179,12 @@ def test_closes_on_nothing_as_often_as_told(model):
     with pytest.raises(MissedGraspError, match="closed on nothing"):
         taker.receive(ITEM)
     assert len(cell.closed) == taker.receipt.attempts == 2
+    # The next hand-over has a record of its own.
+    before = taker.receipt
+    with pytest.raises(MissedGraspError, match="no hand-over"):
+        taker.receive(ITEM)
+    assert taker.receipt.attempts == 0
+    assert before.attempts == 2
 
 
 @shapes_unchecked()
@@ -218,6 +224,16 @@ def test_movements_are_cut_from_rest_to_rest_of_a_body_that_stands():
     assert 2.8 < moving[-1] < 3.4
     assert np.ptp(np.diff(moving)) < 1e-9
     assert watch.times == []
+
+
+def test_a_movement_ends_where_images_are_missing():
+    watch = MovementWatch(ReceivingConfig(), 0, 1)
+    moves = [(0.5, 1.0, REST + np.array([0.4, 0, 0])), (4.5, 1.0, REST)]
+    for begin in (0.0, 4.0):
+        for time in begin + np.arange(30) / RATE:
+            moving = watch.see(seen(time, hand_at(time, moves)))
+            assert moving == bool(watch.times)
+        assert begin + 0.2 < watch.times[0] < watch.times[-1] == time
 
 
 @pytest.mark.parametrize("images", [4, 5])
