@@ -356,7 +356,7 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
     """
     limits, names = plan.chain.limits, plan.chain.joint_names
     path = torch.from_numpy(plan.path)
-    outside = (path < limits.lower) | (path > limits.upper)
+    outside = ~((path >= limits.lower) & (path <= limits.upper))  # also NaN
     if bool(outside.any()):
         k, joint = (int(i) for i in outside.nonzero()[0])
         raise BlockedPathError(
@@ -378,9 +378,10 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
     touches = world.collisions_along(samples, carried)
     if touches:
         first = touches[0]
+        time = min(first.start * every * plan.dt, plan.duration)
         raise BlockedPathError(
-            f"after {first.start * every * plan.dt:.1f} s {first.first} would hit "
-            f"{first.second}, {1e3 * first.depth:.0f} mm deep."
+            f"after {time:.1f} s {first.first} would hit {first.second}, "
+            f"{1e3 * first.depth:.0f} mm deep."
         )
 
 

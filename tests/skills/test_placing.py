@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -173,6 +174,17 @@ def test_check_plan_names_what_would_be_hit(plans, world):
     sweep = np.linspace(HOME.numpy(), HOME.numpy() - 1.9 * np.eye(7)[0], 200)
     with pytest.raises(BlockedPathError, match="would hit"):
         check_plan(replace(plan, path=sweep), world)
+    # The samples that are checked are 4 apart, but for the last.
+    hit = SimpleNamespace(first="hand", second="shelf", depth=0.01, start=2)
+    there = SimpleNamespace(collisions_along=lambda path, carried: [hit])
+    still = replace(plan, path=np.tile(HOME.numpy(), (6, 1)), dt=0.3)
+    with pytest.raises(BlockedPathError, match=r"after 0\.6 s hand would hit shelf"):
+        check_plan(still, there)
+    with pytest.raises(BlockedPathError, match=r"after 0\.1 s hand would hit shelf"):
+        check_plan(replace(still, dt=0.01), there)
+    unknown = np.where(np.eye(6, 7, k=1) > 0, np.nan, still.path)
+    with pytest.raises(BlockedPathError, match=r"panda_joint2 after 0\.0 s, at nan rad"):
+        check_plan(replace(plan, path=unknown), world)
     turned = HOME.numpy() + 2.5 * np.eye(7)[0]
     beyond = np.linspace(HOME.numpy(), turned, 200)
     with pytest.raises(BlockedPathError, match="panda_joint1"):
