@@ -90,10 +90,11 @@ class Segmentation:
                 raise ValueError(f"segments: no frame {frame!r}; there are {known}")
         for demo in demos:
             cuts, n = self.cuts.get(demo.episode, ()), len(self.frames) + 1
-            if len(cuts) != n or cuts[-1] >= len(demo) or min(np.diff(cuts)) < _SHORTEST:
+            spaced = len(cuts) == n and min(np.diff(cuts)) >= _SHORTEST
+            if not spaced or cuts[0] < 0 or cuts[-1] >= len(demo):
                 raise ValueError(
                     f"segments: episode {demo.episode} needs {n} cuts below {len(demo)}, "
-                    f"{_SHORTEST} frames or more apart, but has {list(cuts)}"
+                    f"{_SHORTEST} frames or more apart, from 0 on, but has {list(cuts)}"
                 )
 
 

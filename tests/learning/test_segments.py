@@ -44,6 +44,7 @@ def demo(frames, episode=0, gripper=None):
         ((0, 19), False),
         ((0, 6, 12, 19), False),
         ((6, 0, 19), False),
+        ((-6, 6, 19), False),
     ],
 )
 def test_cuts_are_six_frames_apart_within_the_demonstration(cuts, right):
