@@ -514,11 +514,11 @@ def _described(
     objects: Sequence[Finding | None],
 ) -> DemonstrationSet:
     """Demonstrations with the findings in the columns that detected markers would fill."""
-    result = []
+    result, replaced = [], (OBJECT_FEATURE, ANGLE_FEATURE)
     for demo, found, item in zip(demos, tools, objects, strict=True):
         visible = np.array([f is not None for f in found])
         pixels = np.array([np.zeros(2) if f is None else f.pixel for f in found])
-        extra = dict(demo.extra)
+        extra = {key: x for key, x in demo.extra.items() if key not in replaced}
         if item is not None:
             extra[OBJECT_FEATURE] = np.tile((*item.pixel, 1.0), (len(demo), 1))
             extra[ANGLE_FEATURE] = np.tile((np.nan, item.angle), (len(demo), 1))

@@ -86,7 +86,7 @@ def fit_visual_servo(
         motion=float(held_out.motion.square().sum(-1).mean().sqrt()),
         held_out_error=float(held_out.error.square().sum(-1).mean().sqrt()),
     )
-    ends = _ends(demos)
+    ends = _ends(demos, partial=landmarks is not None)
     target = None
     if ends:
         objects = np.array([end.object_pixel for end in ends], dtype=np.float64)
@@ -151,15 +151,15 @@ class _End(NamedTuple):
     angle: float | None
 
 
-def _ends(demos: Demonstrations) -> list[_End]:
-    """Ends of all demonstrations; an empty list if no object was observed."""
+def _ends(demos: Demonstrations, *, partial: bool = False) -> list[_End]:
+    """Ends of all demonstrations with an object; if `partial`, others may have none."""
     ends, without = [], []
     for demo in demos:
         if OBJECT_FEATURE in demo.extra:
             ends.append(_end(demo, demos.source))
         else:
             without.append(demo.episode)
-    if ends and without:
+    if ends and without and not partial:
         raise ValueError(
             f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, unlike other episodes."
         )

@@ -24,6 +24,7 @@ from hrc_learn.learning.markerless_fitting import (
     _Tracks,
     _tracks,
 )
+from hrc_learn.learning.visual_servo_fitting import _ends
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.vision.landmarks import Features, Finding
 
@@ -302,7 +303,10 @@ def test_an_object_of_a_single_demonstration_is_none():
 
 def test_what_was_found_becomes_columns():
     demos = DemonstrationSet(
-        [demo(3, 0, extra={"mood": np.ones((3, 1))}), demo(3, 1)],
+        [
+            demo(3, 0, extra={"mood": np.ones((3, 1))}),
+            demo(3, 1, extra={OBJECT_FEATURE: np.ones((3, 3)), ANGLE_FEATURE: np.ones((3, 2))}),
+        ],
         notes=("kept",),
         source="here",
         joint_unit="rad",
@@ -323,5 +327,17 @@ def test_what_was_found_becomes_columns():
     assert np.isnan(angle[:, 0]).all()
     np.testing.assert_array_equal(angle[:, 1], [0.4] * 3)
     np.testing.assert_array_equal(made[0].extra["mood"], np.ones((3, 1)))
-    assert OBJECT_FEATURE not in made[1].extra
+    assert not {OBJECT_FEATURE, ANGLE_FEATURE} & made[1].extra.keys()
     assert (made.notes, made.source, made.joint_unit) == (("kept",), "here", "rad")
+
+
+def test_ends_are_those_of_the_demonstrations_whose_object_was_found():
+    seen = {"feature": np.ones((6, 2)), "feature_visible": np.ones(6, dtype=bool)}
+    shown = [
+        demo(6, k, extra={OBJECT_FEATURE: np.full((6, 3), k + 1.0)}, **seen) for k in (0, 1)
+    ]
+    demos = DemonstrationSet([shown[0], demo(6, 5, **seen), shown[1]])
+    ends = _ends(demos, partial=True)
+    np.testing.assert_array_equal([end.object_pixel for end in ends], [[1, 1], [2, 2]])
+    with pytest.raises(ValueError, match=f"episode 5: no {OBJECT_FEATURE}, unlike other"):
+        _ends(demos)
