@@ -357,7 +357,9 @@ def _distance(
     """Largest distance of any joint of a motion from a path, regardless of time [rad]."""
     between = torch.linspace(0, 1, 5, dtype=path.dtype)[:-1, None, None]
     fine = torch.cat([torch.lerp(path[:-1], path[1:], between).flatten(0, 1), path[-1:]])
-    return float(torch.cdist(torch.from_numpy(joints), fine, p=torch.inf).amin(1).max())
+    # In parts: the distances of all pairs of a motion of minutes need gigabytes.
+    parts = torch.from_numpy(joints).split(256)
+    return max(float(torch.cdist(part, fine, p=torch.inf).amin(1).max()) for part in parts)
 
 
 def _pose_errors(pose: Pose, goal: Target) -> dict[str, float]:
