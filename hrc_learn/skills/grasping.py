@@ -26,6 +26,7 @@ from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.jacobian import CameraConfig, CameraEstimator
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
@@ -113,6 +114,9 @@ class GraspingConfig:
     """Height by which the Franka hand lifts an object [m]; it is scaled to other hands."""
     attempts: int = 3
     """Largest number of starts, including starts that fail before the fingers close."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, positive=("lift", "attempts"), not_negative=["detection_timeout"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.skills.grasping import (
     DESCENT_SPEED,
     OPEN,
@@ -88,6 +89,10 @@ class PickAndPlaceConfig:
     """Number of waits for a blocked path to become free."""
     wait: float = 2.0
     """Duration of each wait [s]."""
+
+    def __post_init__(self) -> None:
+        not_negative = "interaction", "interactions", "waits"
+        check_settings(self, positive=("speed", "wait"), not_negative=not_negative)
 
 
 def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float, size: float) -> float:

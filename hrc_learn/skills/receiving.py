@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hrc_learn.dmp import InteractionEstimate, InteractionPrimitive
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import PersonObservation, PersonTracker
 from hrc_learn.skills.grasping import CLOSED, CLOSING_TIME, OPEN, as_load, holds, move_fingers
 from hrc_learn.skills.placing import GraspObject
@@ -59,6 +60,9 @@ class ReceivingConfig:
     """Largest number of times that the fingers close."""
     timeout: float = 30.0
     """Give up after this long [s]."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, positive=vars(self))
 
 
 @dataclass(kw_only=True)

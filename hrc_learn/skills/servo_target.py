@@ -20,6 +20,7 @@ from torch import Tensor
 
 from hrc_learn.controller import Goals
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.jacobian import CameraSpread
 from hrc_learn.jacobian.perspective import MARKER, SIZE, marker_pixels, on_plane
 from hrc_learn.regions import OrientationRegion
@@ -280,6 +281,10 @@ class VisualServoConfig:
     """Rate at which the null space returns to the posture above the table [1/s]."""
     drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
     """Effect of a person's drawing on the goals."""
+
+    def __post_init__(self) -> None:
+        tolerances = "tolerance", "height_tolerance", "turn_tolerance"
+        check_settings(self, positive=(*tolerances, "max_probes", "turn_rate", "angle", "rate"))
 
     def scaled(self, size: float) -> "VisualServoConfig":
         """The same settings, with the lengths above the table scaled to a hand.

@@ -25,6 +25,7 @@ from hrc_learn.controller.joint_path import JointPaths, changed_rate, deviation_
 from hrc_learn.controller.null_space_motion import Clearance
 from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import GraspedBox
 from hrc_learn.log import Event, StepLog
@@ -89,6 +90,10 @@ class WorkCellConfig(ArmLoopConfig):
     """Control steps between two images kept for the recording; 0: no images are kept."""
     latency: LatencyConfig = field(default_factory=LatencyConfig)
     """Delay and loss of the camera's images."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, positive=["detect_every"], not_negative=["keep_image_every"])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hrc_learn.geometry import Pose
-from hrc_learn.skills import pick_and_place
+from hrc_learn.skills import WorkCellConfig, pick_and_place
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.pick_and_place import (
     BlockedPathError,
@@ -17,6 +17,8 @@ from hrc_learn.skills.pick_and_place import (
     TaskFailedError,
     UndetectedObjectError,
 )
+from hrc_learn.skills.receiving import ReceivingConfig
+from hrc_learn.skills.servo_target import VisualServoConfig
 
 pytestmark = pytest.mark.simulation
 
@@ -314,3 +316,18 @@ def test_an_arm_that_cannot_go_on_ends_the_run(scene):
     jobs = run(scene, orders=3)
     assert [job.failure for job in jobs] == ["", "the arm cannot go home"]
     assert scene.phases == STRAIGHT
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        (WorkCellConfig, "detect_every"),
+        (VisualServoConfig, "max_probes"),
+        (GraspingConfig, "attempts"),
+        (ReceivingConfig, "attempts"),
+        (PickAndPlaceConfig, "speed"),
+    ],
+)
+def test_settings_with_which_no_job_would_end_are_refused(config, name):
+    with pytest.raises(ValueError, match=f"{name} must be positive, but is 0"):
+        config(**{name: 0})
