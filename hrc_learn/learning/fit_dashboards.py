@@ -90,9 +90,7 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     made = cast(Any, fitted.each[channel].rollout()).position.detach()
 
     def cut(padded: Tensor) -> tuple[np.ndarray, ...]:
-        return tuple(
-            values[:n].double().numpy() for values, n in zip(padded, lengths, strict=True)
-        )
+        return tuple(x[:n].double().numpy() for x, n in zip(padded, lengths, strict=True))
 
     limits, paths, reproduced = None, (), ()
     if channel != "joint":

@@ -112,10 +112,8 @@ class FittedModel:
                 f"{option}: {len(values)} numbers may be {' or '.join(fits)}: write "
                 f"{option} {fits[0]} or {option} {fits[1]} before them."
             )
-        if fits[0] == "joints":
-            return Target(joints=values)
-        if fits[0] == "position":
-            return Target(position=values)
+        if fits[0] != "pose":
+            return Target(**{fits[0]: values})
         norm = float(values[3:].norm())
         if abs(norm - 1) > 0.02:
             raise ValueError(

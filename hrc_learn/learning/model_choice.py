@@ -59,8 +59,7 @@ def contexts(
         return torch.cat([position[:, 0], goal], dim=-1)
     rows = []
     for demo in demos:
-        missing = [name for name in columns if name not in demo.extra]
-        if missing:
+        if missing := [name for name in columns if name not in demo.extra]:
             raise ValueError(
                 f"{demos.source}, episode {demo.episode}: no column {missing[0]!r} for the "
                 f"context; there are {', '.join(demo.extra) or 'none'}."

@@ -277,9 +277,8 @@ class MultipliedColumns:
         if role.endswith("position"):
             values = values - zero
         factor = np.ravel(self._source.units[role].factor)
-        chosen = (
-            factor[list(self._made.columns)] if self._same and len(factor) > 1 else factor[0]
-        )
+        own = self._same and len(factor) > 1
+        chosen = factor[list(self._made.columns)] if own else factor[0]
         return values / (one - zero) / chosen
 
 

@@ -130,12 +130,6 @@ class Motions:
         """Linear coordinates of a channel: joint positions [rad] or position [m]."""
         return self.column(CHANNELS[channel][0])
 
-    def naming(self, channel: str) -> dict[str, Any]:
-        """Arguments of `JointDMP.fit` that name the coordinates and their unit."""
-        if channel == "joint":
-            return {"joint_names": self.joint_names or None, "units": self.joint_unit}
-        return {"joint_names": ("x", "y", "z"), "units": "m"}
-
     def fit(self, channel: str, n_basis: int, **options: Any) -> Primitive:
         """Fit one primitive to each demonstration.
 
@@ -152,9 +146,8 @@ class Motions:
         if channel == "pose":
             turn, body = self.column("orientation"), self._body_shape()
             return PoseDMP.fit(time, position, turn, n_basis, body=body, mask=mask, **options)
-        return JointDMP.fit(
-            time, position, n_basis, mask=mask, **self.naming(channel), **options
-        )
+        named = _naming(channel, self.joint_names, self.joint_unit)
+        return JointDMP.fit(time, position, n_basis, mask=mask, **named, **options)
 
     def require(self, channel: str) -> None:
         """Raise ValueError unless the columns of a channel were recorded."""
@@ -196,6 +189,13 @@ class Motions:
         angle = np.unwrap(arm_angle(chain, self.demos.joint_position).numpy(), axis=1)
         start = np.unwrap(angle[:, :1], axis=0) - angle[:, :1]
         return torch.from_numpy(angle + start)[..., None]
+
+
+def _naming(channel: str, joint_names: tuple[str, ...], joint_unit: str) -> dict[str, Any]:
+    """Arguments of `JointDMP.fit` that name the coordinates of a channel and their unit."""
+    if channel == "joint":
+        return {"joint_names": joint_names or None, "units": joint_unit}
+    return {"joint_names": ("x", "y", "z"), "units": "m"}
 
 
 def load_primitive(folder: Path, channel: str) -> Primitive:
@@ -405,14 +405,9 @@ def fit_streamed(
             raise ValueError(
                 f"channel {channel!r} cannot be streamed, only joint and position."
             )
-        names = demos.joint_names if channel == "joint" else ("x", "y", "z")
         column = partial(_stamped_column, name=CHANNELS[channel][0], source=demos.source)
-        fits[channel], rmse = fit_shared(
-            LazyMap(demos, column),
-            n_basis,
-            joint_names=names,
-            units=demos.joint_unit if channel == "joint" else "m",
-        )
+        named = _naming(channel, demos.joint_names, demos.joint_unit)
+        fits[channel], rmse = fit_shared(LazyMap(demos, column), n_basis, **named)
         metrics[f"mean_{channel}_rmse"] = float(rmse.square().mean().sqrt())
     return fits, metrics
 

@@ -295,25 +295,16 @@ class VisionRegion(Region):
         self, x: Float[Tensor, "*batch rows"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both rows"]]:
         """Potential and its gradient with respect to x [1/px]; means over the points."""
-        scaled = (x - self.target) / self.half_size
-        P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
-        points = P.shape[-1]
-        return P.mean(-1), gradient.flatten(-2) / (points * self.half_size)
-
-    def _steer(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
-        """Potential of a point, and its gradient with respect to the normalised offset."""
-        square = (scaled * scaled).sum(-1, keepdim=True)
-        steer = self._saturated if self.formulation == "saturated" else self._paper
-        P, slope = steer(square)
-        return P.squeeze(-1), slope * scaled
-
-    def _paper(self, square: Tensor) -> tuple[Tensor, Tensor]:
-        f = (square - 1).clamp(max=0)
-        return (0.5 * self.stiffness) * (1 - f * f), (-2 * self.stiffness) * f
-
-    def _saturated(self, square: Tensor) -> tuple[Tensor, Tensor]:
-        root = torch.sqrt(1 + square / _SATURATION**2)
-        return (2 * self.stiffness * _SATURATION**2) * (root - 1), 2 * self.stiffness / root
+        scaled = ((x - self.target) / self.half_size).unflatten(-1, (-1, 2))
+        square, k_v = (scaled * scaled).sum(-1, keepdim=True), self.stiffness
+        if self.formulation == "saturated":
+            root = torch.sqrt(1 + square / _SATURATION**2)
+            P, slope = (2 * k_v * _SATURATION**2) * (root - 1), 2 * k_v / root
+        else:
+            f = (square - 1).clamp(max=0)
+            P, slope = (0.5 * k_v) * (1 - f * f), (-2 * k_v) * f
+        points = scaled.shape[-2]
+        return P.squeeze(-1).mean(-1), (slope * scaled).flatten(-2) / (points * self.half_size)
 
 
 @pytree

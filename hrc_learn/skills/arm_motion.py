@@ -190,19 +190,18 @@ class PositionServo:
         here, q = state.joint_position, torch.from_numpy(state.joint_position)
         self._motion = self._smoother.step(before, np.asarray(target, dtype=float))
         wanted = self._motion.velocity + self.config.gain * (before.position - here)
-        distances = None
+        distances, J = None, self._chain.jacobian(q)
         if self._watch is not None:
             watched = self._watch.look(state.time, q)
             distances, u = watched.distances, torch.from_numpy(wanted)
-            J, cap = self._chain.jacobian(q), watched.speed_cap
-            scale = capped_scale(self._chain, q, J, u, cap)
+            scale = capped_scale(self._chain, q, J, u, watched.speed_cap)
             wanted = float(torch.minimum(watched.speed_scale, scale)) * wanted
         filtered, self.safety, _ = self._filter.step(
             self.safety,
             q,
             torch.from_numpy(wanted),
             self._dt,
-            jacobian=self._chain.jacobian(q),
+            jacobian=J,
             distances=distances,
         )
         velocity = filtered.numpy()

@@ -178,11 +178,10 @@ class ComplementaryMotion:
 
     def _take(self, wish: Float[Tensor, " joints"], width: float) -> None:
         """Add a posture [rad] and a gripper opening [m] of the policy to the queue."""
-        if self._wishes and not self.waits:
-            near = float((wish - self._wishes[0][0]).norm()) < _MET_AGAIN
-            if near and len(self._wishes) > 1:
-                # The policy has waited, too, or has ended: there is nothing to catch up.
-                self._wishes, self._progress = deque([self._wished()]), 0.0
+        behind = len(self._wishes) > 1 and not self.waits
+        if behind and float((wish - self._wishes[0][0]).norm()) < _MET_AGAIN:
+            # The policy has waited, too, or has ended: there is nothing to catch up.
+            self._wishes, self._progress = deque([self._wished()]), 0.0
         self._wishes.append((wish, width))
 
     def _go_on(self, steps: float) -> None:

@@ -126,12 +126,6 @@ def _margin(half_size: Float[Tensor, "3"], config: DrawnGoalsConfig) -> Float[Te
     return (half_size[:2] / 2).clamp(max=config.wall)
 
 
-def _contains(region: PositionRegion, planned: PositionRegion) -> bool:
-    """True if a region contains the middle of the planned one."""
-    offset = (planned.centre - region.centre).abs()
-    return bool((offset <= region.half_size).all())
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DrawnGoalsState:
     """State of a person's drawing and turn."""
@@ -217,7 +211,8 @@ class DrawnGoals:
         box, target = state.active
         region = drawn_position(state.active, planned.position, self._config)
         goals = replace(planned, position=region)
-        away = target is not None or not _contains(region, planned.position)
+        outside = (planned.position.centre - region.centre).abs() > region.half_size
+        away = target is not None or bool(outside.any())
         if away:
             goals = goals.approached_by(None)
         if target is not None or box is None:

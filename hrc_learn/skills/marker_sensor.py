@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -230,13 +231,8 @@ class DelayedDetection:
             self._taken = taken
         if self._rng.random() < self._latency.frame_loss:
             return
-        self._pending.append(
-            MarkerObservation(
-                time=self._taken,
-                joints=self._joints_at(self._taken, time, joints),
-                features=found,
-            )
-        )
+        then = self._joints_at(self._taken, time, joints)
+        self._pending.append(MarkerObservation(time=self._taken, joints=then, features=found))
 
     def newest(self, time: float) -> MarkerObservation | None:
         """Newest observation that has arrived since the last call; None: none has arrived.
@@ -287,11 +283,8 @@ def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialCha
     position = chain.forward(torch.from_numpy(log["joint_position"][rows])).position
     over_table = ((position - middle.position).norm(dim=-1) < _OVER_TABLE).numpy()
     occluded = over_table & np.isnan(log["feature"][rows, 0])
-    # Rising and falling edges alternate: an occlusion lasts from a rising to a falling edge.
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], occluded, [False]]).astype(int)))
-    steps = edges[1::2] - edges[::2]
-    dt = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    return float(steps.max()) * dt if len(steps) else 0.0
+    steps = max((len([*run]) for hidden, run in groupby(occluded) if hidden), default=0)
+    return steps * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 # Number of images that are averaged for the reference pixel of a held marker: half a second.

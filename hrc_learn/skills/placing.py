@@ -430,8 +430,7 @@ def plan_candidates(
     for via in _via_postures(workplace):
         first = joint_line(start, via, speed=0.6, dt=dt).numpy()
         rest = learned(via)
-        path = np.concatenate([first, rest.path[1:]])
-        yield replace(rest, path=path)
+        yield replace(rest, path=np.concatenate([first, rest.path[1:]]))
 
 
 def _via_postures(workplace: Workplace) -> Iterator[Float[Tensor, " joints"]]:
