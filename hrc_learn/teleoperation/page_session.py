@@ -252,9 +252,9 @@ class PageSession:
 
     def _status(self, step: GuidedStep) -> PageStatus:
         status, world = self._recorder.status, self.world
-        notes = [status.note, self._remark]
-        if status.state != "ready":
-            notes.insert(0, place_target_hint(self._workplace, step.pose.position.numpy()))
+        place = step.pose.position.numpy()
+        hint = "" if status.state == "ready" else place_target_hint(self._workplace, place)
+        notes = (hint, status.note, self._remark)
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)
         counts = self.arm.safety.counts.tolist()
         return PageStatus(
