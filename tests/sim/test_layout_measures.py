@@ -326,6 +326,11 @@ def test_objects_are_put_within_the_reach_and_the_yaw_of_the_table():
     tallest = 2 * max(item.half_size[2] for item in WORKPLACE.scene.objects)
     np.testing.assert_allclose(centre, (*WORKPLACE.table_centre, tallest / 2))
     np.testing.assert_allclose(half, (*WORKPLACE.table_reach, tallest / 2))
+    item, scene = WORKPLACE.scene.objects[0], WORKPLACE.scene
+    tower = replace(item, name="tower", half_size=(0.02, 0.02, tallest))
+    among = replace(WORKPLACE, scene=replace(scene, objects=(item, tower)))
+    for box in among.object_region():
+        assert float(box[2]) == pytest.approx(tallest)
 
 
 def test_a_place_on_a_shelf_counts_up_to_the_edges_of_the_board():
