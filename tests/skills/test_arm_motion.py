@@ -7,11 +7,18 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
+from hrc_learn.dmp import JointDMP, PoseDMP
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import arm_angle, panda
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import StraightLine, joint_line
-from hrc_learn.skills.placing import Plan, check_plan, follow_pose, plan_candidates
+from hrc_learn.skills.placing import (
+    PlacingSkill,
+    Plan,
+    check_plan,
+    follow_pose,
+    plan_candidates,
+)
 from hrc_learn.skills.work_cell import BlockedPathError
 
 
@@ -194,3 +201,48 @@ def test_other_plans_are_higher_or_go_round_near_home():
     inward, outward = (plan.path[-2, 6] - home.numpy()[6] for plan in others[-2:])
     assert inward == pytest.approx(-0.35)
     assert outward == pytest.approx(0.35)
+
+
+@pytest.fixture(scope="module")
+@shapes_unchecked()
+def shown():
+    """A motion of two seconds, from rest to rest, and the skill learned from it."""
+    time = torch.linspace(0.0, 2.0, 101, dtype=torch.float64)
+    turned = torch.tensor([-0.5, 0.1, 0.2, -0.2, 0.1, 0.3, -0.2], dtype=torch.float64)
+    progress = torch.tensor([minimum_jerk(t / 2)[0] for t in time.tolist()]).double()
+    q = panda.ready + progress[:, None] * turned
+    pose, angle = panda.forward(q), arm_angle(panda.chain, q)
+    return q, PlacingSkill(
+        joint=JointDMP.fit(time, q, 40, joint_names=panda.joint_names),
+        pose=PoseDMP.fit(time, pose.position, pose.orientation, 40, body=angle),
+        robot=panda,
+    )
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize("space", ["joint", "pose"])
+@pytest.mark.parametrize("speed", [1.0, 1.6])
+def test_a_plan_repeats_what_was_shown_at_its_speed(shown, space, speed):
+    q, skill = shown
+    goal = panda.forward(q[-1])
+    plan = skill.plan(q[0], goal, space=space, dt=0.05, speed=speed)
+    assert plan.duration == pytest.approx(2.0 / speed)
+    assert plan.goal is goal
+    every = np.linspace(0, 100, len(plan.path))
+    expected = np.stack([np.interp(every, np.arange(101), row) for row in q.numpy().T], axis=-1)
+    # In pose space, steps of 50 ms follow with a lag of one.
+    np.testing.assert_allclose(plan.path, expected, atol=2e-3 if space == "joint" else 0.06)
+    error = plan.tool_pose[-1].twist_to(goal)
+    assert float(error.norm()) < 2e-3
+
+
+@shapes_unchecked()
+def test_a_plan_in_pose_space_keeps_the_shown_arm_angle_from_another_start(shown):
+    q, skill = shown
+    start = follow(q[0], panda.forward(q[0]), torch.full((STEPS,), 0.2).double())[-1]
+    plan = skill.plan(start, panda.forward(q[-1]), space="pose", dt=0.05)
+    np.testing.assert_array_equal(plan.path[0], start)
+    angles = arm_angle(panda.chain, torch.from_numpy(plan.path[[0, -1]]))
+    shown_last = float(arm_angle(panda.chain, q[-1]))
+    assert float(angles[0]) > 0.05
+    assert float(angles[1]) == pytest.approx(shown_last, abs=0.02)
