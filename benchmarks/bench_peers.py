@@ -5,7 +5,7 @@ settings of each peer (`motion_peers.py`) are those that best predict some of th
 from the rest. Recordings are folders SET/TASK.npy of shape (demonstrations, samples, D), evenly
 sampled; `prepare_recordings.py` makes them from public files, and the LASA set comes with the
 environment of the peers, which is built if it is missing. Results are kept in a file per set: a
-second run predicts only the sets that are new.
+second run predicts only with new sets, new peers and new settings.
 """
 
 import os
@@ -46,7 +46,7 @@ class Args:
     recordings: Path | None = None
     """Folder of folders SET of TASK.npy files; None: the LASA set alone."""
     out: Path = Path("outputs/peers")
-    """Folder of the results by set."""
+    """Folder of the results by set; delete a file if the recordings of the set have changed."""
     tasks: int = 9
     """Largest number of tasks of each set, the first by name."""
     predicted: int = 36
@@ -76,6 +76,8 @@ class Measured:
     predict: list[float] = field(default_factory=list)
     """CPU time of one prediction [s]."""
     chosen: list[Setting] = field(default_factory=list)
+    settings: list[Setting] = field(default_factory=list)
+    """Those compared."""
 
 
 @dataclass(kw_only=True)
@@ -99,10 +101,9 @@ def main(args: Args) -> None:
     for name, tasks in sets.items():
         file = args.out / f"{name}.json"
         known = read_json(file, Results) if file.exists() else None
-        if known is None or known.options != options or list(known.peers) != list(PEERS):
-            known = predict_set(name, dict(list(tasks.items())[: args.tasks]), options)
-            cli.write_json(file, asdict(known))
-        found[name] = known
+        known = known.peers if known is not None and known.options == options else {}
+        found[name] = predict_set(name, dict(list(tasks.items())[: args.tasks]), options, known)
+        cli.write_json(file, asdict(found[name]))
     figures: dict[str, float] = {}
     summary = Table("RMSE [% of range], p50 / p90")
     for name, results in found.items():
@@ -139,20 +140,29 @@ def recorded_sets(folder: Path | None) -> Iterator[tuple[str, dict[str, Array]]]
         yield each.name, {file.stem: np.load(file) for file in sorted(each.glob("*.npy"))}
 
 
-def predict_set(name: str, tasks: dict[str, Array], options: dict[str, int]) -> Results:
-    """Predict demonstrations of each task with each peer."""
-    results = Results(options=options, task=[], peers={peer: Measured() for peer in PEERS})
+def predict_set(
+    name: str, tasks: dict[str, Array], options: dict[str, int], known: dict[str, Measured]
+) -> Results:
+    """Predict demonstrations of each task with each peer whose figures are not known."""
     most = max(options["predicted"] // len(tasks), 1)
-    held = {task: spread(len(shown), most) for task, shown in tasks.items()}
+    held = [(task, i) for task, shown in tasks.items() for i in spread(len(shown), most)]
+    motions = {
+        task: np.stack([resampled(one, SAMPLES) for one in shown.astype(float)])
+        for task, shown in tasks.items()
+    }
+    results = Results(options=options, task=[task for task, _ in held], peers={})
     with Progress(console=console()) as progress:
-        steps = progress.add_task(name, total=sum(map(len, held.values())) * len(PEERS))
-        for task, shown in tasks.items():
-            motions = np.stack([resampled(one, SAMPLES) for one in shown.astype(float)])
-            for i in held[task]:
-                results.task.append(task)
-                for peer, measured in results.peers.items():
-                    progress.update(steps, description=f"{name}, {task}, {peer}", advance=1)
-                    predict(PEERS[peer], motions, i, options["inner"], measured)
+        steps = progress.add_task(name, total=len(held) * len(PEERS))
+        for label, peer in PEERS.items():
+            measured = known.get(label, Measured())
+            if measured.settings != list(peer.settings) or len(measured.rmse) != len(held):
+                measured = Measured(settings=list(peer.settings))
+                for task, i in held:
+                    progress.update(steps, description=f"{name}, {task}, {label}", advance=1)
+                    predict(peer, motions[task], i, options["inner"], measured)
+            else:
+                progress.advance(steps, len(held))
+            results.peers[label] = measured
     return results
 
 

@@ -246,7 +246,7 @@ def kernel_primitive(shown: Array, settings: Sequence[Setting]) -> list[Predicto
     return [predictor(**setting) for setting in settings]
 
 
-WIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
+WIDTHS = (0.1, 0.2, 0.4, 0.8)
 """Widths of kernels, relative to the duration."""
 MEAN_OR_NEAREST = ("mean", "nearest")
 PEERS = {
@@ -262,10 +262,10 @@ PEERS = {
     "MP_PyTorch ProDMP": Peer(
         their_prodmp, grid(count=(5, 10, 20), ridge=(1e-9, 1e-5), of=MEAN_OR_NEAREST)
     ),
-    "TP-GMM": Peer(task_mixture, grid(count=(3, 6, 10), ridge=(1e-5, 1e-4, 1e-3))),
+    "TP-GMM": Peer(task_mixture, grid(count=(5, 10, 20), ridge=(1e-5, 1e-3, 1e-2))),
     "KMP": Peer(
         kernel_primitive,
-        grid(count=(8,), local=(False, True), width=WIDTHS, penalty=(0.1, 1.0, 10.0)),
+        grid(count=(8, 16), local=(False, True), width=WIDTHS, penalty=(0.1, 1.0, 10.0, 100.0)),
     ),
 }
 """Ours and those of others, by the name in the table."""

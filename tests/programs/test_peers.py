@@ -1,8 +1,9 @@
 """Task-parameterized mixtures and kernelized primitives of the benchmark of peers."""
 
+import bench_peers
 import numpy as np
 import pytest
-from bench_peers import Measured, predict, resamples, spread, tuned
+from bench_peers import Measured, predict, predict_set, resamples, spread, tuned
 from motion_peers import Peer
 from prepare_recordings import resampled
 from scipy.stats import multivariate_normal
@@ -113,6 +114,27 @@ def test_settings_are_chosen_and_figures_measured_on_held_out_motions():
     assert measured.rmse[0] == pytest.approx(0.01 / 2**0.5 / span, rel=0.05)
     assert measured.miss[0] < 1e-12
     assert measured.acceleration[0] < 1e-6
+
+
+def test_only_new_settings_are_predicted_again(monkeypatch):
+    calls = []
+
+    def counted(shown, settings):
+        calls.append(len(settings))
+        return linear(shown, settings)
+
+    rng = np.random.default_rng(0)
+    tasks = {"a": rng.standard_normal((5, 30, 2)), "b": rng.standard_normal((4, 20, 2))}
+    options = {"predicted": 6, "inner": 2}
+    peers = {"learn": Peer(counted, [{"over": 0.0}])}
+    monkeypatch.setattr(bench_peers, "PEERS", peers)
+    first = predict_set("set", tasks, options, {})
+    assert first.task == ["a"] * 3 + ["b"] * 3
+    assert calls == [1] * 6
+    peers["new"] = Peer(counted, [{"over": 0.0}, {"over": 0.1}])
+    second = predict_set("set", tasks, options, first.peers)
+    assert second.peers["learn"] is first.peers["learn"]
+    assert calls[6:] == [2, 2, 1] * 6
 
 
 def test_the_bootstrap_draws_whole_tasks():
