@@ -348,11 +348,17 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             start: Start of one motion, as `rollout` of the primitive takes it.
             goal: Goal.
             duration: Known duration [s].
+
+        Raises:
+            ValueError: Start or goal has a wrong shape, or is a batch.
         """
         if duration is not None:
             return self.condition([], duration=duration).at(start, goal)
         like = self.mean_primitive()
-        ends = columns_of_ends(like, like.with_boundary(start, goal)).mT.to(self.mean)
+        moved: Any = like.with_boundary(start, goal)
+        if batch := tuple(moved.motion.start.shape[:-1]):
+            raise ValueError(f"start and goal must be those of one motion, got a batch {batch}")
+        ends = columns_of_ends(like, moved).mT.to(self.mean)
         spread = self.spread.view(*self.mean.shape, -1)
         E, k = spread[:, -2:].flatten(0, 1), self.dependence
         back = torch.linalg.pinv(E, rtol=SINGULAR)

@@ -204,6 +204,8 @@ def test_what_cannot_be_is_refused(distribution):
         distribution.position([-1.0])
     with pytest.raises(ValueError, match=r"noise has shape \(3,\), .* must be \(1, 2\)"):
         distribution.condition([0.5], [[0.0, 0.0]], noise=[0.1, 0.1, 0.1])
+    with pytest.raises(ValueError, match=r"one motion, got a batch \(3,\)"):
+        distribution.at(goal=torch.zeros(3, 2))
     for slack in (float("nan"), -1.0):
         with pytest.raises(ValueError, match="slack must be finite and not negative"):
             ProbabilisticDMP.fit(JointDMP.fit(time, both), slack=slack)
