@@ -83,7 +83,7 @@ class DatasetWriter:
             DatasetError: The dataset to append to cannot be read.
         """
         self.root = Path(root)
-        if not fps > 0:
+        if not 0 < fps < np.inf:
             raise ValueError(f"fps must be positive, got {fps}")
         if len(set(joint_names)) != len(joint_names):
             raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")

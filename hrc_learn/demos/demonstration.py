@@ -66,9 +66,13 @@ class Demonstration:
     """All other numeric columns by their key in the dataset, unconverted."""
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
+        for name in (*_ARRAYS, "feature_visible"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, float_array(getattr(self, name)))
+                array = float_array(getattr(self, name))
+                is_mask = name == "feature_visible"
+                object.__setattr__(self, name, array > 0 if is_mask else array)
+        extra = {key: float_array(values) for key, values in self.extra.items()}
+        object.__setattr__(self, "extra", extra)
         frames, joints = len(self.time), len(self.joint_names)
         if frames == 0:
             raise ValueError("a demonstration needs at least one frame, but time is empty")
@@ -81,7 +85,10 @@ class Demonstration:
                 text = f"{name} has shape {array.shape}, expected ({frames}, {width})"
                 named = f" for the joints {', '.join(self.joint_names)}" if joints else ""
                 raise ValueError(text + named)
-        stalled = np.flatnonzero(np.diff(self.time) <= 0)
+        for key, array in extra.items():
+            if len(array) != frames:
+                raise ValueError(f"{key} has {len(array)} frames, but time has {frames}")
+        stalled = np.flatnonzero(~(np.diff(self.time) > 0))
         if len(stalled):
             k = int(stalled[0])
             step = f"{self.time[k]:.6g} s to {self.time[k + 1]:.6g} s at frame {k}"

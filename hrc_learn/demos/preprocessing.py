@@ -107,6 +107,9 @@ def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Dem
             "with savitzky_golay, which accepts uneven ones"
         )
     rate = 1 / steps.mean()
+    if not 0 < cutoff < rate / 2:
+        text = f"the cut-off must lie between 0 and half the frame rate, {rate / 2:g} Hz"
+        raise ValueError(f"{text}, got {cutoff}")
     correction = (np.sqrt(2) - 1) ** (1 / (2 * order))
     # Bilinear transform: the correction applies to the frequencies of the analogue filter.
     raised = np.arctan(np.tan(np.pi * cutoff / rate) / correction) * rate / np.pi
@@ -316,7 +319,7 @@ def regular_grid(duration: float | int, fps: float | int) -> Float64[np.ndarray,
     Raises:
         ValueError: `fps` is not positive, or the duration is shorter than a period.
     """
-    if not fps > 0:
+    if not 0 < fps < np.inf:
         raise ValueError(f"fps must be positive, got {fps}")
     # The tolerance of a thousandth of a period allows for rounded stamps.
     count = int(np.floor(duration * fps + 1e-3)) + 1
@@ -355,6 +358,10 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
     moved: dict[str, Any] = {}
     for name in demo.recorded[1:]:
         values = getattr(demo, name)
+        if name == "feature" and demo.feature_visible is not None:
+            # It need not be finite where it is not visible.
+            sound = np.isfinite(values) | demo.feature_visible[:, None]
+            values = np.where(sound, values, 0.0)
         if name in _SMOOTH:
             moved[name] = CubicSpline(demo.time, values)(time)
         else:
@@ -463,6 +470,9 @@ def warp(
     Returns:
         Indices into both sequences along the cheapest monotone path from both starts to both
         ends; ties prefer the diagonal.
+
+    Raises:
+        ValueError: No path has a finite cost.
     """
     rows, columns = cost.shape
     total = np.full((rows + 1, columns + 1), np.inf)
@@ -472,6 +482,8 @@ def warp(
         j = diagonal - i
         before = np.minimum(np.minimum(total[i, j], total[i, j + 1]), total[i + 1, j])
         total[i + 1, j + 1] = cost[i, j] + before
+    if not total[-1, -1] < np.inf:
+        raise ValueError("no path of finite cost pairs the two sequences")
     i, j = rows, columns
     path = [(i, j)]
     while (i, j) != (1, 1):
@@ -494,7 +506,8 @@ def align(demos: DemonstrationSet) -> DemonstrationSet:
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled
     likewise. Afterwards, all demonstrations have the times of the reference, and frame k of
-    each shows the same phase of the task. Recorded joint velocities are replaced by estimates.
+    each shows the same phase of the task. Recorded joint velocities are replaced by estimates,
+    and commanded ones scaled to the new timing.
 
     Args:
         demos: At least one demonstration; all must record the quantity that is compared.
@@ -550,6 +563,8 @@ def _follow(
         times = local_polynomial(reference.time, column, window=window, degree=1)[0][:, 0]
     times = np.maximum.accumulate(np.clip(times, 0, demo.time[-1]))
     fields = _fields_at(demo, times)
+    for name in {"joint_velocity", "command_velocity"} & fields.keys():
+        fields[name] *= np.gradient(times, reference.time)[:, None]
     warped = replace(demo, time=reference.time, fps=reference.fps, **fields)
     if demo.joint_velocity is None or demo.joint_position is None:
         return warped

@@ -35,6 +35,8 @@ def demonstration(frames=5, **changed) -> Demonstration:
         ({"joint_position": np.zeros((5, 2))}, r"expected \(5, 3\) for the joints a, b, c"),
         ({"orientation": np.zeros((5, 3))}, r"orientation has shape \(5, 3\)"),
         ({"time": np.array([0, 0.1, 0.1, 0.2, 0.3])}, "from 0.1 s to 0.1 s at frame 1"),
+        ({"time": np.array([0, 0.1, np.nan, 0.3, 0.4])}, "from 0.1 s to nan s at frame 1"),
+        ({"extra": {"force": np.zeros((4, 1))}}, "force has 4 frames, but time has 5"),
     ],
 )
 def test_arrays_that_contradict_each_other_are_refused(changed, message):
@@ -103,9 +105,15 @@ def test_lists_and_tensors_become_arrays():
         demo = Demonstration(
             time=[0.0, 0.1],  # type: ignore[arg-type]
             joint_position=joints,  # type: ignore[arg-type]
+            feature=[[3, 4], [5, 6]],  # type: ignore[arg-type]
+            feature_visible=torch.tensor([True, False]),  # type: ignore[arg-type]
+            extra={"force": [[1], [2]]},  # type: ignore[dict-item]
             joint_names=("a", "b"),
             fps=10,
         )
+    assert demo.recorded == ("time", "joint_position", "feature", "feature_visible")
+    np.testing.assert_array_equal(demo.feature_visible, [True, False], strict=True)
+    np.testing.assert_array_equal(demo.extra["force"], [[1.0], [2.0]], strict=True)
     assert demo.joint_position is not None
     assert demo.joint_position.dtype == np.float64
     np.testing.assert_array_equal(demo.joint_position, joints.detach().numpy())

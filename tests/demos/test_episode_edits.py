@@ -239,6 +239,25 @@ def test_columns_are_resampled_by_splines_lines_and_levels():
         )
 
 
+def test_a_feature_is_resampled_where_both_neighbours_show_it():
+    frame = np.arange(60)
+    seen = (frame < 20) | (frame >= 30)
+    pixels = np.stack([100.3 + 3 * frame, 200 - 2.1 * frame], axis=1)
+    given = edit(np.where(seen[:, None], pixels, np.nan), role="feature", unit="px", seen=seen)
+    selection = ColumnSelection(
+        role="feature_visible", columns=(("seen", 0),), labels=("visible",)
+    )
+    selections = {**given.selections, "feature_visible": selection}
+    given = replace(given, columns=replace(given.columns, selections=selections))
+    moved = edits.resample_to_grid(given, 75)
+    at = (moved.time - given.time[0]) * 50
+    visible = moved.frames["seen"][:, 0] > 0
+    both = seen[np.floor(at + 1e-6).astype(int)] & seen[np.ceil(at - 1e-6).astype(int)]
+    np.testing.assert_array_equal(visible, both)
+    expected = np.stack([100.3 + 3 * at, 200 - 2.1 * at], axis=1)
+    np.testing.assert_allclose(moved.frames[STATE][visible], expected[visible])
+
+
 def rest_and_motion(before, after):
     return np.concatenate([np.zeros(before), SLOW, np.ones(after)])
 

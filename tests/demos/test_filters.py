@@ -86,3 +86,10 @@ def test_the_path_is_a_cheapest_one(rows, columns, seed):
     assert (first[-1], second[-1]) == (rows - 1, columns - 1)
     steps = np.stack([np.diff(first), np.diff(second)], axis=1)
     assert set(map(tuple, steps)) <= {(1, 1), (1, 0), (0, 1)}
+
+
+def test_sequences_without_an_allowed_path_are_refused():
+    cost = np.zeros((3, 5))
+    cost[1] = np.inf
+    with pytest.raises(ValueError, match="no path of finite cost"):
+        warp(cost)

@@ -108,12 +108,13 @@ def test_what_is_counted_or_seen_is_not_averaged():
     visible = np.array([True, True, False, True, True, True])
     demo = swing(
         time,
-        feature=np.full((6, 2), 5.0),
+        feature=np.where(visible[:, None], [[5.0, 5.0]], np.nan),
         feature_visible=visible,
         extra={"mixed": np.stack([np.arange(6.0), np.arange(6) / 4], axis=1)},
     )
     moved = at_times(demo, np.array([0.0, 0.04, 0.16, 0.24, 0.38, 0.5]))
     assert moved.feature_visible.tolist() == [True, True, False, False, True, True]
+    np.testing.assert_allclose(moved.feature[moved.feature_visible], 5)
     np.testing.assert_allclose(moved.extra["mixed"][:, 0], [0, 0, 2, 2, 4, 5])
     np.testing.assert_allclose(moved.extra["mixed"][:, 1], [0, 0.1, 0.4, 0.6, 0.95, 1.25])
     with pytest.raises(ValueError, match=r"exceed the demonstration, which lasts 0\.5 s"):
@@ -197,8 +198,9 @@ def test_filters_say_what_they_need():
     with pytest.raises(ValueError, match="needs even stamps"):
         butterworth(swing(jittered()), cutoff=5)
     even = swing(np.arange(100) / 50)
-    with pytest.raises(ValueError, match="fs/2"):
-        butterworth(even, cutoff=25)
+    for cutoff in (25, 60, 0):  # 60 Hz look like 10 Hz at this rate
+        with pytest.raises(ValueError, match="between 0 and half the frame rate, 25 Hz"):
+            butterworth(even, cutoff=cutoff)
     with pytest.raises(ValueError, match="padlen"):
         butterworth(cut(even, 0, 8), cutoff=5)
 
@@ -347,6 +349,18 @@ def test_demonstrations_are_brought_to_the_timing_of_one():
         assert difference.mean() < 0.01
     # Its velocities are those of the leader's timing now.
     np.testing.assert_allclose(aligned[0].joint_velocity, demos[1].joint_velocity, atol=0.5)
+
+
+def test_commanded_velocities_follow_the_timing_of_the_leader():
+    time = np.arange(300) / 50
+    motion = swing(time)
+    slow = replace(motion, time=1.5 * time, command_velocity=motion.joint_velocity / 1.5)
+    # Without positions of joints, the measured velocities are scaled, too.
+    bare = replace(slow, joint_position=None, joint_velocity=slow.command_velocity)
+    for other in (slow, bare):
+        _, demo = align(DemonstrationSet([motion, other]))
+        np.testing.assert_allclose(demo.command_velocity, motion.joint_velocity, atol=0.02)
+        np.testing.assert_allclose(demo.joint_velocity, motion.joint_velocity, atol=0.02)
 
 
 def test_orientations_that_agree_are_no_angle_apart():

@@ -29,6 +29,7 @@ from hrc_learn.demos import (
     load_demos,
     repair_dataset,
 )
+from hrc_learn.demos.preprocessing import regular_grid
 from hrc_learn.demos.read.contract import keep_contract
 
 STATE = "observation.state"
@@ -175,8 +176,11 @@ def test_what_cannot_be_repaired_is_named_or_left_out(tmp_path, damage, options,
 
 
 def test_only_a_rate_above_zero_can_be_resampled_to():
-    with pytest.raises(ValueError, match="fps must be positive, got 0"):
-        RepairOptions(fps=0)
+    for fps in (0, np.inf):
+        with pytest.raises(ValueError, match=f"fps must be positive, got {fps}"):
+            RepairOptions(fps=fps)
+        with pytest.raises(ValueError, match=f"fps must be positive, got {fps}"):
+            regular_grid(1.0, fps)
 
 
 def test_stamps_of_lerobot_that_stall_are_counted_anew(tmp_path):

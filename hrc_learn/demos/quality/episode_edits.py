@@ -366,7 +366,12 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
         text = "holds changes per step, which would be wrong at another rate: keep the frames"
         raise edit.fault(text, key="command_position")
     time = np.minimum(grid, known[-1])
-    smooth = fix_signs(_unwrapped_all(edit))
+    smooth, seen = fix_signs(_unwrapped_all(edit)), None
+    if {"feature", "feature_visible"} <= edit.selections.keys():
+        seen = edit.quantities["feature_visible"] > 0
+        pixels = edit.quantities["feature"]  # it need not be finite where it is not visible
+        sound = np.where(np.isfinite(pixels) | seen, pixels, 0.0)
+        smooth = smooth.with_quantity("feature", sound)
     frames = {
         key: make_interp_spline(known, values.astype(float), k=1)(time)
         for key, values in smooth.frames.items()
@@ -382,6 +387,9 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     nearest = nearest_frames(known, time)
     for key, held in _levels(edit):
         moved.frames[key][:, held] = edit.frames[key][nearest][:, held]
+    if seen is not None:  # visible in both neighbours, as in `preprocessing.at_times`
+        both = np.interp(time, known, seen[:, 0]) > 1 - 1e-9
+        moved = moved.with_quantity("feature_visible", both[:, None])
     return replace(
         moved,
         kept=edit.kept[nearest],

@@ -76,7 +76,7 @@ class RepairOptions:
     """Report the changes without writing anything."""
 
     def __post_init__(self) -> None:
-        if self.fps is not None and not self.fps > 0:
+        if self.fps is not None and not 0 < self.fps < np.inf:
             raise ValueError(f"fps must be positive, got {self.fps}")
 
 
