@@ -41,7 +41,7 @@ def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOption
     """
     place = f"{recording.file.name} {recording.label}".strip()
     time, notes = _stamps_of_state(recording, meaning, options)
-    frames = {name: _latest(recording, name, time, meaning.time) for name in meaning.fields}
+    frames = {n: _latest(recording, n, time, meaning.time, options) for n in meaning.fields}
     known = np.all([index >= 0 for index in frames.values()], axis=0)
     partial = [name for name, index in frames.items() if (index < 0).any()]
     inside = np.flatnonzero(known)
@@ -106,7 +106,7 @@ def _stamps_of_state(
     stamps = meaning.time or next((n for n, one in fields.items() if is_time(n, one)), "")
     rate = options.fps or recording.fps
     if meaning.time and fields[stamps].frames == frames:
-        time = read_stamps(recording, stamps, options.units.get("time", ""))
+        time = read_stamps(recording, stamps, options.units.get("time", ""), rate)
         steps = np.diff(time)
         wide = np.flatnonzero(steps > max(_JUMP * float(np.median(steps)), STEPS[1]))
         jumps = [f"{stamps} jumps by {steps[k]:.3g} s after frame {k}" for k in wide[:1]]
@@ -127,15 +127,20 @@ def _stamps_of_state(
 
 
 def _latest(
-    recording: Recording, name: str, time: Float64[np.ndarray, " frames"], main: str
+    recording: Recording,
+    name: str,
+    time: Float64[np.ndarray, " frames"],
+    main: str,
+    options: ImportOptions,
 ) -> Int64[np.ndarray, " frames"]:
     """Latest frame of a field at each stamp of the state; -1 if it is missing or too old."""
     one, own = recording.fields[name], recording.clock_of(name, main)
     length, lasts = one.frames, float(time[-1] - time[0])
-    if own not in ("", main):
-        stamps = read_stamps(recording, own)
-    elif length == len(time):
+    if length == len(time) and own in ("", main if main else own):
         return np.arange(length)
+    if own not in ("", main):
+        rate, unit = options.fps or recording.fps, options.units.get("time", "")
+        stamps = read_stamps(recording, own, rate=rate, likely=unit)
     elif one.rate:
         stamps = time[0] + np.arange(length) / one.rate
         if abs(length / one.rate - lasts) > 0.5 + 0.05 * lasts:

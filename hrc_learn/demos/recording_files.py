@@ -167,9 +167,20 @@ def time_unit_in(name: str) -> str:
 
 
 def read_stamps(
-    recording: Recording, name: str, unit: str = ""
+    recording: Recording,
+    name: str,
+    unit: str = "",
+    rate: float | int | None = None,
+    likely: str = "",
 ) -> Float64[np.ndarray, " _frames"]:
     """Stamps of a field [s]. Their unit is given or declared, or their name or size tells it.
+
+    Args:
+        recording: The episode.
+        name: The field.
+        unit: Unit from the caller; "" if none is given.
+        rate: Frame rate [1/s] by which a count of frames becomes a time.
+        likely: Unit of stamps whose unit would otherwise be in doubt.
 
     Raises:
         DatasetError: Stamps do not increase, or their unit is in doubt.
@@ -181,17 +192,21 @@ def read_stamps(
     steps = np.diff(time)
     for k in np.flatnonzero(steps <= 0)[:1]:
         way = f"{time[k]:.9g} to {time[k + 1]:.9g} at frame {k}"
-        text = f"time must increase, but goes from {way}: remove repeated rows, or import"
-        raise recording.error(f"{text} without this field and with --fps", name)
+        text = f"time must increase, but goes from {way}: remove repeated rows, or"
+        raise recording.error(f"{text} give --duration, which ignores the stamps", name)
     unit = unit or recording.fields[name].unit or time_unit_in(name)
     if unit:
         return time * unit_factor("time", unit)
     step = float(np.median(steps)) if len(steps) else 1.0
     sizes = {unit: unit_factor("time", unit) for unit in ("s", "ms", "us", "ns")}
     found = [u for u, size in sizes.items() if _EPOCH[0] < time[0] * size < _EPOCH[1]]
+    counts = not found and bool((steps == 1).all())
+    if counts and rate:
+        return time / rate
     found = found or [u for u, size in sizes.items() if STEPS[0] <= step * size <= STEPS[1]]
-    counts = bool((steps == 1).all())
     if counts or len(found) != 1:
+        if likely:
+            return time * unit_factor("time", likely)
         kinds = "a count of frames (give --fps), ms or s" if counts else "s, ms, us or ns"
         text = f"steps by {step:.4g}: {kinds}? Give the unit: --units time s"
         raise recording.error(text, name)
@@ -217,7 +232,7 @@ def make_field(
     if dtype.kind in "SUOT":
         shape = shape[:1]
         kind = "encoded" if dtype.kind == "O" and is_encoded(read(0, 1)[0]) else "text"
-    elif numeric and large and "depth" in name.lower():
+    elif numeric and large and ("depth" in name.lower() or dtype == np.uint16):
         kind = "depth"
     elif numeric and large and (axes == 4 or (axes == 3 and dtype == np.uint8)):
         kind = "image"
@@ -385,5 +400,6 @@ def _ends(whole: Recording) -> list[int] | None:
             flags.append(field.numbers()[:, 0] > 0)
     if not flags or len({len(flag) for flag in flags}) > 1:
         return None
-    last_frames = np.flatnonzero(np.logical_or.reduce(flags)[:-1]) + 1
-    return [*last_frames.tolist(), len(flags[0])]
+    # A flag may stay up from the success to the end of the episode.
+    ends = np.flatnonzero(np.diff(np.logical_or.reduce(flags).astype(int)) < 0) + 1
+    return [*ends.tolist(), len(flags[0])]

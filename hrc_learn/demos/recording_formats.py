@@ -173,13 +173,9 @@ def read_hdf5(path: Path) -> list[Recording]:
             elif node.shape == ():
                 _attributes({place.rpartition("/")[2]: node[()]}, details)
             elif node.shape and 0 not in node.shape and not node.dtype.names:
-                read, unit = (
-                    partial(_read_hdf5, path, place),
-                    _text(node.attrs.get("units", "")),
-                )
-                fields[place] = make_field(
-                    place, node.shape, node.dtype, read, unit=unit_in_words(unit)
-                )
+                unit = unit_in_words(_text(node.attrs.get("units", "")))
+                read = partial(_read_hdf5, path, place)
+                fields[place] = make_field(place, node.shape, node.dtype, read, unit=unit)
     return split_episodes(path, fields, **details)
 
 
@@ -297,8 +293,9 @@ def read_tfrecord(path: Path) -> list[Recording]:
 
 def _rlds_episode(path: Path, number: int, place: tuple[int, int]) -> Recording:
     found, task, label = {}, "", f"record {number}"
-    steps = {n: v for n, v in _rlds_record(path, *place).items() if n.startswith("steps/")}
-    frames = max(1, min((len(values) for values in steps.values()), default=1))
+    record = _rlds_record(path, *place)
+    steps = {n: v for n, v in record.items() if n.startswith("steps/") and len(v)}
+    frames = min((len(values) for values in steps.values()), default=1)
     for name, values in steps.items():
         short = name.removeprefix("steps/")
         if isinstance(values, list):
@@ -374,16 +371,22 @@ def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
             for name, field in one.fields.items()
         }
         opened = [(path, [replace(opened[0][1][0], file=path, fields=joined)])]
-    episodes = []
+    episodes, unused = [], dict.fromkeys(videos)
     for table, found in opened:
+        name = re.compile(rf"{re.escape(table.stem)}(?!\d)")
+        shown = [v for v in videos if len(opened) == 1 or name.match(v.stem)]
+        unused = {v: None for v in unused if v not in shown}
         own = {
             v.stem.removeprefix(table.stem).strip("_-. ") or v.stem: _video_field(v)
-            for v in videos
-            if len(opened) == 1 or re.match(rf"{re.escape(table.stem)}(?!\d)", v.stem)
+            for v in shown
         }
         if own and len(found) > 1:
             raise DatasetError("holds several episodes, and the videos are of one", file=table)
         episodes += [replace(one, fields=one.fields | own) for one in found]
+    if unused and episodes:
+        names = ", ".join(video.name for video in unused)
+        text = f"videos left out, as their names begin with the name of no other file: {names}"
+        episodes[0] = replace(episodes[0], notes=(*episodes[0].notes, text))
     return episodes
 
 

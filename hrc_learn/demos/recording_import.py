@@ -181,20 +181,18 @@ def write_plan(
         text = ", ".join(f"{rate:g} ({name.strip()})" for rate, name in [*rates.items()][:3])
         raise ValueError(f"frame rates differ: {text}; give --fps (stamps are kept)")
     first = next(plan.episodes())
-    demo, sizes = first.demonstration, {}
+    demo = first.demonstration
     features = {key: names for key, (_, names) in plan.meaning.kept.items()}
     made = actions and not plan.has_actions
     if made and demo.joint_position is None:
         columns = columns_for([p for p in _POSE if p in demo.recorded], (), {})
         names = tuple(name for column in columns for name in column.names)
         features["action"] = names or features["observation.state"]
-    for camera, images in first.images.items():
-        height, width = next(_images(*images)).shape[:2]
-        sizes[camera] = (height - height % 2, width - width % 2)  # videos need even sizes
+    sizes = {camera: next(_images(*shown)).shape[:2] for camera, shown in first.images.items()}
     count, seconds, joints = 0, 0.0, demo.joint_names
     with DatasetWriter(out, demo.fps, robot_type, joints, features, cameras=sizes) as writer:
         for one in plan.episodes():
-            shown = {c: _images(*one.images[c], size) for c, size in sizes.items()}
+            shown = {camera: _images(*images) for camera, images in one.images.items()}
             shot = one.demonstration
             writer.add_episode(_with_next_states(shot) if made else shot, shown)
             count += len(shot)
@@ -250,12 +248,8 @@ def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> 
     return Episode(demonstration=demo, images=images, notes=clock.notes)
 
 
-def _images(
-    images: Field,
-    index: Int64[np.ndarray, " frames"],
-    size: tuple[int | None, int | None] = (None, None),
-) -> Iterator[Image]:
-    """RGB image of each frame, cropped to a height and width and read in batches."""
+def _images(images: Field, index: Int64[np.ndarray, " frames"]) -> Iterator[Image]:
+    """RGB image of each frame, read in batches and cropped to an even size for videos."""
     scale = 0.0
     for wanted in np.split(index, np.flatnonzero(np.diff(index // _BATCH)) + 1):
         batch = images.read(int(wanted[0]), int(wanted[-1]) + 1)
@@ -266,7 +260,8 @@ def _images(
                 # Images of real numbers range from 0 to 1 or from 0 to 255.
                 scale = scale or (255.0 if float(batch.max()) <= 1.0 else 1.0)
                 image = np.clip(np.rint(image * scale), 0, 255).astype(np.uint8)
-            yield _rgb(image)[: size[0], : size[1]]
+            rgb = _rgb(image)
+            yield rgb[: len(rgb) // 2 * 2, : rgb.shape[1] // 2 * 2]
 
 
 def _rgb(image: np.ndarray) -> Image:

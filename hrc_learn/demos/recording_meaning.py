@@ -101,9 +101,11 @@ def understand(
         theirs, found = _by_name(other, options, hinted)
         pairs = (meaning, search), (theirs, found)
         contents = [sorted([*m.selections, *m.kept, *m.cameras, *s.actions]) for m, s in pairs]
+        used = [*meaning.fields, *search.actions, *filter(None, [meaning.time])]
         for what, one, two in (
             ("joints", meaning.joint_names, theirs.joint_names),
             ("arrays", *contents),
+            ("fields", _shapes(first, used), _shapes(other, used)),
         ):
             if one != two:
                 text = f"{other.file} and {first.file} do not fit into one dataset: {what}"
@@ -122,6 +124,12 @@ def understand(
 def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
     fields = recording.fields.items()
     return frozenset((n, f.kind, f.width if f.kind == "number" else 0) for n, f in fields)
+
+
+def _shapes(recording: Recording, names: Sequence[str]) -> list[str]:
+    """Those of the fields that exist, with the number of components if they hold numbers."""
+    fields = ((name, recording.fields[name]) for name in names if name in recording.fields)
+    return [f"{n} ({one.width})" if one.kind == "number" else n for n, one in fields]
 
 
 def _by_name(
@@ -389,7 +397,8 @@ def _rate_of(first: Recording, meaning: Meaning, options: ImportOptions) -> floa
     if first.streams:
         return _CHECK_RATE
     if meaning.time and first.fields[meaning.time].frames == frames > 1:
-        time = read_stamps(first, meaning.time, options.units.get("time", ""))
+        unit, rate = options.units.get("time", ""), options.fps or first.fps
+        time = read_stamps(first, meaning.time, unit, rate)
         return 1 / float(np.median(np.diff(time)))
     return frames / lasts if lasts else options.fps or first.fps or _CHECK_RATE
 
@@ -404,6 +413,9 @@ def _matched(
         times = [one.fields[clock].numbers()[:, 0] for clock in own]
         first, last = max(t[0] for t in times), min(t[-1] for t in times)
         ticks = np.arange(first, last, 1 / _CHECK_RATE)
+        if not len(ticks):
+            text = f"the clocks of {command[0][0]} and of {state[0][0]} do not overlap"
+            raise one.error(text)
         at = [np.searchsorted(t, ticks, side="right") - 1 for t in times]
         given, measured = given[at[0]], measured[at[1]]
     count = min(len(given), len(measured))

@@ -4,10 +4,12 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Shaped
 
 from hrc_learn.demos.issues import DatasetError
@@ -30,7 +32,7 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     Fields are separated by commas, semicolons, tabs, bars or blanks; decimal commas are read.
     Lines that begin with #, % or // are comments; the last comment before the numbers may name
     the columns. The unnamed index that pandas writes and columns of text are left out. Dates
-    become seconds.
+    and times of day become seconds.
 
     Args:
         path: The file.
@@ -55,6 +57,11 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     delimiter = _delimiter(rows[min(1, len(rows) - 1)][1])
     fields = [_split(line, delimiter) for _, line in rows]
     header = _without_end(fields[0])
+    start = 0 if header[0] else 1
+    if len(header) > 3 and header[start:] == [str(k) for k in range(len(header) - start)]:
+        # pandas numbers columns that have no names.
+        rows, fields = rows[1:], [row[start:] for row in fields[1:]]
+        header = _without_end(fields[0]) if fields else []
     if any(map(_is_number, header)):
         named = _split(remarks[-1], delimiter) if remarks else []
         header = named if len(named) in (len(header), len(fields[0])) else []
@@ -186,11 +193,17 @@ def _arrow_columns(path: Path, table: pa.Table) -> Table:
     found: Table = {}
     for name in table.column_names:
         column = table[name].combine_chunks()
+        if pa.types.is_time(column.type):
+            column = column.cast(pa.string())
+        if pa.types.is_string(column.type):
+            day = pc.binary_join_element_wise("1970-01-01", column, " ")
+            with suppress(pa.ArrowInvalid):  # other texts are no times of day
+                column = day.cast(pa.timestamp("ns"))
         if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
             found[name.removesuffix(".bytes")] = column.to_numpy(zero_copy_only=False)
         elif pa.types.is_timestamp(column.type):
             stamps = column.cast(pa.timestamp("ns")).cast(pa.int64())
-            found[name] = stamps.to_numpy() * 1e-9
+            found[name] = stamps.to_numpy(zero_copy_only=False) / 1e9
         elif pa.types.is_primitive(column.type):
             found[name] = column.to_numpy(zero_copy_only=False).astype(float)
         elif pa.types.is_nested(column.type):

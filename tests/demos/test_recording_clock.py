@@ -65,15 +65,39 @@ STEADY = np.arange(50) / 25
         ("t", np.arange(9) * 1.0, "", "a count of frames"),
         ("t", np.arange(9) * 2.0, "", np.arange(9) * 2e-3),
         ("t", np.arange(9) * 0.6, "", None),
+        ("t", 1.7e9 + np.arange(9), "", 1.7e9 + np.arange(9)),  # one a second, no count
+        ("t", [1.7e9], "", [1.7e9]),
     ],
 )
 def test_the_unit_of_stamps_is_given_named_or_told_by_their_size(name, stamps, unit, expected):
     one = recording(**{name: stamps})
-    if isinstance(expected, np.ndarray):
+    if not isinstance(expected, str | None):
         np.testing.assert_allclose(read_stamps(one, name, unit), expected, rtol=1e-12)
         return
     with pytest.raises(DatasetError, match=expected or "Give the unit: --units time s"):
         read_stamps(one, name, unit)
+
+
+def test_a_count_of_frames_and_stamps_in_doubt_follow_the_callers_rate_and_unit():
+    q = np.arange(9.0)
+    counted = recording(q=q, t=q + 1)
+    found = clock(counted, meaning(time="t", **JOINTS), fps=20)
+    np.testing.assert_allclose(found.time, (q + 1) / 20)
+    # A camera's own stamps, one second apart, follow the unit that is given for the state's.
+    slow = {"force": [1, 2], "force_t": [0, 1]}
+    one = recording(q=STEADY, t=STEADY, **slow, clocks={"force": "force_t"})
+    known = meaning(time="t", joint_effort="force", **JOINTS)
+    with pytest.raises(DatasetError, match="force_t: steps by 1"):
+        clock(one, known)
+    held = clock(one, known, units={"time": "s"}).frames["force"]
+    assert held.tolist() == (STEADY >= 1).astype(int).tolist()
+
+
+def test_a_duration_replaces_stamps_of_all_fields_with_as_many_frames():
+    one = recording(q=STEADY, force=STEADY, t=1.7e9 + STEADY)
+    found = clock(one, meaning(joint_effort="force", **JOINTS), duration=10)
+    np.testing.assert_allclose(found.time, np.linspace(0, 10, 50))
+    assert found.frames["q"].tolist() == found.frames["force"].tolist() == [*range(50)]
 
 
 def test_a_declared_unit_comes_before_that_of_the_name():

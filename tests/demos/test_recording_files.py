@@ -42,7 +42,8 @@ ROWS = np.frombuffer(JPEG.ljust(65, b"0"), np.uint8)[None].repeat(5, 0)
         ("grey", (5, 16, 16), np.uint8, "image"),
         ("grey", (5, 16, 15), np.uint8, "other"),
         ("grey", (5, 15, 16), np.uint8, "other"),
-        ("grey", (5, 16, 16), np.uint16, "other"),
+        ("grey", (5, 16, 16), np.uint16, "depth"),  # 16 bits, as depth cameras have
+        ("colour", (5, 16, 20, 3), np.uint16, "depth"),
         ("colour", (5, 16, 20, 3), np.uint8, "image"),
         ("colour", (5, 16, 20, 3), float, "image"),
         ("colour", (5, 15, 20, 3), np.uint8, "other"),
@@ -382,6 +383,10 @@ def test_any_flag_ends_an_episode_after_its_frame():
     assert len(split({"q": Q, "terminals": terminals})) == 2
     assert len(split({"q": Q, "terminals": np.zeros(12)})) == 1
     assert len(split({"q": Q, "terminals": np.eye(12)})) == 1
+    # A task that is done stays done up to the last frame.
+    terminals[[2, 4, 10]] = 1
+    parts = split({"q": Q, "dones": terminals})
+    assert [part.fields["q"].frames for part in parts] == [5, 7]
     # Flags of other lengths contradict each other.
     assert len(split({"q": Q, "terminals": terminals, "dones": timeouts[:9]})) == 1
 

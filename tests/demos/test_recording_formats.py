@@ -315,6 +315,7 @@ def test_a_record_gives_steps_of_numbers_texts_and_images(tmp_path):
         "steps/image": ([jpeg + bytes([k]) for k in range(40)], "byte"),
         "steps/note": ([b"a"] * 40, "byte"),
         "steps/observation/task": ([b"pour"] * 40, "byte"),
+        "steps/optional": ([], "float"),
         "episode/number": ([3], "int"),
     }
     path = tmp_path / "set.tfrecord"
@@ -409,6 +410,9 @@ def test_a_video_belongs_to_the_episode_whose_name_it_begins_with(tmp_path):
     (folder / "run_10-left.mp4").write_bytes(video)
     (folder / "other.mp4").write_bytes(video)
     assert cameras() == [["run_1"], ["left"]]
+    notes = [part.notes for part in open_recordings(folder)]
+    text = "videos left out, as their names begin with the name of no other file: other.mp4"
+    assert notes == [(text,), ()]
 
 
 def test_a_file_of_several_episodes_takes_no_video(tmp_path):

@@ -20,13 +20,13 @@ pytestmark = pytest.mark.simulation
 
 
 def test_images_are_read_in_batches_and_cropped():
-    pixels = np.arange(100 * 17 * 18 * 3, dtype=np.uint8).reshape(100, 17, 18, 3)
+    pixels = np.arange(100 * 17 * 19 * 3, dtype=np.uint8).reshape(100, 17, 19, 3)
     reads = []
     field = array_field("rgb", pixels)
     spied = replace(field, read=lambda a, b: (reads.append((a, b)), pixels[a:b])[1])
     index = np.array([0, 0, 5, 31, 32, 70])
-    shown = [*_images(spied, index, (16, 18))]
-    np.testing.assert_array_equal(np.stack(shown), pixels[index][:, :16])
+    shown = [*_images(spied, index)]
+    np.testing.assert_array_equal(np.stack(shown), pixels[index][:, :16, :18])
     assert reads == [(0, 32), (32, 33), (70, 71)]
 
 

@@ -1,5 +1,7 @@
 """Quantities that the arrays of a recording hold: units, poses, commands and grippers."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from lerobot_folders import joint_path
@@ -7,6 +9,9 @@ from recording_samples import TIME, TURN, Q, plan, read, write_hdf5
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
+from hrc_learn.demos.recording_files import Recording, array_field
+from hrc_learn.demos.recording_meaning import understand
+from hrc_learn.demos.recording_names import ImportOptions
 
 
 def test_transforms_are_poses_and_those_of_a_camera_are_not(tmp_path):
@@ -237,6 +242,37 @@ def test_joints_follow_their_commands_at_any_rate(tmp_path, clock):
         np.savez(tmp_path / "a.npz", **arrays)
         (one,) = plan(tmp_path / "a.npz", **options).episodes()
         assert one.demonstration.command_position is None
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"q": Q, "t": TIME},  # another name
+        {"qpos": Q},  # no stamps
+        {"qpos": Q, "action": np.c_[Q, TIME], "t": TIME},  # another width
+        {"qpos": Q, "action": Q[:, :2], "t": TIME},
+    ],
+)
+def test_recordings_whose_fields_differ_do_not_mix(tmp_path, other):
+    first = {"qpos": Q, "t": TIME} | ({"action": Q} if "action" in other else {})
+    np.savez(tmp_path / "run_0.npz", **first)
+    np.savez(tmp_path / "run_1.npz", **other)
+    with pytest.raises(
+        ValueError, match=r"run_1.* and .*run_0.npz do not fit into one dataset: fields "
+    ):
+        plan(tmp_path)
+
+
+def test_commands_of_another_time_than_the_joints_are_named():
+    fields = {}
+    for topic, start in (("states", 0.0), ("command", 100.0)):
+        name, stamp = f"{topic}/joint_positions", f"{topic}/stamp"
+        fields[name] = array_field(name, Q, names=("a", "b", "c"), clock=stamp)
+        fields[stamp] = array_field(stamp, start + TIME, unit="s")
+    one = Recording(file=Path("run.bag"), fields=fields, streams=True)
+    text = "the clocks of command/joint_positions and of states/joint_positions do not overlap"
+    with pytest.raises(DatasetError, match=text):
+        understand([one], ImportOptions())
 
 
 def test_joint_velocities_of_other_joints_are_left_out(tmp_path):

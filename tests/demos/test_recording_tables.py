@@ -45,6 +45,14 @@ def table(tmp_path, text, columns=()):
         (" \n;;\na;b\n\n1;2\n", (), {"a": [1], "b": [2]}),
         ("1\n", (), {"array": [[1]]}),
         ("a b\n-1e-3 2E2\n", (), {"a": [-1e-3], "b": [200]}),
+        # pandas numbers columns that have no names.
+        ("0,1,2,3\n5,6,7,8\n", (), {"array": [[5, 6, 7, 8]]}),
+        (",0,1,2\n0,5,6,7\n1,8,9,1\n", (), {"array": [[5, 6, 7], [8, 9, 1]]}),
+        ("0,1\n5,6\n", (), {"array": [[0, 1], [5, 6]]}),
+        ("0,1,2,3\n5,6,7,8\n", ("a", "b", "c", "d"), {"a": [5], "b": [6], "c": [7], "d": [8]}),
+        # Times of day.
+        ("t,a\n00:01:02,1\n12:00:00,2\n", (), {"t": [62, 43200], "a": [1, 2]}),
+        ("t,a\n00:00:01.5,1\n00:01:00.25,2\n", (), {"t": [1.5, 60.25], "a": [1, 2]}),
     ],
 )
 def test_text_becomes_columns_of_numbers(tmp_path, text, columns, found):
@@ -88,6 +96,7 @@ def test_a_missing_number_is_nan(tmp_path):
         ("a;b\n1,5;2\n1.5;2\n", (), "mixes decimal points and decimal commas"),
         ("word\nx\ny\n", (), "holds no column of numbers"),
         (",a\n7,1\n9,2\n", (), "holds a column without a name"),
+        ("0,1,2,3\n", (), "holds a header and no numbers"),
     ],
 )
 def test_tables_that_are_damaged_name_the_line(tmp_path, text, columns, message):
