@@ -65,11 +65,12 @@ def assemble(
     tables: list[pa.Table] = []
     if earlier is not None:
         tables.append(_carry_over(earlier, listed, cameras))
-        # The new dataset keeps the contract of the earlier dataset. It also keeps the details,
-        # except those that the recording gives again.
+        # The new dataset keeps the contract and the reference frames of the earlier dataset. It
+        # also keeps the details, except those that the recording gives again.
         before = read_sidecar(earlier)
         details = before.details | sidecar.details
-        sidecar = replace(sidecar, details=details, contract=before.contract)
+        kept = {"contract": before.contract, "frames": before.frames}
+        sidecar = replace(sidecar, details=details, **kept)
     listed.tasks |= dict.fromkeys(tasks)
     if videos is None:
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
@@ -302,10 +303,8 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
         if _is_done(root, staging) or not _has_episodes(staging):
             discard(staging)  # no episode is lost
     if earlier_episodes is None and os.path.lexists(root):
-        raise FileExistsError(
-            f"{root} already exists: choose another folder, remove it, or append to it "
-            f"(append=True)"
-        )
+        text = f"{root} already exists: choose another folder, remove it, or append to it"
+        raise FileExistsError(f"{text} (append=True)")
     try:
         staging.mkdir()
     except FileExistsError:
@@ -325,7 +324,8 @@ def finish(root: Path, claim: store.Claim) -> None:
     """Make or extend a dataset from its recording, then remove the recording.
 
     Raises:
-        DatasetError: The dataset would be new, but no episode was saved.
+        DatasetError: The dataset would be new, but no episode was saved, or the dataset to be
+            extended holds another number of episodes than before.
         FileExistsError: The dataset would be new, but `root` exists already.
     """
     root, staging = store.resolved(root), staging_folder(root)
@@ -337,6 +337,11 @@ def finish(root: Path, claim: store.Claim) -> None:
             if episodes is None:
                 raise DatasetError("no episode was saved, so there is no dataset", file=root)
             return
+        if episodes is not None and (now := len(open_folder(root).episodes)) != episodes:
+            text = (
+                f"holds {now} episodes, but {episodes} when it was to be extended: put it back"
+            )
+            raise DatasetError(f"{text}, or move {staging} away", file=root)
         if episodes is None and os.path.lexists(root):
             raise FileExistsError(
                 f"{root} already exists: remove {staging} if both hold the same recording, or "

@@ -271,8 +271,8 @@ class DatasetWriter:
         with self._claim:
             if not self._new_episodes:
                 discard(self._staging)
-                text = "no episode was saved, so there is no dataset"
-                raise DatasetError(text, file=self.root)
+                left = "the dataset stays as it was" if self._earlier else "there is no dataset"
+                raise DatasetError(f"no episode was saved: {left}", file=self.root)
             try:
                 finish(self.root, self._claim)
             except OSError as error:
@@ -287,10 +287,12 @@ class DatasetWriter:
     def _continue(self) -> DatasetFolder:
         """Check the dataset to append to, continue its counts, and return its metadata."""
         folder, sidecar = open_folder(self.root), read_sidecar(self.root)
+        frames = self._sidecar.frames or sidecar.frames
         for name, theirs, ours in (
             ("frame rate", folder.fps, self.fps),
             ("robot", folder.robot_type, self.robot_type),
             ("joints", sidecar.joint_names, self.joint_names),
+            ("reference frames", sidecar.frames, frames),
         ):
             if theirs != ours:
                 text = f"cannot append to {self.root}: its {name} is {theirs!r}, not {ours!r}"

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -58,13 +59,9 @@ class ImageReader:
 
     def available(self, episode: int) -> tuple[str, ...]:
         """Cameras that have images of an episode."""
-        segments = self._segments.get(episode, {})
-        return tuple(
-            key
-            for key in self.cameras
-            if self._folder.features[key].dtype == "image"
-            or (key in segments and segments[key].file.is_file())
-        )
+        segments, features = self._segments.get(episode, {}), self._folder.features
+        there = {key for key, segment in segments.items() if segment.file.is_file()}
+        return tuple(k for k in self.cameras if k in there or features[k].dtype == "image")
 
     def segment(self, episode: int, camera: str) -> VideoSegment | None:
         """Part of a video that shows an episode; None for images in columns."""
@@ -145,7 +142,9 @@ class ImageReader:
         if camera not in self.cameras:
             text = f"there is no such camera; there are {', '.join(self.cameras) or 'none'}"
             raise DatasetError(text, file=self._folder.root, key=camera)
-        if len(wanted) and not (wanted[0] >= 0 and wanted[-1] < entry.length):
+        if not len(wanted):
+            return
+        if not (wanted[0] >= 0 and wanted[-1] < entry.length):
             text = f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}"
             raise entry.error(text)
         if self._folder.features[camera].dtype == "image":
@@ -220,6 +219,12 @@ def camera_images(
         segment = reader.segment(demo.episode, camera)
         try:
             encoded = None if segment is None else videos.encoded_samples(segment)
+            if encoded is not None:  # a video runs at the nominal rate, the robot at its stamps
+                nominal = (
+                    np.linspace(0, reader.entry(demo.episode).length - 1, len(demo)) / demo.fps
+                )
+                late = np.interp(encoded.time, nominal, demo.time - nominal)
+                encoded = replace(encoded, time=encoded.time + late)
             yield name, encoded or thumbnails(reader, demo, camera)
         except DatasetError as error:
             yield name, error

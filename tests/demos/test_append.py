@@ -18,7 +18,9 @@ from hrc_learn.demos import (
     check_dataset,
     load_demos,
     recover_all,
+    recover_dataset,
 )
+from hrc_learn.demos.quality.ranking import Decision, write_curated
 from hrc_learn.demos.read.contract import read_sidecar
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
@@ -92,7 +94,7 @@ def test_a_list_of_episodes_that_is_put_together_of_pieces_is_the_same(tmp_path,
 
 def test_nothing_is_appended_where_nothing_was_recorded(tmp_path):
     root = record(tmp_path / "set", [0], ["reach"])
-    with pytest.raises(DatasetError, match="no episode was saved"):
+    with pytest.raises(DatasetError, match="no episode was saved: the dataset stays as it was"):
         record(root, [], [], append=True)
     assert_holds(root, [0], ["reach"])
     assert list(tmp_path.iterdir()) == [root]
@@ -105,10 +107,11 @@ def test_nothing_is_appended_where_nothing_was_recorded(tmp_path):
         ({"robot_type": "panda"}, "its robot is 'any', not 'panda'"),
         ({"joint_names": ("a", "b", "d")}, "its joints is"),
         ({"cameras": {"front": (4, 6)}}, "gives? images of no camera|expected front"),
+        ({"frames": {"base": "table"}}, "its reference frames is {'base': 'link0'}, not"),
     ],
 )
 def test_other_settings_than_the_datasets_are_refused(tmp_path, settings, message):
-    root = record(tmp_path / "set", [0], ["reach"])
+    root = record(tmp_path / "set", [0], ["reach"], frames={"base": "link0"})
     with pytest.raises(ValueError, match=message):
         record(root, [1], ["reach"], append=True, **settings)
     assert_holds(root, [0], ["reach"])
@@ -184,8 +187,28 @@ def test_a_file_of_the_users_own_stays_in_the_dataset(tmp_path):
     assert (root / "README.md").read_text() == (root / "meta/notes.txt").read_text() == "mine"
 
 
+def test_a_dataset_that_was_shortened_meanwhile_is_not_extended(tmp_path):
+    root = record(tmp_path / "set", [0, 1], ["reach"] * 2)
+    with pytest.raises(KeyboardInterrupt):
+        record(root, [2], ["reach"], append=True, then=KeyboardInterrupt())
+    one, both = tmp_path / "one", tmp_path / "both"
+    write_curated(root, one, {0: Decision(verdict="reject", length=40)})
+    root.rename(both)
+    one.rename(root)
+    with pytest.raises(
+        DatasetError, match="holds 1 episodes, but 2 when it was to be extended"
+    ):
+        recover_dataset(root)
+    assert_holds(root, [1], ["reach"])
+    root.rename(one)
+    both.rename(root)
+    recover_dataset(root)
+    assert_holds(root, [0, 1, 2], ["reach"] * 3)
+
+
 def test_what_was_kept_of_a_dataset_stays_with_the_longer_one(tmp_path):
-    root = record(tmp_path / "set", [1, 2], ["a", "b"], details={"who": "me", "room": 1})
+    own = {"details": {"who": "me", "room": 1}, "frames": {"base": "link0"}}
+    root = record(tmp_path / "set", [1, 2], ["a", "b"], **own)
     assert hrc("check", root, "--keep-contract").status == 0
     before = read_sidecar(root)
     assert before.contract
@@ -193,6 +216,7 @@ def test_what_was_kept_of_a_dataset_stays_with_the_longer_one(tmp_path):
     after = read_sidecar(root)
     assert after.contract == before.contract
     assert after.details == {"who": "me", "room": 2}
+    assert after.frames == {"base": "link0"}
     assert len(load_demos(root)) == 3
 
 

@@ -508,6 +508,7 @@ def test_images_of_an_episode_are_read_in_any_order(tmp_path):
     assert len(reader.read(1)["cam"]) == 20
     assert reader.read(1, cameras=[]) == {}
     assert [frame for frame, _ in reader.stream(1, "cam", [3, 5])] == [3, 5]
+    assert [*reader.stream(1, "cam", [])] == []
     for frames in ([-1], [3, 20]):
         with pytest.raises(DatasetError, match=f"has no frames {frames[0]} to"):
             reader.read(1, frames=frames)
@@ -534,6 +535,10 @@ def test_thumbnails_are_five_a_second_and_spread_over_the_episode(tmp_path):
     assert len(thumbnails(reader, thin, "cam").time) == 20
     (found,) = camera_images(reader, demos[1])
     assert (found[0], found[1].codec) == ("cam", "h264")
+    # A robot that was read more slowly than at the nominal rate is shown at its own stamps.
+    ((_, late),) = camera_images(reader, replace(demos[1], time=1.2 * demos[1].time))
+    np.testing.assert_allclose(found[1].time, demos[1].time, atol=1e-6)
+    np.testing.assert_allclose(late.time, 1.2 * demos[1].time, atol=1e-6)
     second(root).write_text("no video")
     ((_, error),) = camera_images(reader, demos[1])
     assert isinstance(error, DatasetError)
