@@ -296,10 +296,8 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
     root, staging = store.resolved(root), staging_folder(root)
     if staging.is_dir():
         if not _is_recording(staging):
-            raise FileExistsError(
-                f"{staging} is no interrupted recording and is not touched: move it away, or "
-                f"choose another name than {root.name}"
-            )
+            text = f"{staging} is no interrupted recording and is not touched: move it away"
+            raise FileExistsError(f"{text}, or choose another name than {root.name}")
         if _is_done(root, staging) or not _has_episodes(staging):
             discard(staging)  # no episode is lost
     if earlier_episodes is None and os.path.lexists(root):
@@ -308,11 +306,11 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
     try:
         staging.mkdir()
     except FileExistsError:
-        raise FileExistsError(
-            f"{staging} holds an interrupted recording: "
-            f"{recovery_advice(root)} makes a dataset of its saved episodes; remove the "
-            f"folder to start anew"
-        ) from None
+        text = (
+            f"{staging} holds an interrupted recording: {recovery_advice(root)} makes a dataset"
+        )
+        text += " of its saved episodes; remove the folder to start anew"
+        raise FileExistsError(text) from None
     try:
         store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
     except OSError:
@@ -343,10 +341,8 @@ def finish(root: Path, claim: store.Claim) -> None:
             )
             raise DatasetError(f"{text}, or move {staging} away", file=root)
         if episodes is None and os.path.lexists(root):
-            raise FileExistsError(
-                f"{root} already exists: remove {staging} if both hold the same recording, or "
-                f"move {root} away to make a dataset of the recording"
-            )
+            text = f"{root} already exists: remove {staging} if both hold the same recording"
+            raise FileExistsError(f"{text}, or move {root} away to make a dataset of it")
         paths = recorded.staged_paths(staging, episodes or 0)
         with store.replacing(
             claim, store.DATASET, overwrite=episodes is not None, source=header.id

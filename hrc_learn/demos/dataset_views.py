@@ -86,10 +86,8 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
     if "joint_position" not in source.units:
         raise DatasetError("the dataset has no joint positions")
     if arm is None:
-        raise DatasetError(
-            f"robot type {kind!r} is no registered and installed arm; --robot NAME|FILE names "
-            "one"
-        )
+        text = f"robot type {kind!r} is no registered and installed arm"
+        raise DatasetError(f"{text}; --robot NAME|FILE names one")
     return DatasetArm(
         arm=arm,
         columns=arm_columns(source.joint_names, arm),

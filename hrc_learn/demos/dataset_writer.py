@@ -89,9 +89,8 @@ class DatasetWriter:
             raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
         for key in features or {}:
             if key != "action" and not key.startswith(("observation.", "action.")):
-                raise ValueError(
-                    f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
-                )
+                text = f"feature {key!r} needs a key that LeRobot understands"
+                raise ValueError(f"{text}: 'observation.{key}'")
         self.fps = float(fps)
         self.robot_type = robot_type
         self.joint_names = tuple(joint_names)
@@ -211,10 +210,11 @@ class DatasetWriter:
         """
         self._require_no_open_episode("first")
         if demonstration.joint_names != self.joint_names:
-            raise ValueError(
-                f"the demonstration's joints {demonstration.joint_names} are not the "
-                f"dataset's {self.joint_names}: select_joints(names) brings them in order"
+            text = (
+                f"the demonstration's joints {demonstration.joint_names} are not the dataset's"
             )
+            advice = "select_joints(names) brings them in order"
+            raise ValueError(f"{text} {self.joint_names}: {advice}")
         episode = {name: getattr(demonstration, name) for name in demonstration.recorded}
         episode["time"] = demonstration.time + demonstration.start_time
         episode |= {key: demonstration.extra[key] for key in self.features}
@@ -304,10 +304,8 @@ class DatasetWriter:
 
     def _require_no_open_episode(self, when: str) -> None:
         if self._task is not None:
-            raise RuntimeError(
-                f"an episode with {len(self._frames)} unsaved frames is open: call "
-                f"save_episode() or discard_episode() {when}"
-            )
+            text = f"an episode with {len(self._frames)} unsaved frames is open"
+            raise RuntimeError(f"{text}: call save_episode() or discard_episode() {when}")
 
     def _open_task(self) -> str:
         if self._task is None:

@@ -69,8 +69,9 @@ class Demonstration:
         for name in (*_ARRAYS, "feature_visible"):
             if getattr(self, name) is not None:
                 array = float_array(getattr(self, name))
-                is_mask = name == "feature_visible"
-                object.__setattr__(self, name, array > 0 if is_mask else array)
+                object.__setattr__(
+                    self, name, array > 0 if name == "feature_visible" else array
+                )
         extra = {key: float_array(values) for key, values in self.extra.items()}
         object.__setattr__(self, "extra", extra)
         frames, joints = len(self.time), len(self.joint_names)
@@ -211,10 +212,8 @@ class DemonstrationSet(Sequence[Demonstration]):
         self.joint_unit = joint_unit
         names = {demo.joint_names for demo in self._demonstrations}
         if len(names) > 1:
-            raise ValueError(
-                f"demonstrations of one set need the same joints, but these differ: {names}. "
-                f"select_joints(names) brings them to one order."
-            )
+            text = f"demonstrations of one set need the same joints, but these differ: {names}"
+            raise ValueError(f"{text}. select_joints(names) brings them to one order.")
 
     @overload
     def __getitem__(self, index: int) -> Demonstration: ...

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,9 +42,8 @@ def local_polynomial(
     if not window > 0 or degree < 1:
         raise ValueError(f"window and degree must be positive, got {window} s and {degree}")
     if len(time) <= degree:
-        raise ValueError(
-            f"{len(time)} samples do not determine a polynomial of degree {degree}"
-        )
+        text = f"{len(time)} samples do not determine a polynomial of degree {degree}"
+        raise ValueError(text)
     count = round(window / float(np.median(np.diff(time))))
     count = min(max(count, degree + 2) | 1, len(time))  # an odd number around each sample
     first = np.clip(np.arange(len(time)) - count // 2, 0, len(time) - count)
@@ -76,10 +76,8 @@ def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) ->
     Raises:
         ValueError: There are too few frames.
     """
-    return _filtered(
-        demo,
-        lambda values: local_polynomial(demo.time, values, window=window, degree=degree)[0],
-    )
+    fit = partial(local_polynomial, demo.time, window=window, degree=degree)
+    return _filtered(demo, lambda values: fit(values)[0])
 
 
 def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Demonstration:
@@ -102,10 +100,8 @@ def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Dem
 
     steps = np.diff(demo.time)
     if not len(steps) or np.ptp(steps) > 0.01 * steps.mean():  # stamps are rounded
-        raise ValueError(
-            "a Butterworth filter needs even stamps: resample(demo, fps) first, or smooth "
-            "with savitzky_golay, which accepts uneven ones"
-        )
+        text = "a Butterworth filter needs even stamps: resample(demo, fps) first, or smooth"
+        raise ValueError(f"{text} with savitzky_golay, which accepts uneven ones")
     rate = 1 / steps.mean()
     if not 0 < cutoff < rate / 2:
         text = f"the cut-off must lie between 0 and half the frame rate, {rate / 2:g} Hz"
@@ -401,9 +397,8 @@ def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
         ValueError: The duration is not positive, or there is only one frame.
     """
     if not duration > 0 or len(demo) < 2:
-        raise ValueError(
-            f"a demonstration of {len(demo)} frames cannot be made to last {duration} s"
-        )
+        text = f"a demonstration of {len(demo)} frames cannot be made to last {duration} s"
+        raise ValueError(text)
     scale = duration / demo.duration
     rates = {"joint_velocity", "command_velocity"} & {*demo.recorded}
     scaled = {name: getattr(demo, name) / scale for name in rates}
@@ -438,9 +433,8 @@ def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demons
             recorded = ", ".join(demo.recorded[1:])
             raise ValueError(f"{name} is not recorded; there are {recorded}")
         if not 0 <= delay < demo.duration:
-            raise ValueError(
-                f"the delay of {name} must be between 0 and {demo.duration:.4g} s, got {delay}"
-            )
+            bounds = f"between 0 and {demo.duration:.4g} s"
+            raise ValueError(f"the delay of {name} must be {bounds}, got {delay}")
     longest = max(delays.values(), default=0.0)
     kept = demo.time[demo.time <= demo.time[-1] - longest]
     moved = at_times(demo, kept)

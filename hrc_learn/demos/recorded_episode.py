@@ -130,10 +130,9 @@ def frame_row(
     row = {}
     for name, value in values.items():
         if name not in widths:
-            raise ValueError(
-                f"{name!r} is no quantity of a frame; known are {', '.join(widths)}. "
-                f"Declare others as features={{'observation.{name}': [names of components]}}."
-            )
+            text = f"{name!r} is no quantity of a frame; known are {', '.join(widths)}. Declare"
+            more = f"features={{'observation.{name}': [names of components]}}"
+            raise ValueError(f"{text} others as {more}.")
         numbers, width = float_array(value).copy(), widths[name]
         if numbers.size != width or numbers.ndim > 1:
             text = f"frame {number}: {name} needs {width} numbers, got shape {numbers.shape}"

@@ -242,9 +242,8 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     steady = [main, *(n for n, one in fields.items() if one.kind in ("image", "encoded"))]
     times = {n: fields[one.clock].numbers()[:, 0] for n, one in clocked.items()}
     if np.median(np.diff(times[main])) < _BURST:
-        notes.append(
-            f"{main}: its messages have no times of their own and were written at once"
-        )
+        text = "its messages have no times of their own and were written at once"
+        notes.append(f"{main}: {text}")
         bare = {n: replace(fields[n], clock="") for n in clocked}
         return [replace(whole, fields=bare, streams=False, notes=tuple(notes))]
     gaps = {name: _gaps(time) for name, time in times.items()}
@@ -268,11 +267,11 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     whole = replace(whole, fields=fields, notes=tuple(notes))
     if parts == [(start, stop)]:
         return [whole]
-    episodes = [
-        replace(whole, label=f"part {k}", fields=_during(fields, a, b), notes=())
+    shown = whole.notes  # of the whole bag, once
+    return [
+        replace(whole, label=f"part {k}", fields=_during(fields, a, b), notes=shown * (not k))
         for k, (a, b) in enumerate(parts)
     ]
-    return [replace(episodes[0], notes=whole.notes), *episodes[1:]]
 
 
 def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:

@@ -121,9 +121,8 @@ def _stamps_of_state(
     if stamps:
         text = f"holds {fields[stamps].frames} stamps for {frames} frames of the state"
         raise recording.error(f"{text}: name its stamps (--time), or give --fps", stamps)
-    raise recording.error(
-        "there are no stamps: name the field of stamps (time), or give duration or fps"
-    )
+    text = "there are no stamps: name the field of stamps (time), or give duration or fps"
+    raise recording.error(text)
 
 
 def _latest(

@@ -129,15 +129,11 @@ def _parsed(
     text = io.StringIO()
     csv.writer(text, delimiter="\t").writerows(fields)
     comma = bool(re.search(r"\d,\d", text.getvalue()))
-    options = {
-        "read_options": ReadOptions(column_names=names, use_threads=False),
-        "parse_options": ParseOptions(delimiter="\t"),
-        "convert_options": ConvertOptions(
-            null_values=_MISSING, decimal_point="," if comma else "."
-        ),
-    }
+    read = ReadOptions(column_names=names, use_threads=False)
+    convert = ConvertOptions(null_values=_MISSING, decimal_point="," if comma else ".")
+    content = io.BytesIO(text.getvalue().encode())
     try:
-        table = read_csv(io.BytesIO(text.getvalue().encode()), **options)
+        table = read_csv(content, read, ParseOptions(delimiter="\t"), convert)
     except pa.ArrowInvalid as error:
         wrong = _WRONG_ROW.search(str(error))
         place = f"line {lines[int(wrong[1]) - 1]}" if wrong else "a line"
@@ -167,9 +163,8 @@ def _without_index(path: Path, table: Table) -> Table:
         if counts and len(table) > 1:
             del table[name]
         elif not name.strip():
-            raise DatasetError(
-                "holds a column without a name: name it in the header", file=path
-            )
+            text = "holds a column without a name: name it in the header"
+            raise DatasetError(text, file=path)
     return table
 
 

@@ -216,11 +216,8 @@ def decode(
                     if not wanted or frame > run[-1]:
                         break
     except (av.FFmpegError, IndexError) as error:
-        raise DatasetError(
-            f"cannot be decoded ({error}): the recording was interrupted, or the copy is "
-            f"incomplete",
-            file=segment.file,
-        ) from error
+        text = f"cannot be decoded ({error}): the recording or the copy is incomplete"
+        raise DatasetError(text, file=segment.file) from error
 
 
 def image_at(segment: VideoSegment, frame: int, fps: float) -> Image:
@@ -326,10 +323,9 @@ class CameraRecorder:
                 type; no image of the frame is then encoded.
         """
         if images.keys() != self._cameras.keys():
-            raise ValueError(
-                f"a frame gives images of {', '.join(images) or 'no camera'}, expected "
-                f"{', '.join(self._cameras) or 'none: name cameras when opening the dataset'}"
-            )
+            given = ", ".join(images) or "no camera"
+            known = ", ".join(self._cameras) or "none: name cameras when opening the dataset"
+            raise ValueError(f"a frame gives images of {given}, expected {known}")
         for camera, image in images.items():
             expected = (*self._cameras[camera], 3)
             if np.shape(image) != expected:

@@ -185,11 +185,9 @@ class ColumnRewriter:
         found, fps = self._segments.get(edit.entry.index, {}), self._folder.fps
         for key in self.cameras:
             if key not in found:
-                raise edit.fault(
-                    "the video of this episode is missing: copy it, or leave out the videos "
-                    "(--no-videos) or the episode (--drop bad-episodes)",
-                    key=key,
-                )
+                text = "the video of this episode is missing: copy it, or leave out the videos"
+                text += " (--no-videos) or the episode (--drop bad-episodes)"
+                raise edit.fault(text, key=key)
         if self.cameras and (edit.resampled or (np.diff(edit.kept) != 1).any()):
             raise edit.fault(
                 "its videos would have to be encoded anew, because frames were dropped in the "
@@ -201,11 +199,9 @@ class ColumnRewriter:
             raise edit.fault(text, key=self._image_columns[0])
         begin = int(edit.kept[0]) / fps
         end = begin + len(edit) / fps
+        shown = {key: found[key] for key in self.cameras}
         return {
-            key: replace(
-                found[key], start=found[key].start + begin, stop=found[key].start + end
-            )
-            for key in self.cameras
+            k: replace(s, start=s.start + begin, stop=s.start + end) for k, s in shown.items()
         }
 
     def _tasks_of(self, edit: EpisodeEdit) -> list[str]:
@@ -217,11 +213,8 @@ class ColumnRewriter:
         indices = edit.frames["task_index"][:, 0].tolist()
         for frame, index in enumerate(indices):
             if index not in listed:
-                text = (
-                    f"task {index:g} is not in the list of tasks: leave the episode out "
-                    f"(drop_bad_episodes)"
-                )
-                raise edit.fault(text, frame=frame, key="task_index")
+                text = f"task {index:g} is not in the list of tasks: leave the episode out"
+                raise edit.fault(f"{text} (drop_bad_episodes)", frame, "task_index")
         return [listed[index] for index in indices]
 
     def stage(

@@ -51,10 +51,8 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
     for entry in entries:
         # Operators differ by a factor of two or three, not by five.
         if not usual / 5 < entry.length < 5 * usual:
-            yield entry.warning(
-                f"has {entry.length} frames where {usual:.0f} are usual: broken off, "
-                f"or several in one?"
-            )
+            text = f"has {entry.length} frames where {usual:.0f} are usual"
+            yield entry.warning(f"{text}: broken off, or several in one?")
 
 
 def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
@@ -105,10 +103,9 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
     # A large part of the episode, long for this component, and longer than a short pause.
-    frozen = (
-        (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * feature.fps))
-    )
-    frozen &= feature.smooth & (feature.median("span") > 0)
+    frozen = (fraction > 0.1) & (fraction > 5 * usual + 0.02)
+    frozen &= (held > max(10, 0.3 * feature.fps)) & feature.smooth
+    frozen &= feature.median("span") > 0
     for number, component in np.argwhere(frozen).tolist():
         text = (
             f"{feature.names[component]} stays the same for {held[number, component]:.0f} of "

@@ -297,10 +297,8 @@ def duplicates(
         same = np.abs(sketches[others] - sketch).max(1, initial=0) <= _SAME_EPISODE * span
         if span and same.any():
             earlier = motions[others[same].min()][0]
-            yield entry.warning(
-                f"shows the same motion as episode {earlier.index}: recorded once, "
-                f"stored twice?"
-            )
+            text = f"shows the same motion as episode {earlier.index}"
+            yield entry.warning(f"{text}: recorded once, stored twice?")
 
 
 def motion_sketch(

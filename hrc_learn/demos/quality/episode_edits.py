@@ -160,11 +160,9 @@ def drop_bad_frames(edit: EpisodeEdit, allowed: bool) -> EpisodeEdit:
     rows = [~np.isfinite(edit.time), *(mask.any(1) for mask in faulty.values())]
     bad = np.logical_or.reduce(rows)
     if bad.any() and not allowed:
-        raise edit.fault(
-            f"holds values that are not finite in {bad.sum()} frames; drop those "
-            f"(drop_bad_frames), or the episode (drop_bad_episodes)",
-            frame=int(bad.argmax()),
-        )
+        text = f"holds values that are not finite in {bad.sum()} frames; drop those"
+        text += " (drop_bad_frames), or the episode (drop_bad_episodes)"
+        raise edit.fault(text, frame=int(bad.argmax()))
     return edit.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
 
 
@@ -357,11 +355,9 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     except ValueError as error:
         raise edit.fault(str(error)) from error
     if "pose_matrix" in edit.selections:
-        raise edit.fault(
-            "holds poses as matrices, which are not resampled; map them away "
-            "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
-            key="pose_matrix",
-        )
+        text = "holds poses as matrices, which are not resampled; map them away"
+        text += " (mapping={'pose_matrix': None}) or leave the frames as they are (no fps)"
+        raise edit.fault(text, key="pose_matrix")
     if "command_position" in edit.units and edit.units["command_position"].steps.any():
         text = "holds changes per step, which would be wrong at another rate: keep the frames"
         raise edit.fault(text, key="command_position")

@@ -71,11 +71,9 @@ def merge_datasets(
         if np.isclose(folder.fps, rate):
             continue
         if fps is None:
-            raise DatasetError(
-                f"runs at {folder.fps:g} fps, but {opened[0].folder.root} at {rate:g}: "
-                f"--fps {rate:g} --no-videos resamples it",
-                file=folder.root,
-            )
+            text = f"runs at {folder.fps:g} fps, but {opened[0].folder.root} at {rate:g}"
+            advice = f"--fps {rate:g} --no-videos resamples it"
+            raise DatasetError(f"{text}: {advice}", file=folder.root)
         report.notes.append(f"{folder.root}: resampled from {folder.fps:g} to {rate:g} fps")
     _Merge(opened, rate, videos, report).write()
     return report
@@ -191,14 +189,9 @@ class _Merge:
             text = f"{source.root}: {key} matched by position, as not both datasets name it"
             self.report.notes.append(text)
         if len({*places}) < len(places):
-            raise source.fault(
-                f"its components do not match those of {self.first.root} one to one: "
-                f"{', '.join(other.names or ())}",
-                key,
-            )
-        factors = [
-            self._factor(source, key, index, place) for index, place in enumerate(places)
-        ]
+            text = f"its components do not match those of {self.first.root} one to one"
+            raise source.fault(f"{text}: {', '.join(other.names or ())}", key)
+        factors = [self._factor(source, key, i, place) for i, place in enumerate(places)]
         source.places[key], source.factors[key] = places, np.array(factors)
 
     def _place(self, source: _Source, key: str, index: int) -> int:
@@ -214,11 +207,8 @@ class _Merge:
         for place in range(len(names)):
             if wanted is not None and source.meanings.get((key, place)) == wanted:
                 return place
-        raise source.fault(
-            f"has no component {name} of {self.first.root}; there are {', '.join(names)}: "
-            f"rename it in {source.root}/meta/info.json",
-            key,
-        )
+        text = f"has no component {name} of {self.first.root}; there are {', '.join(names)}"
+        raise source.fault(f"{text}: rename it in {source.root}/meta/info.json", key)
 
     def _factor(self, source: _Source, key: str, index: int, place: int) -> float:
         own, other = self.first.units.get((key, index)), source.units.get((key, place))

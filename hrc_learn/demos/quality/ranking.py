@@ -312,10 +312,8 @@ class Decision:
         if min(self.start, self.stop) < 0 or (
             is_cut and not self.start < self.stop - 1 < self.length
         ):
-            raise ValueError(
-                f"frames {self.start} to {self.stop} are no part of two frames or more of an "
-                f"episode of {self.length} frames"
-            )
+            text = f"frames {self.start} to {self.stop} are no part of two frames or more"
+            raise ValueError(f"{text} of an episode of {self.length} frames")
 
 
 Decisions = dict[int, Decision]
@@ -350,11 +348,9 @@ def read_decisions(root: Path) -> Decisions:
         raise DatasetError(str(error).removeprefix(f"{path}: "), file=path) from error
     for index, known in kept.items():
         if known.length != lengths.get(index):
-            text = (
-                f"decides on an episode of {known.length} frames, the dataset has "
-                f"{lengths.get(index, 'no such episode')}: it belongs to another dataset; "
-                f"{advice}"
-            )
+            has = lengths.get(index, "no such episode")
+            text = f"decides on an episode of {known.length} frames, the dataset has {has}"
+            text += f": it belongs to another dataset; {advice}"
             raise DatasetError(text, file=path, episode=index)
     return kept
 

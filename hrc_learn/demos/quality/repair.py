@@ -400,9 +400,7 @@ class _Repair:
                 edit = getattr(edits, name)(edit)
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
         if len(stalled):
-            raise edit.fault(
-                "stamps must increase; have late frames dropped (drop_late), or leave the "
-                "episode out (drop_bad_episodes)",
-                frame=int(stalled[0]) + 1,
-            )
+            text = "stamps must increase; have late frames dropped (drop_late), or leave the"
+            text += " episode out (drop_bad_episodes)"
+            raise edit.fault(text, frame=int(stalled[0]) + 1)
         return edit if options.fps is None else edits.resample_to_grid(edit, options.fps)

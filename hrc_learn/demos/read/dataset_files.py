@@ -223,9 +223,8 @@ def read_table(
         table = parquet.read_row_groups(groups, columns=wanted)
         return table.slice(rows.start - starts[first], rows.stop - rows.start)
     except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
-        raise DatasetError(
-            f"unreadable: the file is damaged ({error}); copy it again", file=file
-        ) from error
+        text = f"unreadable: the file is damaged ({error}); copy it again"
+        raise DatasetError(text, file=file) from error
 
 
 def row_group_starts(metadata: pq.FileMetaData) -> list[int]:

@@ -150,10 +150,8 @@ def _normalized(q: Tensor) -> Tensor:
     wrong = ((q.norm(dim=-1) - 1).abs() > 0.01).nonzero()
     if len(wrong):
         k = int(wrong[0])
-        raise ValueError(
-            f"quaternion of length {float(q[k].norm()):.4g} at frame {k}: the columns hold no "
-            f"quaternion, or it was lost there"
-        )
+        text = f"quaternion of length {float(q[k].norm()):.4g} at frame {k}"
+        raise ValueError(f"{text}: the columns hold no quaternion, or it was lost there")
     return quaternion.normalize(q)
 
 
@@ -171,9 +169,8 @@ def _from_two_columns(values: Tensor) -> Tensor:
     # Parallel columns, or zeros where nothing was recorded.
     lost = (third.norm(dim=-1) < 1e-6).nonzero()
     if len(lost):
-        raise ValueError(
-            f"the two columns at frame {int(lost[0])} span no plane: they hold no rotation"
-        )
+        text = f"the two columns at frame {int(lost[0])} span no plane"
+        raise ValueError(f"{text}: they hold no rotation")
     first = first / first.norm(dim=-1, keepdim=True)
     third = third / third.norm(dim=-1, keepdim=True)
     matrix = torch.stack([first, torch.linalg.cross(third, first), third], dim=-1)

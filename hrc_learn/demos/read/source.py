@@ -110,10 +110,8 @@ class OpenedDataset:
         """Warning that the data changed since the contract was kept, or None."""
         if self.contract is None or self.contract.fingerprint == fingerprint(self.folder):
             return None
-        return (
-            f"the data changed since the contract in {SIDECAR_PATH} was kept: "
-            f"hrc check --keep-contract renews it"
-        )
+        text = f"the data changed since the contract in {SIDECAR_PATH} was kept"
+        return f"{text}: hrc check --keep-contract renews it"
 
     @cached_property
     def declared_units(self) -> Mapping[str, str | Sequence[str]]:
@@ -216,9 +214,8 @@ class OpenedDataset:
         text = f"the forward kinematics of {arm.name} give the position within"
         text += f" {1e3 * found.residual:.2g} mm"
         if found.change:
-            text += (
-                f" only with {found.change}; as recorded, {1e3 * found.other:.2g} mm are left"
-            )
+            left = f"{1e3 * found.other:.2g} mm are left"
+            text += f" only with {found.change}; as recorded, {left}"
         units = [joints.unit_of(i) for i in range(values.shape[1])]
         for column in columns:
             units[column] = found.unit

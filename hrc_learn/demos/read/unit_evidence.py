@@ -219,9 +219,8 @@ def guess_joints(
                 f"all values step by {steps[0]:.4g}, as an encoder of 4096 steps does in {unit}"
             )
             return Guess(unit, 0.97, text)
-    ranged = (
-        len(steps) >= _FEWEST_ENCODERS and ((steps > _RANGED[0]) & (steps < _RANGED[1])).all()
-    )
+    inside = (steps > _RANGED[0]) & (steps < _RANGED[1])
+    ranged = len(steps) >= _FEWEST_ENCODERS and inside.all()
     if ranged and is_hobby_arm(robot_type, labels) and np.ptp(steps) > 1e-2 * steps[0]:
         text = f"joints step by {steps.min():.3g} to {steps.max():.3g}, as their ranges differ"
         return Guess("%", 0.95, text, "deg")
