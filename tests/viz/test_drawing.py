@@ -283,9 +283,13 @@ def test_a_line_is_as_thick_as_it_is_near_with_an_outline(x, width):
     outline = np.flatnonzero((column == (89, 45, 18)).all(-1))  # 0.35 times as bright
     assert 2 <= len(outline) <= 4
     assert (picture[0, 0] == (228, 233, 238)).all()
-    # Round ends reach half a width beyond.
-    row = np.flatnonzero((picture[49] == (255, 128, 51)).all(-1))
-    assert np.ptp(row) == pytest.approx(120 * (0.6 + width) / (2 - x), abs=2.5)
+    # Round ends reach half a width beyond, and no farther in any direction.
+    size = 120 * np.array([width, 0.6 + width]) / (2 - x)
+    colours = {0: (picture == (255, 128, 51)).all(-1), 3: (picture != picture[0, 0]).any(-1)}
+    for more, shown in colours.items():
+        at, half = np.argwhere(shown), (size + more) / 2
+        np.testing.assert_allclose(at.min(axis=0), (49.5, 99.5) - half, atol=1.6)
+        np.testing.assert_allclose(at.max(axis=0), (49.5, 99.5) + half, atol=1.6)
 
 
 def test_lines_behind_the_camera_are_left_out():
