@@ -11,9 +11,11 @@ def filled(steps: int, block: int = 8192) -> StepLog:
     return log
 
 
-@pytest.mark.parametrize("steps", [1, 7, 8, 9, 16, 17])
-def test_columns_come_back_whatever_the_blocks(steps):
-    log = filled(steps, block=8)
+@pytest.mark.parametrize(
+    ("steps", "block"), [(1, 8), (7, 8), (8, 8), (9, 8), (16, 8), (17, 8), (3, 1)]
+)
+def test_columns_come_back_whatever_the_blocks(steps, block):
+    log = filled(steps, block=block)
     k = np.arange(steps)
     assert log.names == ("time", "joint", "J", "pushed")
     assert len(log) == steps
