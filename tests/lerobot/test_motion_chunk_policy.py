@@ -5,6 +5,7 @@ import math
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lerobot.policies import get_policy_class
@@ -33,7 +34,7 @@ from torchvision.models import resnet18
 
 from hrc_learn.lerobot import MotionChunkConfig
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
-from hrc_learn.lerobot.policy.motion_chunks import ChunkDecoder
+from hrc_learn.lerobot.policy.motion_chunks import ChunkDecoder, ChunkNetwork
 
 SHOWN = reaching(10)
 
@@ -367,6 +368,28 @@ def test_the_closed_form_counts_each_frame_or_evenly_spaced_ones(monkeypatch, mo
     coefficients = policy.decoder.project(counted)
     torch.testing.assert_close(policy.network.mean, coefficients.mean(0))
     torch.testing.assert_close(policy.network.spread, coefficients.std(0))
+
+
+def test_a_network_begins_as_the_ridge_regression_of_numpy():
+    """Numbers have a mean, as those of some episodes of a dataset do."""
+    rng = np.random.default_rng(0)
+    numbers = rng.normal([1.0, -0.5, 2.0], 0.3, (40, 3))
+    settings = {"numbers": 3, "features": 3, "moving": 0, "columns": 2, "two_level": 0}
+    decoder = ChunkDecoder(10, 0.05, n_basis=4)
+    network = ChunkNetwork(decoder=decoder, n_plans=1, hidden=8, dropout=0.0, **settings)
+    targets = numbers @ rng.normal(size=(3, 2 * decoder.size)) + 5.0
+    targets += rng.normal(size=targets.shape)
+    tensor = torch.from_numpy(numbers).float()
+    network.fit(tensor, torch.from_numpy(targets).float().unflatten(-1, (2, -1)))
+    plans = network.eval()(tensor, torch.zeros(40, 0), torch.zeros(40))
+    white = (targets - targets.mean(0)) / targets.std(0, ddof=1)
+    # Observations of zeros are the penalty; they have no constant.
+    design = np.c_[np.r_[np.ones(40), np.zeros(3)], np.r_[numbers, np.sqrt(0.4) * np.eye(3)]]
+    best = np.linalg.lstsq(design, np.r_[white, np.zeros((3, white.shape[1]))])[0]
+    expected = (design[:40] @ best) * targets.std(0, ddof=1) + targets.mean(0)
+    np.testing.assert_allclose(
+        plans.coefficients[:, 0].flatten(1).detach().numpy(), expected, atol=1e-4
+    )
 
 
 def test_training_takes_up_what_the_closed_form_leaves():
