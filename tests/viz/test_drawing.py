@@ -287,9 +287,9 @@ def test_a_line_is_as_thick_as_it_is_near_with_an_outline(x, width):
     size = 120 * np.array([width, 0.6 + width]) / (2 - x)
     colours = {0: (picture == (255, 128, 51)).all(-1), 3: (picture != picture[0, 0]).any(-1)}
     for more, shown in colours.items():
-        at, half = np.argwhere(shown), (size + more) / 2
-        np.testing.assert_allclose(at.min(axis=0), (49.5, 99.5) - half, atol=1.6)
-        np.testing.assert_allclose(at.max(axis=0), (49.5, 99.5) + half, atol=1.6)
+        off, half = np.argwhere(shown) - (49.5, 99.5), (size + more) / 2
+        np.testing.assert_allclose(off.min(axis=0), -half, atol=1.6)
+        np.testing.assert_allclose(off.max(axis=0), half, atol=1.6)
 
 
 def test_lines_behind_the_camera_are_left_out():
