@@ -343,3 +343,19 @@ def test_what_is_no_processor_is_refused(tmp_path):
     (tmp_path / PREPROCESSOR).write_text("{}")
     with pytest.raises(ValueError, match="is not a processor of LeRobot"):
         remove_smoothing(tmp_path)
+
+
+def test_a_robot_with_one_value_that_was_put_elsewhere_begins_at_rest_the_other_goes_on():
+    watch, smooth = WatchStateStep(), SmoothActionsStep(**SETTINGS | {"state_columns": [0, 1]})
+    asked = torch.full((2, 2), 0.5, dtype=torch.float64)
+    states = torch.zeros(2, 2, dtype=torch.float64), torch.full((2, 2), 0.012).double()
+    states[1][0, 0] = 0.3  # 15 rad/s; the other values move at 0.6 rad/s
+    for state in states:
+        watch.reset()
+        smooth.reset()
+        watch(batch_to_transition({"observation.state": state}))
+        action = smooth(policy_action_to_transition(asked))[TransitionKey.ACTION]
+    velocity = (action - states[1]) * 50
+    # One step at the limit of acceleration changes a velocity by 0.16 rad/s at most.
+    expected = torch.tensor([[0.0, 0.0], [0.6, 0.6]], dtype=torch.float64)
+    torch.testing.assert_close(velocity, expected, atol=0.16, rtol=0)
