@@ -92,7 +92,7 @@ def main(args: Args) -> None:
     figures: dict[str, float] = {}
     for name in args.tasks:
         task = make_task(name)
-        shown = _demonstrations(name, args, console)
+        shown = demonstrations(name, args.demonstrations, args.out, console)
         frames = sum(len(e["action"]) for e in shown)
         table = Table(
             "policy", "steps", "CPU s", "success", "object moved", f"{args.few} shown"
@@ -124,9 +124,9 @@ def main(args: Args) -> None:
         console.print(table)
 
 
-def _demonstrations(name: str, args: Args, console: Console) -> list[Episode]:
-    """Those that were kept, and as many more as are missing."""
-    path = args.out / f"{name}.safetensors"
+def demonstrations(name: str, count: int, folder: Path, console: Console) -> list[Episode]:
+    """Demonstrations of a task, read from a folder, or made and kept there if it has fewer."""
+    path = folder / f"{name}.safetensors"
     columns = load_file(path) if path.exists() else {}
     shown: list[Episode] = []
     for key in sorted(columns, key=lambda key: int(key.split(SEPARATOR)[0])):
@@ -134,13 +134,13 @@ def _demonstrations(name: str, args: Args, console: Console) -> list[Episode]:
         if int(k) == len(shown):
             shown.append({})
         shown[int(k)][column] = columns[key]
-    if len(shown) >= args.demonstrations:
-        return shown[: args.demonstrations]
+    if len(shown) >= count:
+        return shown[:count]
     task, seed, failed = make_task(name), 0, 0
     shown = []
     with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task(f"{name}: demonstrations", total=args.demonstrations)
-        while len(shown) < args.demonstrations:
+        bar = progress.add_task(f"{name}: demonstrations", total=count)
+        while len(shown) < count:
             episode = demonstrate(task, seed)
             seed += 1
             if episode is None:

@@ -345,6 +345,8 @@ class PushT:
     moved_at: int | None = 10
     moved: float = 40.0
     """How far the T is moved, pixels."""
+    reward: float = 0.0
+    """Of the package for the last action: covered share of the goal over 95 %, at most 1."""
 
     def __init__(self) -> None:
         import gym_pusht  # noqa: F401  # pyright: ignore[reportMissingImports]
@@ -360,7 +362,8 @@ class PushT:
 
     def step(self, action: Point) -> tuple[Observation, bool]:
         """What is seen after an action, and whether 95 % of the goal are covered."""
-        seen, _, _, _, info = self._environment.step(np.asarray(action, dtype=float))
+        act = np.asarray(action, dtype=float)
+        seen, self.reward, _, _, info = self._environment.step(act)
         return seen, bool(info["is_success"])
 
     def move_object(self, rng: np.random.Generator) -> Observation:

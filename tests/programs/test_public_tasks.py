@@ -124,21 +124,19 @@ def test_there_is_no_such_task():
 
 
 def test_demonstrations_are_kept_and_taken_again(tmp_path, monkeypatch):
-    args = bench.Args(demonstrations=4, out=tmp_path)
-    first = bench._demonstrations("walk", args, Console())
+    first = bench.demonstrations("walk", 4, tmp_path, Console())
     assert [len(e["action"]) for e in first] == [3, 4, 5, 6]
     monkeypatch.setattr(bench, "make_task", None)  # nothing is shown again
-    again = bench._demonstrations("walk", args, Console())
+    again = bench.demonstrations("walk", 4, tmp_path, Console())
     for one, two in zip(first, again, strict=True):
         assert one.keys() == two.keys()
         assert all(torch.equal(one[key], two[key]) for key in one)
-    few = bench.Args(demonstrations=2, out=tmp_path)
-    assert len(bench._demonstrations("walk", few, Console())) == 2
+    assert len(bench.demonstrations("walk", 2, tmp_path, Console())) == 2
 
 
 def test_an_expert_who_mostly_fails_shows_nothing(tmp_path):
     with pytest.raises(RuntimeError, match="lost: 4 of 4 demonstrations failed"):
-        bench._demonstrations("lost", bench.Args(demonstrations=2, out=tmp_path), Console())
+        bench.demonstrations("lost", 2, tmp_path, Console())
     assert not any(tmp_path.iterdir())
 
 
