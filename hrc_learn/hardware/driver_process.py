@@ -87,7 +87,7 @@ def checked_velocity(
             f"joint_velocity must be {len(names)} finite numbers, but is {velocity}."
         )
     # A filter that follows a limit may exceed it by rounding.
-    for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6))[:1]:
+    for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6)):
         text = f"{names[i]}: {velocity[i]:.3f} rad/s is beyond its limit"
         raise ValueError(f"{text} of {fastest[i]:.3f} rad/s.")
     return np.clip(velocity, -fastest, fastest)
