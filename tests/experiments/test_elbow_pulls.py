@@ -130,3 +130,12 @@ def test_random_pulls_come_one_after_the_other_from_all_sides():
     assert starts[-1] > 280
     hands = np.array([pull.towards for pull in pulls])
     assert (hands.std(axis=0) > 0.1).all()
+
+
+def test_a_position_between_two_goals_before_a_corner_is_on_the_path():
+    """Goals a decimetre apart, along x and then along y."""
+    goal = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0], [2, 2, 0]]) / 10
+    position = goal.copy()
+    position[-1] = [0.15, 0.0, 0.02]
+    found = path_distance(position, goal, 0.02 * np.arange(5))
+    np.testing.assert_allclose(found, [0, 0, 0, 0, 0.02], atol=1e-12)
