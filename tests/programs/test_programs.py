@@ -14,15 +14,16 @@ import pytest
 from hrc_learn import cli
 
 ROOT = Path(__file__).parents[2]
-BENCHMARKS = sorted(
-    path for path in (ROOT / "benchmarks").glob("*.py") if "cli.run(" in path.read_text()
-)
 PROGRAMS = sorted(
     path
     for folder in ("datasets", "training", "control")
-    for path in (ROOT / folder).glob("*")
-    if path.suffix == ".py"
+    for path in (ROOT / folder).glob("*.py")
+    if path.stem != "export_mcap"
 )
+BENCHMARKS = sorted(
+    path for path in (ROOT / "benchmarks").glob("*.py") if "cli.run(" in path.read_text()
+)
+BENCHMARKS.append(ROOT / "datasets/export_mcap.py")
 every_benchmark = pytest.mark.parametrize("program", BENCHMARKS, ids=lambda path: path.stem)
 
 
