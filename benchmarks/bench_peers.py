@@ -105,7 +105,7 @@ def main(args: Args) -> None:
         found[name] = predict_set(name, dict(list(tasks.items())[: args.tasks]), options, known)
         cli.write_json(file, asdict(found[name]))
     figures: dict[str, float] = {}
-    summary = Table("RMSE [% of range], p50 / p90")
+    summary = Table("RMSE (% of range), p50 / p90")
     for name, results in found.items():
         show(name, results, args.seed, figures)
         summary.add_column(f"{name} ({len(results.task)})")
@@ -221,13 +221,13 @@ def show(name: str, results: Results, seed: int, figures: dict[str, float]) -> N
     """Print the table of a set and add its figures."""
     table = Table(
         f"{name} ({len(results.task)})",
-        "RMSE [% of range], p50 [95 %] / p90",
+        "RMSE (% of range), p50 [95 %] / p90",
         "RMSE / learn's [95 %]",
-        "goal [%]",
+        "goal (%)",
         "peak acceleration",
-        "tuning [s]",
-        "fit [ms]",
-        "prediction [ms]",
+        "tuning (s)",
+        "fit (ms)",
+        "prediction (ms)",
     )
     draws = resamples(results.task, np.random.default_rng(seed))
     ours = np.array(results.peers["learn"].rmse)
