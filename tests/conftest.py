@@ -6,6 +6,8 @@ import os
 # a thread a core it takes twice the CPU time. Set before torch is imported, and in the
 # environment for the programs that tests start.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Each process in which inductor compiles would import torch.
+os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
 
 import gc
 import random

@@ -19,6 +19,7 @@ from hrc_learn.experiments.grasping_experiment import (
     grasping_metrics,
 )
 from hrc_learn.experiments.grasping_trial import (
+    _MOST_STARTS,
     GraspingSceneConfig,
     _draw_camera,
     _has_free_path,
@@ -83,7 +84,7 @@ def test_a_random_camera_is_shifted_by_10_cm_and_looks_4_cm_off_the_middle_at_mo
 def test_starts_are_within_the_limits_high_and_far_from_the_goal():
     limits, hover = panda.limits, WORKPLACE.hover().position
     lower, upper = limits.lower.numpy() + 0.02, limits.upper.numpy() - 0.02
-    draws = np.random.default_rng(1).uniform(0, 1, (300, 7))
+    draws = np.random.default_rng(1).uniform(0, 1, (_MOST_STARTS, 7))
 
     class Sequence:
         def __init__(self):

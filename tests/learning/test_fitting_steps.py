@@ -139,7 +139,7 @@ def test_a_thinned_demonstration_keeps_its_ends_and_duration(frames, longest):
     thin = _thinned(demo, longest)
     assert len(thin) == min(frames, longest)
     assert (thin.time[0], thin.time[-1]) == (demo.time[0], demo.time[-1])
-    rows = thin.extra["mood"][:, 0]
+    rows = thin.extra["mood"][:, 0].astype(int)
     np.testing.assert_array_equal(thin.position, demo.position[rows])
     step = (frames - 1) / (longest - 1)
     assert np.abs(rows - step * np.arange(longest)).max() <= 0.5
