@@ -133,7 +133,7 @@ def _numbers(demo: Demonstration, made: Mapping[str, Any]) -> Iterator[_Timed]:
         for topic, (joints, *parts) in states.items():
             if any(part is not None for part in parts):  # empty: was not recorded
                 rows = [np.zeros(0) if part is None else part[k] for part in parts]
-                state = dict(zip(_STATE, (list(joints), *rows), strict=True))
+                state: dict[str, Any] = dict(zip(_STATE, (list(joints), *rows), strict=True))
                 yield time, topic, "sensor_msgs/msg/JointState", state
         if place is not None and turn is not None:
             point = made["geometry_msgs/msg/Point"](*place[k])

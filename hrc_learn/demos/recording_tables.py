@@ -191,7 +191,7 @@ def _arrow_columns(path: Path, table: pa.Table) -> Table:
         if pa.types.is_time(column.type):
             column = column.cast(pa.string())
         if pa.types.is_string(column.type):
-            day = pc.binary_join_element_wise("1970-01-01", column, " ")
+            day = pc.binary_join_element_wise("1970-01-01", column, " ")  # pyright: ignore
             with suppress(pa.ArrowInvalid):  # other texts are no times of day
                 column = day.cast(pa.timestamp("ns"))
         if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):

@@ -108,8 +108,8 @@ class PersonWatch:
         """
         seen, number = self._tracker.read(), self._config.pairs
         age = _NAN if seen is None else time - seen.time
-        usable = seen is not None and age >= -_CLOCK_ERROR
-        usable = usable and bool(np.isfinite([seen.ends, seen.velocity]).all())
+        known = age >= -_CLOCK_ERROR
+        usable = seen is not None and known and np.isfinite([seen.ends, seen.velocity]).all()
         if seen is None or not usable or not len(seen.ends):
             distance = joints.new_full((number,), _NO_PERSON if usable else _NAN)
             return WatchedPeople(
