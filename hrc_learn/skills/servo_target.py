@@ -371,7 +371,7 @@ class ServoTarget:
     """Camera that determines the target pixel. It keeps the target in place while the estimate
     of the camera changes. None: the present estimate determines the target pixel."""
 
-    def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool = True) -> Goals:
+    def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool) -> Goals:
         """Goals from an estimate of the camera, for the present pose of the end effector."""
         # A camera that was moved may not see above the box: do not raise the goal until the
         # marker is detected.
