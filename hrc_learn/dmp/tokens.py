@@ -152,7 +152,8 @@ class MotionTokenizer(nn.Module):
         units = _units(seen[:, smooth])
         components = MotionComponents.fit(parts, units, velocity, start_known, accuracy)
         config: dict[str, Any] = {"steps": chosen, "slots": min(y.shape[1] - 1, MOST_SLOTS)}
-        reference = (y[:, 0] if start_known else y[:, 0].mean(0).expand(len(y), -1))[:, chosen]
+        # Unknown starts are the lowest values, as for `encode` and `decode`.
+        reference = y[:, 0, chosen] if start_known else levels[:, 0].expand(len(y), -1)
         switches = _switches(samples, reference, chosen, levels, config["slots"])
         z = components.encode(parts, velocity) * components.spread
         # Errors of all columns add up.

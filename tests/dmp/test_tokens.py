@@ -244,6 +244,17 @@ def test_grippers_switch_without_ramps(gripping):
     assert (tokenizer.decode(ids, TIME, position[:, 0], order=1)[..., 1] == 0).all()
 
 
+def test_grippers_that_mostly_start_closed_are_restored_from_unknown_starts():
+    """Most chunks start closed; the others close at any time."""
+    position, _ = motions(300, columns=2)
+    at = torch.randint(-30, 20, (300, 1), generator=torch.Generator().manual_seed(4))
+    gripper = 2 * (torch.arange(21) >= at).double() - 1
+    whole = torch.stack([position[..., 0], gripper, position[..., 1]], -1)
+    tokenizer = MotionTokenizer.fit(TIME, whole, VOCABULARY, start_known=False)
+    made = tokenizer.decode(tokenizer.encode(TIME, whole), TIME)
+    assert torch.equal(made[..., 1], gripper)
+
+
 def test_any_tokens_leave_grippers_on_their_levels(gripping):
     tokenizer, position = gripping
     rng = torch.Generator().manual_seed(5)
