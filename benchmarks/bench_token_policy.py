@@ -79,7 +79,7 @@ class Args:
     """LeRobot datasets, as FOLDER, or as FOLDER:COLUMN if that column's next value is the
     action, as in hand-guided demonstrations."""
     codes: tuple[str, ...] = CODES
-    """Codes to compare; ours-256 is ours with 256 tokens."""
+    """Codes to compare; ours-free-256 is ours with 256 tokens that also encode the start."""
     units: int = 900
     """CPU time of training, as a number of steps of a code with `UNIT` tokens."""
     seeds: int = 3
@@ -236,7 +236,7 @@ class SetJob(Job):
         root, _, column = source.partition(":")
         folder = open_folder(root)
         column = column or ACTION
-        columns = read_episodes(root, {STATE, column})
+        columns = read_episodes(root, list(dict.fromkeys((STATE, column))))
         episodes = [
             {STATE: e[STATE].float(), ACTION: e[column].float()}
             if column == ACTION
@@ -345,8 +345,9 @@ def show(runs: list[dict[str, Any]], args: Args, console: Console) -> None:
                 more = [ours[k] - v for k, v in values.items() if k in ours]
                 gap, wide = interval(more)
                 sign = 1 if task else -1
-                verdict = "" if code == "ours" else "draw" if not abs(gap) > wide else "better"
-                verdict = "worse" if verdict == "better" and sign * gap < 0 else verdict
+                better = "better" if sign * gap > 0 else "worse"
+                verdict = better if abs(gap) > wide else "draw"
+                verdict = "one seed" if math.isnan(wide) else verdict
                 figures |= {f"{job}_{code}_{name}": mean, f"{job}_{code}_{name}_half": half}
                 average = {
                     key: float(np.mean([run[key] for run in mine.values()]))

@@ -179,20 +179,27 @@ def compare(dataset: Path, args: Args) -> dict[str, float]:
 
 
 def matched(
-    train: Chunks, test: Chunks, rmse: float, vocabulary: int = VOCABULARY
+    train: Chunks,
+    test: Chunks,
+    rmse: float,
+    vocabulary: int = VOCABULARY,
+    *,
+    start_known: bool = True,
 ) -> tuple[MotionTokenizer, float, float]:
     """Tokenizer of about this error, its tokens per chunk at this error, and its own error.
 
     The logarithms of two near errors and their tokens are interpolated.
     """
     state = torch.from_numpy(test.motions[:, 0]), torch.from_numpy(test.start_velocity)
+    state = state if start_known else ()
     tolerance, points = rmse / 2, []
     for _ in range(3):
         tokenizer = MotionTokenizer.fit(
             train.time,
             train.motions,
             vocabulary,
-            start_velocity=train.start_velocity,
+            start_velocity=train.start_velocity if start_known else None,
+            start_known=start_known,
             tolerance=tolerance,
         )
         ids = tokenizer.encode(test.time, test.motions, test.start_velocity)

@@ -52,8 +52,11 @@ class Code(Protocol):
     """Map between chunks and tokens 0 ... size - 1."""
 
     size: int
-    end: int | None
-    """Token that ends a sequence; None: all have the same length."""
+
+    @property
+    def end(self) -> int | None:
+        """Token that ends a sequence; None: all have the same length."""
+        ...
 
     def encode(self, chunks: Chunks) -> list[list[int]]:
         """Tokens that a network has to write for each chunk."""
@@ -69,13 +72,20 @@ class Code(Protocol):
 class OurCode:
     """`MotionTokenizer` with the error of FAST's recipe."""
 
-    def __init__(self, chunks: Chunks, size: int):
-        """Fit to chunks."""
+    def __init__(self, chunks: Chunks, size: int = VOCABULARY, start_known: bool = True):
+        """Fit to chunks.
+
+        Args:
+            chunks: Motions from the last action on.
+            size: Number of tokens.
+            start_known: False: tokens encode also where chunks start.
+        """
+        self.start_known = start_known
         some = _thinned(chunks)
         # The transform is orthogonal: coefficients have the error of the chunks.
         y = SCALE * np.asarray(dct(some.motions[:, 1:], axis=1, norm="ortho"))
         rmse = np.sqrt(np.mean((y - y.round()) ** 2)) / SCALE
-        self.tokenizer, _, _ = matched(chunks, some, float(rmse), size)
+        self.tokenizer, _, _ = matched(chunks, some, float(rmse), size, start_known=start_known)
         self.size, self.end, self.time = size, self.tokenizer.end, chunks.time
 
     def encode(self, chunks: Chunks) -> list[list[int]]:
@@ -85,7 +95,8 @@ class OurCode:
     def decode(
         self, ids: Int[np.ndarray, "B L"], last: Windows, relaxed: bool
     ) -> tuple[Float[np.ndarray, "B T D"], Bool[np.ndarray, "B"]]:
-        made = self.tokenizer.decode(ids, self.time, last.start, last.velocity)
+        state = (last.start, last.velocity) if self.start_known else ()
+        made = self.tokenizer.decode(ids, self.time, *state)
         return made.numpy()[:, 1:], np.zeros(len(ids), bool)
 
 
@@ -153,15 +164,14 @@ def code_of(name: str, chunks: Chunks) -> Code:
         ValueError: There is no such code.
     """
     match name.split("-"):
-        case ["ours"]:
-            return OurCode(chunks, VOCABULARY)
-        case ["ours", size]:
-            return OurCode(chunks, int(size))
         case ["fast"]:
             return FastCode(chunks)
         case ["bins"]:
             return Bins(chunks)
-    raise ValueError(f"--codes takes {', '.join(CODES)} or ours-256, not {name!r}")
+        case ["ours", *settings]:
+            size = [int(word) for word in settings if word.isdecimal()] or [VOCABULARY]
+            return OurCode(chunks, size[0], "free" not in settings)
+    raise ValueError(f"--codes takes {', '.join(CODES)} or ours-free-256, not {name!r}")
 
 
 def _thinned(chunks: Chunks) -> Chunks:

@@ -44,6 +44,9 @@ class Block(nn.Module):
 class Writer(nn.Module):
     """Decoder-only transformer whose first position is what is observed."""
 
+    mean: Tensor
+    spread: Tensor
+
     def __init__(
         self, inputs: Float[Tensor, "N I"], size: int, length: int, width: int, layers: int
     ):
