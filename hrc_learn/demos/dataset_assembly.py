@@ -307,9 +307,9 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
         staging.mkdir()
     except FileExistsError:
         text = (
-            f"{staging} holds an interrupted recording: {recovery_advice(root)} makes a dataset"
+            f"{staging} holds an interrupted recording: {recovery_advice(root)} makes a "
+            "dataset of its saved episodes; remove the folder to start anew"
         )
-        text += " of its saved episodes; remove the folder to start anew"
         raise FileExistsError(text) from None
     try:
         store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
