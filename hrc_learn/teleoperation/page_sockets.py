@@ -400,7 +400,7 @@ def _guarded_sockets(secret: str):
 
     def serve(*args: Any, **options: Any) -> Any:
         def check(connection: ServerConnection, request: Any) -> Any:
-            if same_secret(request.headers.get(_SECRET_HEADER, ""), secret):
+            if same_secret("".join(request.headers.get_all(_SECRET_HEADER)), secret):
                 return None
             return connection.respond(403, "This port is not for browsers.\n")
 

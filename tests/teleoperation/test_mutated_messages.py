@@ -133,12 +133,13 @@ def test_leaders_watchers_and_headsets_have_a_link_each(session):
     assert http(page, "/xr")[0] == 200
 
 
-async def ask(page, raw: bytes) -> bytes:
+async def ask(page, raw: bytes, *, ends: bool = True) -> bytes:
     """Answer to a request that then ends; empty where the server closes without one."""
     reader, writer = await asyncio.open_connection("127.0.0.1", page.address.port)
     try:
         writer.write(raw)
-        writer.write_eof()
+        if ends:
+            writer.write_eof()
         return await asyncio.wait_for(reader.read(64), PATIENCE)
     except ConnectionError:
         return b""
@@ -189,6 +190,17 @@ def no_traceback(caplog):
         yield
     raised = [record for record in caplog.records if record.exc_info]
     assert not raised, [record.getMessage() for record in raised]
+
+
+@pytest.mark.usefixtures("no_traceback")
+@pytest.mark.parametrize("name", ["Host", "Upgrade", "Authorization", "Origin"])
+def test_requests_that_repeat_a_header_are_refused(session, name):
+    for sound in requests(session.page)[1:3]:
+        lines = sound.split("\r\n")
+        repeated = [line for line in lines for _ in range(1 + line.startswith(name))]
+        if repeated != lines:
+            answer = asyncio.run(ask(session.page, "\r\n".join(repeated).encode(), ends=False))
+            assert answer[9:12] == (b"403" if name == "Host" else b"400")
 
 
 @pytest.mark.long

@@ -218,7 +218,7 @@ class Gate:
             hosts = request.headers.get_all("Host")
             if len(hosts) != 1 or not self._admission.is_ours(hosts[0]):
                 raise RefusedError(403, "This page is not served under that name.")
-            if request.headers.get("Upgrade", "").lower() == "websocket":
+            if _header(request, "Upgrade").lower() == "websocket":
                 await self._admit(request)
                 return None
             content = await self._content(request)
@@ -234,7 +234,7 @@ class Gate:
         path = _path(request)
         if path in self._contents:
             return self._contents[path]
-        kind, _, secret = request.headers.get("Authorization", "").partition(" ")
+        kind, _, secret = _header(request, "Authorization").partition(" ")
         self._admission.right(secret if kind == "Bearer" else "")
         if path == "/admitted":
             return Content(body=b"", kind=_PLAIN)
@@ -249,7 +249,7 @@ class Gate:
         Raises:
             RefusedError: The socket may not be opened.
         """
-        if not self._admission.from_ours(request.headers.get("Origin", "")):
+        if not self._admission.from_ours(_header(request, "Origin")):
             raise RefusedError(403, "Another site may not connect.")
         route, client = _place(request)
         if route not in self._routes or not 16 <= len(client) <= 64:
@@ -317,6 +317,14 @@ def _path(request: Request) -> str:
         return urlsplit(request.path).path
     except ValueError as error:
         raise RefusedError(400, "That is no address.") from error
+
+
+def _header(request: Request, name: str) -> str:
+    """Value of a header that a request may give once; empty where it is absent."""
+    values = request.headers.get_all(name)
+    if len(values) > 1:
+        raise RefusedError(400, f"The request has more than one header {name}.")
+    return "".join(values)
 
 
 def _place(request: Request) -> tuple[str, str]:
