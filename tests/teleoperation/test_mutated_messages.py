@@ -200,7 +200,7 @@ def test_requests_that_repeat_a_header_are_refused(session, name):
         repeated = [line for line in lines for _ in range(1 + line.startswith(name))]
         if repeated != lines:
             answer = asyncio.run(ask(session.page, "\r\n".join(repeated).encode(), ends=False))
-            assert answer[9:12] == (b"403" if name == "Host" else b"400")
+            assert answer[9:12] == b"400"
 
 
 @pytest.mark.long
@@ -225,6 +225,7 @@ def test_a_page_lives_on_after_many_damaged_messages(session):
         lambda text: text.replace("Bearer ", "Bearer \xff"),
         lambda text: text.replace("secret.", "secret.\xff"),
         lambda text: text.replace("Origin: http", "Origin: \xff"),
+        lambda text: text.replace("Key: ", "Key: \xff"),
         lambda text: text.replace("GET /", "GET /../", 1),
     ],
 )
@@ -232,5 +233,5 @@ def test_damage_of_each_kind_is_refused(session, damage):
     sound = requests(session.page)
     for text in sound:
         if (wrong := damage(text)) != text:
-            answer = asyncio.run(ask(session.page, wrong.encode("latin-1")))
+            answer = asyncio.run(ask(session.page, wrong.encode("latin-1"), ends=False))
             assert answer == b"" or answer[9:10] == b"4", answer

@@ -215,8 +215,10 @@ class Gate:
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket through."""
         try:
-            hosts = request.headers.get_all("Host")
-            if len(hosts) != 1 or not self._admission.is_ours(hosts[0]):
+            # websockets fails by itself at letters that ASCII lacks.
+            if not all(value.isascii() for _, value in request.headers.raw_items()):
+                raise RefusedError(400, "Headers are ASCII text.")
+            if not self._admission.is_ours(_header(request, "Host")):
                 raise RefusedError(403, "This page is not served under that name.")
             if _header(request, "Upgrade").lower() == "websocket":
                 await self._admit(request)
@@ -335,16 +337,20 @@ def _place(request: Request) -> tuple[str, str]:
 
 def _secret(request: Request) -> str:
     """Secret among the subprotocols that a client offers."""
-    offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
-    words = [word.strip() for word in offered.split(",")]
-    return next((w.removeprefix(_SECRET) for w in words if w.startswith(_SECRET)), "")
+    offered = ", ".join(request.headers.get_all("Sec-WebSocket-Protocol")).split(",")
+    secrets = [name.strip() for name in offered if name.strip().startswith(_SECRET)]
+    return secrets[0].removeprefix(_SECRET) if secrets else ""
 
 
 def _quiet_logger() -> logging.Logger:
-    """Drop log lines about refused clients, which could otherwise flood the terminal."""
+    """Drop log lines about refused clients, which could otherwise flood the terminal.
+
+    websockets calls it an internal error when a client closes before it has the answer.
+    """
+    noise = ("opening handshake", "unexpected internal error")
     logger = logging.getLogger("hrc_learn.gate.sockets")
     if not logger.filters:
-        logger.addFilter(lambda record: not record.getMessage().startswith("opening handshake"))
+        logger.addFilter(lambda record: not record.getMessage().startswith(noise))
     return logger
 
 
