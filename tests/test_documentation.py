@@ -93,6 +93,7 @@ def test_a_section_follows_the_order_of_its_index(tmp_path):
 
 
 @builder
+@pytest.mark.long
 def test_the_site_opens_without_a_network(tmp_path):
     out = tmp_path / "site"
     assert build_docs.build(checkout(tmp_path / "checkout"), out) == []

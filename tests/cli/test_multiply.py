@@ -38,6 +38,7 @@ def multiplied(dataset, out, *more, episodes=6):
     return hrc("multiply", dataset, "--episodes", episodes, "--out", out, *more)
 
 
+@pytest.mark.long
 def test_new_episodes_have_the_columns_of_the_demonstrations(dataset, tmp_path):
     out, figures = tmp_path / "out", tmp_path / "figures.json"
     wide = "objects.block.yaw=[-0.4,0.4]"
@@ -67,6 +68,7 @@ def test_new_episodes_have_the_columns_of_the_demonstrations(dataset, tmp_path):
         assert (np.diff(mood) >= 0).all()
 
 
+@pytest.mark.long
 def test_it_goes_on_where_it_was_killed(dataset, tmp_path, monkeypatch):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     multiplied(dataset, whole)

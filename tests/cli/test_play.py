@@ -77,6 +77,7 @@ def test_a_motion_is_written_as_table_film_recording_and_episode(models, tmp_pat
     assert episode.command_position[:-1] == pytest.approx(joints[1:], abs=1e-5)
 
 
+@pytest.mark.long
 def test_a_demonstration_gives_start_and_goal(models, tmp_path):
     out = tmp_path / "out"
     words = ("--start", "episode", 1, "--goal", "episode", 0)

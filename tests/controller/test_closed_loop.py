@@ -100,6 +100,7 @@ def test_adaptation_finds_a_camera_turned_upside_down():
     assert success[KalmanEstimator] >= 0.9
 
 
+@pytest.mark.long
 def test_a_person_moves_the_elbow_and_not_the_tool():
     """Pull of joint 4 the way it can go and back, while the arm servoes on its target."""
     dt = 0.008
@@ -212,6 +213,7 @@ def test_a_lost_marker_does_not_send_the_arm_back_to_its_approach():
     assert (path[-1] - path[150]).norm() < 2e-3
 
 
+@pytest.mark.long
 def test_a_posture_far_away_begins_a_new_approach():
     rng = sampling.generator(16)
     controller, _ = grasping(rng=rng)

@@ -44,6 +44,7 @@ def test_poisoned_arms_keep_their_limits_and_move_again():
     assert not result.stuck.any()
 
 
+@pytest.mark.long
 def test_poison_that_is_remembered_is_noticed(monkeypatch):
     monkeypatch.setattr(SafetyFilter, "restored", lambda self, state: state)
     monkeypatch.setattr(AdaptiveController, "_restored", lambda self, state: state)

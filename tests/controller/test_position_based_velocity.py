@@ -111,6 +111,7 @@ def test_hostile_streams_keep_all_limits(arm, constraints):
         assert float(fastest) > 0.9
 
 
+@pytest.mark.long
 def test_streams_that_know_of_no_tightening_break_it():
     """The check finds what it is there to find."""
     flat = replace(fr3.limits, velocity_offset=None, deceleration=None)

@@ -123,6 +123,7 @@ def run(mode: str, constraints: ConstraintConfig | None = None) -> tuple[float, 
     return float(near.distance), float(moved)
 
 
+@pytest.mark.long
 def test_the_four_modes():
     """A person who pushes the elbow towards an obstacle, 0.2 m away at first."""
     with shapes_unchecked():

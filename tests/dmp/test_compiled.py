@@ -82,8 +82,9 @@ def run(program, *arguments):
     subprocess.run([sys.executable, "-c", program, *arguments], check=True)
 
 
-def test_compiles_with_the_gradient_by_its_duration():
-    run(COMPILED, "aot_eager", "joint", "ude")
+@pytest.mark.parametrize("kind", ["joint", pytest.param("ude", marks=pytest.mark.long)])
+def test_compiles_with_the_gradient_by_its_duration(kind):
+    run(COMPILED, "aot_eager", kind)
 
 
 @pytest.mark.slow

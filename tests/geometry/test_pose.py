@@ -70,6 +70,7 @@ class RoundTrip(torch.nn.Module):
         return Pose.from_vector(same.vector())
 
 
+@pytest.mark.long
 def test_exports_for_any_batch_size():
     pose = poses(5, rng=generator(6))
     batch = torch.export.Dim("batch")

@@ -249,6 +249,7 @@ def test_a_loop_at_rest_ends_with_its_commander(box, monkeypatch):
     assert box.cycle == 20
 
 
+@pytest.mark.long
 def test_after_lost_cycles_the_answers_go_on_from_what_the_box_has(box):
     box.command(range(10, 400, 20))
     # In the first ramp, at constant velocity, and as it turns round.

@@ -252,6 +252,7 @@ def test_messages_that_cannot_be_used_are_refused_and_do_not_end_the_thread(grap
     assert len(graph.log) == 2
 
 
+@pytest.mark.long
 def test_a_camera_that_falls_silent_stops_the_arm_that_follows_its_feature(
     graph, arm, node, values
 ):

@@ -141,6 +141,7 @@ def test_small_motions_are_noticed(reference, turn, shift):
 
 
 @pytest.mark.simulation
+@pytest.mark.long
 def test_a_camera_that_stood_still_is_left_in_peace(reference):
     rng = np.random.default_rng(4)
     for _ in range(2):

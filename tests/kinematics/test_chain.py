@@ -169,6 +169,7 @@ class ForwardAndJacobian(torch.nn.Module):
         return panda.forward_and_jacobian(q)
 
 
+@pytest.mark.long
 def test_exports_for_any_batch_size():
     q = joint_positions(5, rng=generator(11))
     with shapes_unchecked():

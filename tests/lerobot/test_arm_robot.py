@@ -165,6 +165,7 @@ def test_a_robot_whose_person_cannot_be_reached_is_disconnected(
         assert connected_robots() == []
 
 
+@pytest.mark.long
 def test_a_page_that_has_failed_does_not_leave_the_arm_connected(simulated):
     pytest.importorskip("viser", reason="the extra `ui` is not installed")
     robot = simulated(action_space="ee", person=PersonConfig(kind="page"))

@@ -95,6 +95,7 @@ def test_a_camera_that_stands_still_is_left_in_peace(step, caplog):
     assert not caplog.records
 
 
+@pytest.mark.long
 def test_a_moved_camera_is_warned_about_once_an_episode(step, caplog):
     caplog.set_level(logging.WARNING)
     rng = np.random.default_rng(2)
@@ -136,6 +137,7 @@ def correcting(step):
     return CameraWatchStep(**step.get_config() | columns | more)
 
 
+@pytest.mark.long
 def test_a_policy_sees_what_it_would_if_the_camera_had_not_been_moved(correcting, caplog):
     rng = np.random.default_rng(4)
     knocked = moved(CAMERA, torch.tensor([0.1, 0.02, 0.05, 0.05, -0.03, 0.02]).double())

@@ -74,6 +74,7 @@ def test_plans_without_an_error_are_plans_all_the_same(error):
 
 @pytest.mark.gradients
 @pytest.mark.simulation
+@pytest.mark.long
 def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
     shown = passing()
     policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)

@@ -431,6 +431,7 @@ def test_a_checkpoint_brings_everything(tmp_path):
         MotionChunkPolicy.from_pretrained(tmp_path)
 
 
+@pytest.mark.long
 def test_a_policy_begins_with_given_weights_and_a_checkpoint_brings_them(tmp_path):
     """The file is not asked for again."""
     torch.manual_seed(0)

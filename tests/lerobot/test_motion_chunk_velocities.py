@@ -170,6 +170,7 @@ def there_and_back(count=12, frames=60):
 
 @pytest.mark.gradients
 @pytest.mark.simulation
+@pytest.mark.long
 def test_velocities_tell_the_way_there_from_the_way_back():
     shown = there_and_back()
     errors = []

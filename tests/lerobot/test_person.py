@@ -104,6 +104,7 @@ def test_the_elbow_goes_aside_and_back_while_the_hand_follows_the_actions(pulled
     assert not robot.complement.offset.any()
 
 
+@pytest.mark.long
 def test_joints_as_they_are_are_observed_if_wanted(pulled):
     robot = pulled(PULL, observed="joints", velocity=True)
     wished, read, seen = carried_out(robot, seconds=2.0)
@@ -113,6 +114,7 @@ def test_joints_as_they_are_are_observed_if_wanted(pulled):
     assert values_of(seen, VELOCITIES).abs().max() > 0.3
 
 
+@pytest.mark.long
 def test_poses_of_the_hand_are_followed_likewise(pulled):
     robot = pulled(PULL, action_space="ee")
     start = robot.get_observation()
@@ -127,6 +129,7 @@ def test_poses_of_the_hand_are_followed_likewise(pulled):
     assert np.abs(robot.complement.offset).max() > 0.2
 
 
+@pytest.mark.long
 def test_what_the_person_does_is_recorded_in_columns_of_its_own(pulled, tmp_path):
     robot = pulled(PULL, record=True)
     names = [*NULLSPACE_INPUTS, *OFFSETS]

@@ -140,6 +140,7 @@ def test_an_expert_who_mostly_fails_shows_nothing(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.long
 def test_successes_are_counted_by_lerobots_evaluation():
     """A policy that steps on, whatever it sees, gets there, and later where the thing moved."""
     args = bench.Args(demonstrations=8, minutes=0.02)

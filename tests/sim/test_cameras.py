@@ -124,6 +124,7 @@ def sensor_for(world, kind):
 
 
 @pytest.mark.parametrize("kind", ["synthetic", pytest.param("egl", marks=pytest.mark.egl)])
+@pytest.mark.long
 def test_a_marker_is_hidden_for_a_spell_and_seen_again(board_world, kind):
     board_world.reset(WORKPLACE.hover_joints().numpy())
     sensor = sensor_for(board_world, kind)

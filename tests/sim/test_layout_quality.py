@@ -53,6 +53,7 @@ def robot(request):
     return six_joints() if request.param == "six" else described(request.param)
 
 
+@pytest.mark.long
 def test_the_arm_gets_to_all_shelves_and_touches_nothing(robot):
     workplace = Workplace.of(robot)
     world = World(workplace.scene)
@@ -190,6 +191,7 @@ def test_a_marker_is_seen_where_no_ray_to_it_meets_a_link():
     assert 5 < sum(said) < 55
 
 
+@pytest.mark.long
 def test_an_arm_too_small_for_the_cell_is_refused():
     small = bare()
     chain = small.chain

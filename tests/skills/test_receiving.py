@@ -119,6 +119,7 @@ def receiving(cell, model, **config):
 
 
 @shapes_unchecked()
+@pytest.mark.long
 def test_passes_over_another_movement_and_meets_the_hand(model):
     met = np.array([0.3, 0.4, 0.33])
     moves = [(1.0, 1.0, ELSEWHERE), (3.0, 1.0, REST), (5.0, 1.1, met + BESIDE)]

@@ -155,6 +155,7 @@ class RoughWall(Wall):
         return replace(state, external_torque=torque)
 
 
+@pytest.mark.long
 def test_who_pushes_the_null_space_is_not_taken_for_a_surface():
     """Two pushes, one on the way and one as the surface is near, to both sides."""
     top = float(panda.forward(HOVER).position[2]) - 0.03
@@ -325,6 +326,7 @@ class SlowArm(ObedientArm):
         self.velocity = now
 
 
+@pytest.mark.long
 def test_a_straight_line_slows_down_for_an_arm_that_falls_behind():
     cell = cell_with(SlowArm(HOVER.numpy()))
     start = cell.pose.position

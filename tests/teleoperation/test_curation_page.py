@@ -278,6 +278,7 @@ def test_a_set_that_cannot_be_written_says_why(page, client):
 
 
 @pytest.mark.browser
+@pytest.mark.long
 def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tab):
     errors: list = []
     tab.on("pageerror", lambda error: errors.append(error))

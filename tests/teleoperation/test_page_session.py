@@ -101,6 +101,7 @@ def test_an_arm_with_a_driver_moves_home_and_never_jumps(tmp_path):
 
 
 @pytest.mark.simulation
+@pytest.mark.long
 def test_an_arm_with_a_driver_does_not_go_home_through_a_board(tmp_path):
     home, shelf = Workplace().home_joints(), Workplace().shelf("upper")
     with session_from(panda.inverse(shelf, near=home), tmp_path) as session:

@@ -127,6 +127,7 @@ def show(run):
             run.command(target, asked.gripper)
 
 
+@pytest.mark.long
 def test_the_expert_grasps_and_doing_nothing_does_not(grasping):
     grasping.begin(3)
     show(grasping)
