@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import atexit
 import os
+import queue
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -104,19 +106,16 @@ def read_description(topic: str = "/robot_description", timeout: float = _STARTU
     """
     from std_msgs.msg import String
 
-    session, came, found = Ros2Session("hrc_description"), threading.Event(), []
-
-    def take(message: Any) -> None:
-        found.append(message.data)
-        came.set()
-
-    session.node.create_subscription(String, topic, take, quality(reliable=True, latched=True))
-    there = came.wait(timeout)
-    session.close()
-    if not there:
+    session, found = Ros2Session("hrc_description"), queue.SimpleQueue[String]()
+    form = quality(reliable=True, latched=True)
+    session.node.create_subscription(String, topic, found.put, form)
+    try:
+        return found.get(timeout=timeout).data
+    except queue.Empty:
         text = f"no description on {topic} for {timeout:g} s: is robot_state_publisher running"
-        raise ConnectionError(f"{text}, and is ROS_DOMAIN_ID the same?")
-    return found[0]
+        raise ConnectionError(f"{text}, and is ROS_DOMAIN_ID the same?") from None
+    finally:
+        session.close()
 
 
 def found_description(name: str) -> str:
@@ -152,23 +151,27 @@ def start_guard(topic: str, joints: int, timeout: float, controllers: int) -> su
     Raises:
         ConnectionError: The guard does not start.
     """
-    numbers = map(str, (joints, timeout, controllers))
+    numbers = map(str, (joints, timeout, controllers, os.getpid()))
     words = [sys.executable, str(Path(__file__)), topic, *numbers]
-    process = subprocess.Popen(words, stdout=subprocess.PIPE)
+    # In a session of its own: a closed terminal or Ctrl-C must not end it before the commander.
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, start_new_session=True)
     assert process.stdout is not None
     if not process.stdout.readline():
         raise ConnectionError(f"the guard of {topic} does not start: see its error above")
     return process
 
 
-def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) -> None:
+def guard_velocities(
+    topic: str, joints: int, timeout: float, controllers: int, parent: int
+) -> None:
     """Send zeros once the last command is a nonzero velocity and older than the timeout.
 
-    After the process that started the guard has died, the guard sends zeros for another second.
+    After the process that started the guard (ID `parent`) has died, the guard sends zeros for
+    another second.
     """
     from std_msgs.msg import Float64MultiArray
 
-    session, parent = Ros2Session(f"hrc_guard_{os.getpid()}"), os.getppid()
+    session = Ros2Session(f"hrc_guard_{os.getpid()}")
     newest = {"moving": 0.0, "time": 0.0}
 
     def take(message: Any) -> None:
@@ -202,6 +205,6 @@ def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) 
 
 
 if __name__ == "__main__":
-    with suppress(KeyboardInterrupt):
-        joints, timeout, controllers = sys.argv[2:]
-        guard_velocities(sys.argv[1], int(joints), float(timeout), int(controllers))
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends after its commander
+    topic, joints, timeout, *numbers = sys.argv[1:]
+    guard_velocities(topic, int(joints), float(timeout), *map(int, numbers))

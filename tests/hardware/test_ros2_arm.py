@@ -168,15 +168,23 @@ with Ros2Arm(panda.chain, Ros2Config()) as arm:
 """
 
 
-def test_a_killed_node_leaves_the_arm_at_rest(world):
-    """The velocity controller has no time-out of its own: the guard sends zeros."""
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP, signal.SIGTERM])
+def test_a_killed_node_leaves_the_arm_at_rest(world, number):
+    """The velocity controller has no time-out of its own: the guard sends zeros, also if a
+    terminal or a supervisor ends all processes of the node.
+    """
     with Ros2Robot(world) as robot:
-        node = subprocess.Popen([sys.executable, "-c", LOOP], stdout=subprocess.PIPE, text=True)
+        node = subprocess.Popen(
+            [sys.executable, "-c", LOOP],
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
         assert node.stdout is not None
         assert node.stdout.readline() == "ready\n"
         time.sleep(0.3)
         assert robot.state.joint_velocity[0] > 0.2
-        node.send_signal(signal.SIGKILL)
+        os.killpg(node.pid, number)
         node.wait()
         assert rests(robot, 2.0) < 1.0
 

@@ -68,7 +68,7 @@ def guarded(monkeypatch, graph, controllers=1):
     monkeypatch.setattr(ros2_topics, "Ros2Session", lambda name: graph)
     monkeypatch.setattr(ros2_topics, "time", graph)
     monkeypatch.setattr(os, "getppid", lambda: 1 if graph.now > graph.death else 77)
-    guard_velocities(TOPIC, 3, TIMEOUT, controllers)
+    guard_velocities(TOPIC, 3, TIMEOUT, controllers, 77)
 
 
 def test_zeros_follow_a_velocity_that_nobody_renews_and_the_death_of_its_commander(
@@ -112,13 +112,18 @@ def test_a_guard_whose_commander_dies_early_does_not_wait(monkeypatch):
     with pytest.raises(SystemExit):
         guarded(monkeypatch, graph, controllers=2)
     assert graph.now == pytest.approx(51.0, abs=0.05)
+    graph = GuardedGraph(death=49.0)  # before the guard has started
+    guarded(monkeypatch, graph, controllers=0)
+    assert graph.now == pytest.approx(51.0, abs=0.1)
+    assert graph.closed
 
 
 @pytest.mark.parametrize("line", [b"ready\n", b""])
 def test_a_guard_is_a_process_that_says_when_it_is_ready(monkeypatch, line):
     words = []
 
-    def open_process(command, stdout):
+    def open_process(command, stdout, start_new_session):
+        assert start_new_session  # signals of a terminal do not reach it
         words.extend(command)
         return SimpleNamespace(stdout=SimpleNamespace(readline=lambda: line))
 
@@ -126,7 +131,7 @@ def test_a_guard_is_a_process_that_says_when_it_is_ready(monkeypatch, line):
     if line:
         assert start_guard(TOPIC, 7, 0.3, 2).stdout is not None
         assert words[0] == sys.executable
-        assert words[2:] == [TOPIC, "7", "0.3", "2"]
+        assert words[2:] == [TOPIC, "7", "0.3", "2", str(os.getpid())]
         return
     with pytest.raises(ConnectionError, match=f"the guard of {TOPIC} does not start"):
         start_guard(TOPIC, 7, 0.3, 2)
