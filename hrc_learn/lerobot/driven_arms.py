@@ -11,7 +11,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -144,6 +144,7 @@ class DrivenArm(ArmRobot):
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float
     ) -> Float[np.ndarray, " joints"]:
+        self._arm.feed()  # its answer tells of a stop while the policy computed the action
         if self._arm.trips != self._trips:
             self._trips = self._arm.trips
             self._servo.restart()  # the arm is at rest, which the servo does not know
@@ -151,7 +152,6 @@ class DrivenArm(ArmRobot):
             _, sent = self._servo.follow(joints)
         if np.isfinite(width):
             self._arm.move(width)
-        self._arm.feed()
         return sent
 
 
@@ -208,7 +208,10 @@ class Ros2ArmRobot(DrivenArm):
         super().__init__(config, ArmChoice(found_description(config.arm)).arm())
 
     def _driver(self) -> Callable[[], StoppableArm]:
-        return partial(Ros2Arm, self.work_arm.chain, self.config.topics)
+        # A velocity must last until the next action, also at a low rate.
+        topics, least = self.config.topics, 1.5 * self.dt
+        topics = replace(topics, timeout=max(topics.timeout, least))
+        return partial(Ros2Arm, self.work_arm.chain, topics)
 
 
 @CameraConfig.register_subclass("ros2")

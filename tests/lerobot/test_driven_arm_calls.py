@@ -1,5 +1,6 @@
 """Arms behind drivers call by call: driver, topics and clock are the test's."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -60,7 +61,8 @@ class Process:
     """The process of a driver: an arm that does what it is told, and what was asked of it."""
 
     def __init__(self, driver, timeout):
-        self.driver, self.timeout, self.trips, self.calls = driver, timeout, 4, []
+        self.driver, self.timeout, self.stops, self.calls = driver, timeout, 4, []
+        self.trips = 4  # as of the last answer
         self.q, self.velocity, self.now = READY.copy(), np.zeros(7), 1.0
 
     def __enter__(self):
@@ -70,6 +72,7 @@ class Process:
         self.calls.append("close")
 
     def read(self):
+        self.trips = self.stops
         return ArmState(
             time=self.now,
             joint_position=self.q.copy(),
@@ -78,13 +81,16 @@ class Process:
         )
 
     def command(self, velocity):
-        self.velocity = np.array(velocity)
+        if self.trips == self.stops:
+            self.velocity = np.array(velocity)
+        self.trips = self.stops
 
     def move(self, width):
         self.calls.append(("move", width))
 
     def feed(self):
         self.calls.append("feed")
+        self.trips = self.stops
 
     def turn(self, dt):
         self.q, self.now = self.q + dt * self.velocity, self.now + dt
@@ -130,7 +136,7 @@ def test_an_arm_is_driven_in_a_process_and_ends_with_its_cameras(robot):
 def test_each_action_is_a_sign_of_life_and_a_width_that_is_none_moves_nothing(robot):
     robot.arm.calls.clear()
     act(robot, READY, **{GRIPPER: 0.03})
-    assert robot.arm.calls == [("move", 0.03), "feed"]
+    assert robot.arm.calls == ["feed", ("move", 0.03)]
     robot.arm.calls.clear()
     act(robot, READY)
     assert robot.arm.calls == ["feed"]
@@ -143,7 +149,8 @@ def test_after_a_stop_the_arm_goes_on_from_rest(robot):
     fast = abs(robot.arm.velocity[0])
     first = panda.chain.limits.acceleration.numpy()[0] * robot.config.dynamics * robot.dt
     assert fast > 2 * first
-    robot.arm.trips += 1  # the watchdog has stopped it
+    robot.get_observation()
+    robot.arm.stops += 1  # by the watchdog, while the policy computes the action
     robot.arm.velocity = np.zeros(7)
     act(robot, goal)
     assert abs(robot.arm.velocity[0]) < 0.5 * fast
@@ -298,9 +305,13 @@ def test_the_newest_image_is_half_a_second_old_at_most(topic):
 
 def test_an_arm_of_topics_is_driven_with_its_topics(monkeypatch, tmp_path):
     pytest.importorskip("rclpy")
-    topics = Ros2Config(command="/mine")
-    config = Ros2ArmRobotConfig(calibration_dir=tmp_path, arm="panda", topics=topics)
-    driver = driven_arms.Ros2ArmRobot(config)._driver()
-    assert driver.func is driven_arms.Ros2Arm
-    assert driver.args[1] is topics
+    topics = Ros2Config(command="/mine", timeout=0.15)
+    for fps, holds in ((20, 0.15), (5, 0.3)):  # until the next action, even a late one
+        config = Ros2ArmRobotConfig(
+            calibration_dir=tmp_path, arm="panda", topics=topics, fps=fps, timeout=0.5
+        )
+        driver = driven_arms.Ros2ArmRobot(config)._driver()
+        assert driver.func is driven_arms.Ros2Arm
+        assert driver.args[1].timeout == pytest.approx(holds)
+        assert replace(driver.args[1], timeout=topics.timeout) == topics
     assert driver.args[0].joint_names == panda.chain.joint_names
