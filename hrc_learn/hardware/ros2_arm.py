@@ -66,11 +66,9 @@ class Ros2Config:
     """Position of `gripper_joint` when closed."""
 
     def __post_init__(self) -> None:
-        check_settings(self, finite=("timeout", "silence", "startup", "lag", "opening"))
-        if self.interface not in ("velocity", "position", "trajectory"):
-            raise ValueError(
-                f"interface must be velocity, position or trajectory, not {self.interface!r}."
-            )
+        numbers = "timeout", "silence", "startup", "lag", "opening"
+        kinds = "velocity", "position", "trajectory"
+        check_settings(self, finite=numbers, one_of=[("interface", kinds)])
         travel = self.gripper_open - self.gripper_closed
         if not travel or not math.isfinite(travel):
             raise ValueError("gripper_open and gripper_closed must be finite and different.")
@@ -124,6 +122,7 @@ class Ros2Arm(Connected):
         # then on the goal moves on at the velocity, and brakes [s].
         self._commanded_at, self._moved_at = -math.inf, 0.0
         self._hold = self._brake = 0.0
+        self._closed = False
         node, kind, self._numbers = self.session.node, config.interface, Float64MultiArray
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
         self._hand, once = None, quality(reliable=True)
@@ -189,8 +188,7 @@ class Ros2Arm(Connected):
         if (back >= 0 and not reset) or not np.isfinite(q).all():
             self.ignored += 1
             return
-        if reset:
-            self._offset, last = math.inf, None
+        last = None if reset else last
         if not np.isfinite(velocity).all():
             velocity = np.zeros(len(q))
             if last is not None:
@@ -201,7 +199,7 @@ class Ros2Arm(Connected):
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
             drifted = self._offset + _DRIFT * (now - self.received)
-            self._offset = min(drifted, now - stamp)
+            self._offset = now - stamp if last is None else min(drifted, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()
         if config.interface == "position" and self._velocity.any():
@@ -279,12 +277,16 @@ class Ros2Arm(Connected):
     def _trajectory(self, goal: np.ndarray, velocity: np.ndarray) -> Any:
         """Trajectory that continues with the velocity and then comes to rest."""
         from rclpy.duration import Duration
+        from rclpy.time import Time
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
         step, rest = self._hold, self.config.timeout
         end = goal + 0.5 * rest * velocity
         message: Any = JointTrajectory(joint_names=list(self._names))
-        message.header.stamp = self.session.node.get_clock().now().to_msg()
+        # By the robot's clock, which differs from this machine's in a simulation, or without
+        # NTP. States without stamps tell nothing of it: zero begins at once.
+        if self._offset:
+            message.header.stamp = Time(seconds=time.monotonic() - self._offset).to_msg()
         for at, position, speed in (step, goal, velocity), (step + rest, end, 0 * velocity):
             point = JointTrajectoryPoint(positions=position.tolist(), velocities=speed.tolist())
             point.time_from_start = Duration(seconds=at).to_msg()
@@ -323,6 +325,9 @@ class Ros2Arm(Connected):
 
     def close(self) -> None:
         """Stop the arm and leave the graph."""
+        if self._closed:
+            return
+        self._closed = True
         atexit.unregister(self.close)
         self._dog.close()
         self.stop()

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from ros2_graph import Graph, qualities_of, stamp
+from ros2_graph import Graph, qualities_of
 
 from hrc_learn.hardware import ArmFaultError, Ros2Arm, Ros2Config, ros2_arm
 from hrc_learn.kinematics import panda
@@ -186,7 +186,8 @@ def test_a_trajectory_goes_on_with_the_velocity_and_ends_at_rest(graph):
         arm.command(velocity)
         message = graph.sent[-1][1]
         assert tuple(message.joint_names) == NAMES
-        assert message.header.stamp == stamp(graph.now)
+        begun = message.header.stamp  # by the robot's clock
+        assert begun.sec + 1e-9 * begun.nanosec == pytest.approx(graph.now - 40, abs=1e-8)
         ahead, end = message.points
         times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in (ahead, end)]
         assert times == pytest.approx([step, step + 0.2])
@@ -196,6 +197,23 @@ def test_a_trajectory_goes_on_with_the_velocity_and_ends_at_rest(graph):
         way = np.array(end.positions) - np.array(ahead.positions)
         np.testing.assert_allclose(way, 0.5 * 0.2 * velocity)
     np.testing.assert_allclose(ahead.positions, READY + 0.051 * velocity)
+
+
+def test_a_trajectory_begins_by_the_clock_of_the_robot_or_at_once(graph):
+    """Stock controllers drop a trajectory that ends in their past."""
+    config = Ros2Config(interface="trajectory")
+    for first, begin in ((1e-3, 0.2), (1.7e9, 1.7e9 + 0.2 - 1e-3), (0.0, 0.0)):
+        graph.now, graph.greeting = 50.0, [(first, READY)]
+        with Ros2Arm(panda.chain, config) as arm:
+            graph.now += 0.1
+            graph.state(first and first + 0.15, READY)  # quicker than the first by 0.05 s
+            graph.now += 0.05 - 1e-3
+            arm.command(np.zeros(7))
+            begun = graph.sent[-1][1].header.stamp
+            assert begun.sec + 1e-9 * begun.nanosec == pytest.approx(begin, abs=1e-6)
+            arm.close()
+            sent = len(graph.sent)
+        assert len(graph.sent) == sent  # closed once
 
 
 def test_a_position_goes_on_with_the_states_and_never_jumps(graph):
