@@ -7,7 +7,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -158,10 +157,8 @@ class LoopWatch:
         self._quality.clear()
 
 
-@cache
-def connected_robots() -> list[ArmRobot]:
-    """Connected robots of this process, in the order in which they were connected."""
-    return []
+connected_robots: list[ArmRobot] = []
+"""Connected robots of this process, in the order in which they were connected."""
 
 
 def the_robot() -> ArmRobot:
@@ -173,13 +170,13 @@ def the_robot() -> ArmRobot:
     Raises:
         DeviceNotConnectedError: No robot or several robots are connected.
     """
-    robots = connected_robots()
-    if len(robots) != 1:
+    if len(connected_robots) != 1:
+        names = ", ".join(map(str, connected_robots)) or "none"
         raise DeviceNotConnectedError(
             "this teleoperator needs exactly one connected robot of hrc_learn (such as "
-            f"mujoco_arm or franka_panda); connected: {', '.join(map(str, robots)) or 'none'}."
+            f"mujoco_arm or franka_panda); connected: {names}."
         )
-    return robots[0]
+    return connected_robots[0]
 
 
 @dataclass(kw_only=True)
@@ -272,7 +269,7 @@ class ArmRobot(Device, Robot):
 
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
-        connected_robots().append(self)
+        connected_robots.append(self)
         try:
             if self._person_config.kind != "none":
                 self._invite(self._person_config)
@@ -283,7 +280,7 @@ class ArmRobot(Device, Robot):
     @check_if_not_connected
     def disconnect(self) -> None:
         self._loop.end()
-        connected_robots().remove(self)
+        connected_robots.remove(self)
         self.complement, page, self._page = None, self._page, None
         try:
             super().disconnect()

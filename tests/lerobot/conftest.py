@@ -9,7 +9,7 @@ from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
 @pytest.fixture(autouse=True)
 def nothing_left_connected():
     yield
-    for robot in list(connected_robots()):
+    for robot in list(connected_robots):
         robot.disconnect()
 
 

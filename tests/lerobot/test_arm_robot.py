@@ -143,7 +143,7 @@ def test_a_robot_is_found_where_it_is_the_only_one(simulated):
     right = simulated(scenario="grasping", id="right")
     with pytest.raises(DeviceNotConnectedError, match=r"left.*right"):
         the_robot()
-    assert connected_robots() == [left, right]
+    assert connected_robots == [left, right]
     left.disconnect()
     assert the_robot() is right
 
@@ -162,7 +162,7 @@ def test_a_robot_whose_person_cannot_be_reached_is_disconnected(
         with pytest.raises(ValueError, match=message):
             robot.connect()
         assert not robot.is_connected
-        assert connected_robots() == []
+        assert connected_robots == []
 
 
 @pytest.mark.long
