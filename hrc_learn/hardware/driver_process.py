@@ -83,9 +83,7 @@ def checked_velocity(
     """
     velocity = np.asarray(velocity, dtype=float)
     if velocity.shape != (len(names),) or not np.isfinite(velocity).all():
-        raise ValueError(
-            f"joint_velocity must be {len(names)} finite numbers, but is {velocity}."
-        )
+        raise ValueError(f"joint_velocity must be {len(names)} finite numbers, not {velocity}.")
     # A filter that follows a limit may exceed it by rounding.
     for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6)):
         text = f"{names[i]}: {velocity[i]:.3f} rad/s is beyond its limit"

@@ -73,9 +73,7 @@ class Ros2Config:
         if not travel or not math.isfinite(travel):
             raise ValueError("gripper_open and gripper_closed must be finite and different.")
         if bool(self.gripper) != bool(self.gripper_joint):
-            raise ValueError(
-                "gripper and gripper_joint belong together: give both, or neither."
-            )
+            raise ValueError("gripper and gripper_joint belong together: give both or neither.")
 
 
 class Ros2Arm(Connected):
@@ -239,9 +237,8 @@ class Ros2Arm(Connected):
             ValueError: They are not finite, or beyond the limits of the arm's description.
             ArmFaultError: The joint states are too old.
         """
-        velocity = checked_velocity(
-            joint_velocity, self._names, self._chain.limits.velocity.numpy()
-        )
+        fastest = self._chain.limits.velocity.numpy()
+        velocity = checked_velocity(joint_velocity, self._names, fastest)
         try:
             state = self.read()
         except ArmFaultError:

@@ -58,13 +58,9 @@ class DrivenArmConfig(ArmRobotConfig):
         if not 5 <= self.fps <= 1000:
             raise ValueError(f"fps must be from 5 to 1000, but is {self.fps}.")
         if self.person.kind == "scripted":
-            raise ValueError(
-                "person.kind: a script pushes simulated arms only, not a real one."
-            )
+            raise ValueError("person.kind: scripts push simulated arms only, not real ones.")
         if self.person.worker:
-            raise ValueError(
-                "person.worker: a worker can be simulated near simulated arms only."
-            )
+            raise ValueError("person.worker: workers are simulated near simulated arms only.")
         if not self.timeout > 1.5 / self.fps:
             raise ValueError(
                 f"timeout must be longer than an action and a half at {self.fps:g} fps, but is "
