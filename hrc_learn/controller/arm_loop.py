@@ -13,8 +13,6 @@ States, readings and requests have any number of leading batch dimensions. Drive
 and messages to people belong to the caller.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import final
 

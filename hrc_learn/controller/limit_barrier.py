@@ -1,7 +1,5 @@
 """Control barriers for the limits of the joints, and for the speed of points of the arm."""
 
-from __future__ import annotations
-
 from typing import final
 
 import torch

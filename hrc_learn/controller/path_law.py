@@ -3,8 +3,6 @@
 A path advances, waits or is retraced, depending on how well an arm off the path can follow.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ The filter needs only the joint limits, and serves any source of commands: the a
 controller, the playback of a learned motion, a joystick.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import NamedTuple, final

@@ -4,8 +4,6 @@ The name of the folder is a hash of everything that determines the code, so that
 compiled twice.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache

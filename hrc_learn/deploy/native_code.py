@@ -6,8 +6,6 @@ length of the program. A value that a later function reads is kept in a slot of 
 small array that the caller provides.
 """
 
-from __future__ import annotations
-
 import ctypes
 import heapq
 from collections.abc import Sequence

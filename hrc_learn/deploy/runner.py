@@ -1,7 +1,5 @@
 """Run a control step on NumPy arrays, and run a loop at a fixed rate without drift."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable

@@ -7,8 +7,6 @@ become one instruction per element. Equal instructions are kept once, and instru
 constants are evaluated here.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence

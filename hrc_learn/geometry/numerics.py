@@ -8,8 +8,6 @@ threshold and the closed form above it. The form that is not selected is evaluat
 argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from operator import add

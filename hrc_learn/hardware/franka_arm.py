@@ -9,8 +9,6 @@ Tested against the protocol simulators franka-sim, including all limits that it 
 franky-sim. NOT RUN ON HARDWARE.
 """
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import os

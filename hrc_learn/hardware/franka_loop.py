@@ -10,8 +10,6 @@ one, the step starts from the commanded velocity and acceleration that the contr
 because the box continues with a constant acceleration when an answer is missing.
 """
 
-from __future__ import annotations
-
 import gc
 import math
 import os

@@ -4,8 +4,6 @@ Tested with franky 2.0 (PyPI: franky-control) against simulators of the arm's ne
 NOT RUN ON HARDWARE.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 from contextlib import suppress

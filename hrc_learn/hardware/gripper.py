@@ -1,7 +1,5 @@
 """Drive grippers by threads, so that no control loop waits for the fingers."""
 
-from __future__ import annotations
-
 import atexit
 import sys
 import threading

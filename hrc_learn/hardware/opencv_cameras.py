@@ -9,8 +9,6 @@ the marker's pixel is a smooth function of the joint position. This function is 
 candidate delay; the delay with the smallest residual is the result.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

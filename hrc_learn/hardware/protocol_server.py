@@ -7,8 +7,6 @@ affect joint velocities and positions, whose limits the driver enforces. Poses a
 Research 3 model; dynamics are not reported, and torque commands have no effect.
 """
 
-from __future__ import annotations
-
 import random
 import threading
 import time

@@ -1,7 +1,5 @@
 """Run the adaptive controller with its safety filter as a lifecycle node of ROS 2."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

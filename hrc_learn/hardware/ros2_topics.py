@@ -4,8 +4,6 @@ Run as a program, this module guards a velocity controller: see `guard_velocitie
 nothing of this package, so that the guard is ready in half a second.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import queue

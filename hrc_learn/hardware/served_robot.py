@@ -3,8 +3,6 @@
 This module needs the package franky-sim, so it is imported on demand.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arms from descriptions in URDF and MJCF files, with links numbered from base to tool."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping, Sequence

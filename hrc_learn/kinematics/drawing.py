@@ -1,7 +1,5 @@
 """Drawing of arms: meshes of each link, and bodies along recorded joint positions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache

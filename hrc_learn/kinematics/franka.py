@@ -16,8 +16,6 @@ Franka's meshes agree to 2 mm for both arms. They protrude from the capsules by 
 the links (link 2), 46 mm at the base and 9 mm at the gripper: clearances must cover this.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from math import cos, pi, sin
 from pathlib import Path

@@ -4,8 +4,6 @@ With the pseudo-inertia P of each body (`description.pseudo_inertia`) and the de
 its frame with respect to joint j, the mass matrix is M_jk = sum over bodies of tr(D_j P D_k^T).
 """
 
-from __future__ import annotations
-
 from typing import final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Robot descriptions in MJCF, which MuJoCo itself reads, with defaults and includes."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from pathlib import Path

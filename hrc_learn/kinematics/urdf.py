@@ -1,7 +1,5 @@
 """Robot descriptions in URDF, with all numbers read in double precision."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -4,8 +4,6 @@ Units are radians, metres and pixels; poses are in the base frame, as position a
 vector. Names end in `.pos` or `.vel` because lerobot-rollout passes on no others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 

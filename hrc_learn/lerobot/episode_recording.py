@@ -3,8 +3,6 @@
 LeRobot's own commands use the wall clock, and cannot record the input of a person.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path

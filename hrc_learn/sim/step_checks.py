@@ -4,8 +4,6 @@ MuJoCo goes on when a simulation diverges: it writes a line to a log, resets the
 first pose at time zero, and counts a warning. Measurements of such a run are meaningless.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Draw, move and size the Cartesian region with the mouse, and mark the target."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

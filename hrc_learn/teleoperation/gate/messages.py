@@ -3,8 +3,6 @@
 A message that fits no schema raises `MessageError`. Decoders parse no deeper than the schema.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Annotated, Any, Literal
