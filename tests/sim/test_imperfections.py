@@ -153,6 +153,18 @@ def test_a_payload_weighs_on_the_joints_what_the_jacobian_says():
     np.testing.assert_allclose(felt, expected, atol=1e-2)
 
 
+def test_a_payload_touches_nothing():
+    """It weighs on the joints only: an object may be where the load is, inside the palm."""
+    made = world(payload=2.0)
+    load, item = made.data.geom("payload"), made.config.objects[0].name
+    pose = np.eye(4)
+    pose[:3, 3] = load.xpos
+    made.reset(HOVER, {item: pose})
+    touching = made.data.contact.geom
+    assert made.model.geom(item).id in touching  # the hand
+    assert load.id not in touching
+
+
 def test_the_arm_is_not_moved_by_less_than_its_friction():
     made = world(joint_friction=3.0)
     made.data.ctrl[:] = 0.0

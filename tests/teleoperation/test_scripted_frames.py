@@ -1,6 +1,7 @@
 """Frames of scripted demonstrations: their times, rates, columns and repetitions."""
 
 import math
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import minimum_jerk
 from hrc_learn.kinematics import gripper_down
-from hrc_learn.protocols import Human, HumanInput
+from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import HAND_MARKER, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
@@ -97,8 +98,10 @@ def test_an_expert_of_servoing_wobbles_turns_for_the_object_and_ends_above_it(tu
     np.testing.assert_allclose(expert.path.position(0.0), middle + spread[0])
     passed = np.array([expert.path.position(t) for t in np.linspace(0, 10, 4001)])
     higher = above + np.array([0.0, 0.0, 0.06])
-    for point in (*(middle + spread), higher):
+    points = np.vstack([middle + spread, higher])
+    for point in points:
         assert np.linalg.norm(passed - point, axis=1).min() < 1e-3
+    assert passed[:, 2].max() < points[:, 2].max() + 1e-9
     rates, phases = rng.uniform(0.8, 1.6, 3), rng.uniform(0, 2 * np.pi, 3)
     down = Rotation.from_quat(gripper_down().numpy(), scalar_first=True)
     for time in (0.0, 1.0, 3.0, 5.0, 6.5, 6.9, 7.2, 7.6, 10.0):
@@ -110,6 +113,39 @@ def test_an_expert_of_servoing_wobbles_turns_for_the_object_and_ends_above_it(tu
         found = expert.orientation(torch.zeros(3).double(), time).numpy()
         off = Rotation.from_quat(found, scalar_first=True) * expected.inv()
         assert off.magnitude() < 1e-6, time
+
+
+def test_a_smaller_hand_is_guided_along_the_same_motion_in_proportion():
+    """All lengths scale: way points, the final descent and the tremor."""
+    robot = copy(WORKPLACE.robot)
+    robot.hand_size = 0.6
+    arm = replace(WORKPLACE.scene.arm, robot=robot)
+    small = replace(WORKPLACE, scene=replace(WORKPLACE.scene, arm=arm))
+    middle = WORKPLACE.hover().position.numpy()
+    below = np.array([0.05, -0.02, -0.1])
+
+    def motion(workplace, size, time):
+        """Way covered from the middle, and what the tremor adds to the velocity."""
+        shaking, steady = (
+            servo_expert(
+                workplace,
+                middle + size * below,
+                ServoDemonstrationConfig(tremor=tremor),
+                np.random.default_rng(0),
+            )
+            for tremor in (0.02, 0.0)
+        )
+        q = np.zeros(len(workplace.robot.chain.joint_names))
+        state = ArmState(time=time, joint_position=q, joint_velocity=q, gripper_width=0.0)
+        added = shaking.read(state).twist - steady.read(state).twist
+        return shaking.path.position(time) - middle, added[:3]
+
+    for time in (0.0, 3.0, 6.0, 8.0, 8.9):
+        way, shaken = motion(WORKPLACE, 1.0, time)
+        way_of_small, shaken_of_small = motion(small, 0.6, time)
+        np.testing.assert_allclose(way_of_small, 0.6 * way, atol=1e-9)
+        np.testing.assert_allclose(shaken_of_small, 0.6 * shaken, atol=1e-9)
+        assert np.linalg.norm(shaken) > 1e-3
 
 
 CORNERS = np.array([[300.0, 200.0], [310.0, 200.0], [310.0, 210.0], [300.0, 210.0]])
