@@ -307,6 +307,28 @@ def test_derivatives_are_those_of_autograd(seed):
         torch.testing.assert_close(camera_jacobian(view, pose), expected, rtol=1e-7, atol=1e-6)
 
 
+def test_the_uncertainty_of_a_network_includes_its_camera():
+    """To first order in the camera's errors, which are independent of the weights'."""
+    rng = generator(1)
+    view, pose = random_camera(rng), wander(5, rng=rng)
+    mixed = 1e-5 * torch.randn(13, 13, generator=rng, dtype=torch.float64)
+    spread = mixed @ mixed.mT
+    centers = torch.rand(4, 2, generator=rng, dtype=torch.float64)
+    alone, network = (
+        RBFImageJacobian(centers, 0.2, camera=fit)
+        for fit in (None, CameraFit(camera=view, covariance=spread, noise=1.0))
+    )
+    alone.covariance = network.covariance = 0.02 * torch.eye(24, dtype=torch.float64)
+    zero = torch.zeros(13, dtype=torch.float64)
+    with shapes_unchecked():
+        by_camera = torch.func.jacfwd(lambda d: camera_jacobian(stepped(view, d), pose))(zero)
+    variance = (by_camera @ spread * by_camera).sum(-1)
+    expected = alone.uncertainty(pose) ** 2 + variance.amax(-2)
+    assert (variance.amax(-2) > 0.1 * expected).any()
+    assert (variance.amax(-2) < 0.9 * expected).any()
+    torch.testing.assert_close(network.uncertainty(pose) ** 2, expected, rtol=1e-3, atol=0)
+
+
 def test_a_network_with_a_camera_survives_the_disk(tmp_path):
     rng = np.random.default_rng(4)
     demos = [guided(rng)[0] for _ in range(2)]
