@@ -223,6 +223,7 @@ def balls(**radii):
         balls(l1=0.05, l3=0.05, l5=0.05, l7=0.05),
         balls(l0=0.05, l2=0.2, l4=0.25, l6=0.2, l9=0.05),
         balls(l1=0.02, l3=0.16, l4=0.16, l6=0.3, l8=0.1, l9=0.1),
+        balls(l5=0.03, l6=0.03, l8=0.03, l9=0.03),
     ],
 )
 def test_pairs_that_always_or_never_touch_need_no_watching(capsules):
