@@ -606,6 +606,21 @@ def test_a_correction_keeps_what_it_knows_for_the_next_episode():
     torch.testing.assert_close(correction.object(0.1, seen), expected, rtol=0, atol=1.0)
 
 
+def test_a_further_knock_is_reported_and_corrected():
+    """Exact pixels of a camera that is knocked while the tool moves, then put back."""
+    twist = torch.tensor([0.05, -0.03, 0.08, 0.02, 0.03, -0.04]).double()
+    correction = CameraCorrection(exact_reference())
+    for n, fraction in enumerate((1.0, 0.0)):
+        pose, pixels = wandering(20, moved_camera(EXACT, fraction * twist))
+        with shapes_unchecked():
+            shown = [
+                correction.update(n + k / 20, pose[k], pixels[k]) is not None for k in range(20)
+            ]
+            assert any(shown)
+            found = correction.marker(pose[-1], pixels[-1])
+        assert (found - marker_pixels(EXACT, pose)[0][-1]).abs().max() < 0.3
+
+
 def test_a_correction_without_a_motion_forgets_frames_before_its_last_second():
     pose, pixels = wandering(40)
     correction = CameraCorrection(exact_reference())
