@@ -14,6 +14,7 @@ from sample_runs import OPTIONAL, sample_run, until
 
 from hrc_learn.geometry import Box, Capsule, MeshFile
 from hrc_learn.log import Event, RunRecording, StepLog
+from hrc_learn.viz import palette
 from hrc_learn.viz.panels import run_tabs
 from hrc_learn.viz.rerun_stream import capsules, samples, thin
 from hrc_learn.viz.run_dashboard import (
@@ -102,7 +103,8 @@ def test_the_region_of_the_controller_is_drawn_while_it_acts(tmp_path):
     halves = rrd.column("world/active_region", "Boxes3D:half_sizes")
     np.testing.assert_allclose(halves[first][0], [0.1, 0.1, 0.003], atol=1e-6)
     colours = rrd.column("world/active_region", "Boxes3D:colors")
-    assert colours[first] != colours[last]
+    for k, colour in ((first, palette.TARGET), (last, palette.PERSON)):
+        assert colours[k] == [int.from_bytes(palette.rgba(colour))]
     assert any("region drawn" in text for (text,) in rrd.column("phases", "TextLog:text"))
 
 
