@@ -326,6 +326,15 @@ class SlowArm(ObedientArm):
         self.velocity = now
 
 
+def test_a_straight_line_is_kept_to_when_the_cell_is_slow():
+    cell = cell_with(ObedientArm(HOVER.numpy()), config=WorkCellConfig(speed=0.5))
+    with shapes_unchecked():
+        cell.move_straight(lowered(0.002), speed=0.04)
+    hand = panda.forward(torch.from_numpy(cell.log["joint_position"])).position
+    away = hand - torch.from_numpy(cell.log["goal_position"])
+    assert float(away.norm(dim=-1).max()) < 1e-4
+
+
 @pytest.mark.long
 def test_a_straight_line_slows_down_for_an_arm_that_falls_behind():
     cell = cell_with(SlowArm(HOVER.numpy()))
