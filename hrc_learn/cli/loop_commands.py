@@ -127,7 +127,7 @@ def page(args: ServePage) -> None:
     workplace = Workplace.of(robot)
     world = World(workplace.scene)
     connect, safety = _access(args, settings.site, world, guiding.safety)
-    if args.arm != "sim" and not args.drives_real_arm():
+    if not args.drives_real_arm():
         world.hold(workplace.scene.objects[0].name, workplace.home_joints().numpy())
     writer = DatasetWriter(
         args.out,

@@ -168,7 +168,7 @@ def push_arrows(
         nullspace_input: Null-space input of the person on each joint [N m].
     """
     points = np.full((len(joint_position), 2, 3), np.nan)
-    rows = np.abs(nullspace_input).max(axis=1, initial=0.0) > _NO_PUSH
+    rows = np.abs(nullspace_input).max(axis=1) > _NO_PUSH
     if len(chain.joint_names) < _PUSHED or not rows.any():
         return points
     q, d = torch.from_numpy(joint_position[rows]), torch.from_numpy(nullspace_input[rows])
@@ -239,7 +239,7 @@ def frames(recording: RunRecording) -> Iterator[Picture]:
         inset = camera_inset(recording.camera, WIDTH)
     with _painter(recording, camera) as paint:
         for time in np.linspace(begin, end, max(2, round(shown * RATE))):
-            step = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
+            step = int(np.searchsorted(recording.time, time))
             lines, labels = _drawn_in(recording, step)
             yield annotated(
                 paint(step, lines),

@@ -27,6 +27,7 @@ from hrc_learn.learning import fit_dashboards, fit_primitives
 from hrc_learn.learning.demonstration_dashboard import (
     ShownDataset,
     _episode_tab,
+    demonstration_layout,
     record_demonstrations,
 )
 from hrc_learn.learning.fit_dashboards import (
@@ -166,6 +167,40 @@ def test_joints_are_plotted_in_the_units_of_the_dataset(demos, tmp_path):
         place = arm_bodies(panda, shown.arm.positions(demo.joint_position))[3].position[0]
         moved = rrd.column("world/bodies/link3", "Transform3D:translation")[0]
         np.testing.assert_allclose(moved[0], place, atol=1e-6)
+
+
+@pytest.mark.parametrize("cameras", [0, 1, 4])
+@pytest.mark.parametrize("arm", [panda_of(), None])
+def test_the_arm_and_its_cameras_stand_left_of_curves_and_task(demos, cameras, arm):
+    names = [f"camera {k}" for k in range(cameras)]
+    shown = ShownDataset(title="", demos=demos, arm=arm, cameras=names)
+    root = demonstration_layout(shown).root_container
+    *left, right = root.contents
+    views = list(left[0].contents) if left else []
+    assert len(views) == (arm is not None) + bool(cameras)
+    if left:
+        assert tuple(root.column_shares) == (1, 1)
+        assert tuple(left[0].row_shares) == (3, 2)[: len(views)]
+    if arm is not None:
+        scene, *views = views
+        assert panda.name in scene.name
+        # The arm is in view from its base to its tool.
+        q = torch.from_numpy(demos[0].joint_position)
+        joints = panda.joint_origins(q).reshape(-1, 3).numpy()
+        everything = np.concatenate([np.zeros((1, 3)), joints, tool_path(demos[0])])
+        (seen,) = scene.properties["EyeControls3D"].look_target.as_arrow_array().to_pylist()
+        middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+        np.testing.assert_allclose(seen, middle, atol=1e-6)
+    for grid in views:
+        assert [view.name for view in grid.contents] == names
+        assert [view.origin for view in grid.contents] == [
+            f"/cameras/camera_{k}" for k in range(cameras)
+        ]
+        assert grid.grid_columns == min(cameras, 3)
+    tabs, task = right.contents
+    assert tuple(right.row_shares) == (9, 1)
+    assert (task.origin, tabs.active_tab) == ("/task", 0)
+    assert [tab.name.split(":")[0] for tab in tabs.contents] == ["Episode", "Episodes"]
 
 
 def test_without_an_arm_there_is_no_scene(tmp_path):
