@@ -9,6 +9,7 @@ from sample_runs import sample_run
 
 from hrc_learn.experiments import run_recorder as film
 from hrc_learn.experiments.run_recorder import caption, frames
+from hrc_learn.geometry import Body, Capsule
 from hrc_learn.log import Event
 from hrc_learn.sim import RenderingUnavailableError
 
@@ -43,11 +44,20 @@ def test_a_film_is_as_long_as_the_run_up_to_a_bound(duration, shown, monkeypatch
         assert sum(1 for _ in file.decode(stream)) == round(shown * film.RATE)
 
 
-def test_the_first_and_the_last_moment_are_in_the_film():
-    run = sample_run(time=np.linspace(0.0, 0.5, len(sample_run().time)))
-    pictures = list(frames(run))
-    assert pictures[0].shape == (film.HEIGHT, film.WIDTH, 3)
-    assert (pictures[0] != pictures[-1]).any()
+def test_a_film_shows_every_moment_of_what_moves_above_the_table():
+    steps = len(sample_run().time)
+    way = np.linspace([0.0, 0.0, 0.3], [0.3, 0.4, 0.3], steps)  # from the base to an object
+    ball = Capsule(start=(0, 0, 0), end=(0, 0, 0.02), radius=0.05, colour=(1, 0, 1, 1))
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (steps, 1))
+    body = Body(name="ball", position=way, orientation=upright, capsules=(ball,))
+    run = sample_run(time=np.linspace(0.0, 0.5, steps), bodies=(body,), boxes=(), push=None)
+    places = []
+    for picture in frames(run):
+        assert picture.shape == (film.HEIGHT, film.WIDTH, 3)
+        v, u = np.nonzero((picture == [255, 0, 255]).all(-1))
+        places.append([u.mean() / film.WIDTH, v.mean() / film.HEIGHT])
+    assert (np.diff(places, axis=0) > 0).all()
+    np.testing.assert_allclose(np.mean(places, axis=0), 0.5, atol=0.1)  # in the middle
 
 
 def test_the_caption_is_of_the_phase_that_was_entered_last():
