@@ -450,6 +450,10 @@ def test_images_that_never_change_are_named(tmp_path):
     text = "shows one colour at the beginning, in the middle and at the end"
     # Two images may be alike.
     assert still == [(0, text), (2, text)]
+    # A camera that was frozen shows a picture.
+    picture = np.linspace(40, 200, SIZE[1]).astype(int)[:, None]
+    write(root / "videos/chunk-002/cam/episode_000002.mp4", [picture] * 3, rate=50, qp="0")
+    assert findings(root)[-1][3] == text.replace("one colour", "the same image")
     # One image at a third of the episode differs.
     path = root / "videos/chunk-000/cam/episode_000000.mp4"
     write(path, [90] * 6 + [30] + [90] * 13, rate=50)
