@@ -8,6 +8,7 @@ import pytest
 from commands import done
 from lerobot_folders import joint_path, write_folder
 
+from hrc_learn.cli.fit_command import open_moving
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.viz.report import read_report
 
@@ -72,6 +73,18 @@ def test_an_episode_of_one_frame_is_left_out_of_a_fit_with_a_note(tmp_path):
         done("evaluate", "--dataset", root, *model, "--json", tmp_path / "f.json")
         figures = json.loads((tmp_path / "f.json").read_text())
         assert figures["demonstrations"] == (2 if model else 1)
+
+
+def test_episodes_of_a_single_frame_are_read_only_if_they_are_named(tmp_path):
+    episodes = [{"observation.state": joint_path(n, seed=n)} for n in (1, 2, 3, 1)]
+    root = write_folder(tmp_path, episodes, {"observation.state": ["a", "b", "c"]})
+    units = {"joint_position": "rad"}
+    source, notes = open_moving(root, (), units=units)
+    assert [demo.episode for demo in source] == [1, 2]
+    assert notes == ["episodes of a single frame are left out: 0, 3"]
+    for chosen in ([1], [0, 2]):
+        source, notes = open_moving(root, chosen, units=units)
+        assert ([demo.episode for demo in source], notes) == (chosen, [])
 
 
 def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):

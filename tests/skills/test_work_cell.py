@@ -131,7 +131,7 @@ def test_a_surface_is_found_where_it_is():
     cell = cell_with(Wall(top, noise=0.2))
     met = cell.move_until_contact(lowered(0.06))
     assert met is not None
-    assert float(met.position[2]) == pytest.approx(top, abs=1.5e-3)
+    assert float(met.position[2]) == pytest.approx(top, abs=2e-4)  # a step of the arm
     assert float(cell.pose.position[2]) > top - 3e-3  # it did not go on
 
 
