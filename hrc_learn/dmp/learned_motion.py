@@ -161,9 +161,7 @@ def choose(
             demonstrations for a regression.
     """
     if frames is not None and not isinstance(fits[0], JointDMP):
-        raise ValueError(
-            "frames move positions alone: leave out the orientations or the frames"
-        )
+        raise ValueError("frames move positions alone: leave out orientations or frames")
     fits = [with_common_reference(each) for each in fits]
     x = _coordinates(fits[0])
     n = len(x)

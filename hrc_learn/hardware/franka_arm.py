@@ -94,9 +94,8 @@ class FrankaArm(Connected):
             ValueError: The arm does not have seven joints.
         """
         if len(chain.joint_names) != JOINTS:
-            raise ValueError(
-                f"a Franka arm has {JOINTS} joints, but the chain {len(chain.joint_names)}."
-            )
+            joints = len(chain.joint_names)
+            raise ValueError(f"a Franka arm has {JOINTS} joints, but the chain {joints}.")
         self._config = config = config or FrankaConfig()
         self._names, limits = chain.joint_names, chain.limits
         self._rest = config.rest_timeout(limits.velocity, limits.acceleration, limits.jerk)

@@ -166,9 +166,8 @@ class CaptureCamera(Connected, TimedCamera):
                 return
             self._arrived.wait_for(lambda: self._closing or self._begun is not None)
             begun = self._begun or 0.0
-            self._arrived.wait_for(
-                lambda: self._closing, max(0.0, begun + position - time.monotonic())
-            )
+            left = max(0.0, begun + position - time.monotonic())
+            self._arrived.wait_for(lambda: self._closing, left)
 
 
 def taken_by(capture: Any, now: float, oldest: float) -> float:
@@ -340,9 +339,7 @@ def measure_delay(
             f"the camera saw marker {marker} in {len(taken)} different images, and at least "
             f"{_FEWEST} are needed: move the arm into the view, and light it."
         )
-    return fit_delay(
-        np.array(times), np.array(positions), np.array(taken), np.array(pixels), _LONGEST
-    )
+    return fit_delay(*map(np.array, (times, positions, taken, pixels)), _LONGEST)
 
 
 def fit_delay(

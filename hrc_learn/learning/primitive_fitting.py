@@ -402,9 +402,7 @@ def fit_streamed(
     fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
     for channel in channels or ("joint",):
         if channel not in ("joint", "position"):
-            raise ValueError(
-                f"channel {channel!r} cannot be streamed, only joint and position."
-            )
+            raise ValueError(f"channel {channel!r} cannot be streamed, only joint and position")
         column = partial(_stamped_column, name=CHANNELS[channel][0], source=demos.source)
         named = _naming(channel, demos.joint_names, demos.joint_unit)
         fits[channel], rmse = fit_shared(LazyMap(demos, column), n_basis, **named)

@@ -71,10 +71,9 @@ class GuidedRobot:
         self._joints = self._joints + self._velocity * self.robot.dt
         if step.human_input.gripper is not None:
             self._width = step.human_input.gripper
-        action = self.robot.values.action_of(
-            self.robot.space, self._joints, self._width, self._rotation
-        )
-        if self.robot.space == "ee":
+        space, values = self.robot.space, self.robot.values
+        action = values.action_of(space, self._joints, self._width, self._rotation)
+        if space == "ee":
             self._rotation = np.array(list(action.values())[3:6])
         return action, step.human_input
 
@@ -131,9 +130,7 @@ class ArmExpert(ArmTeleoperator):
     def get_action(self) -> dict[str, float]:
         robot = the_robot()
         if not isinstance(robot, MujocoArmRobot):
-            raise ValueError(
-                f"arm_expert knows the scenarios of a mujoco_arm only, not of {robot.name}."
-            )
+            raise ValueError(f"arm_expert knows scenarios of mujoco_arm, not of {robot.name}.")
         return self._guided_robot(robot, lambda: robot.run.expert).next()[0]
 
 

@@ -119,9 +119,8 @@ class DrivenArm(ArmRobot):
             for camera in self.cameras.values():
                 camera.connect()
                 devices.callback(camera.disconnect)
-            self._arm = devices.enter_context(
-                ArmProcess(self._driver(), timeout=config.timeout)
-            )
+            process = ArmProcess(self._driver(), timeout=config.timeout)
+            self._arm = devices.enter_context(process)
             self._trips = self._arm.trips
             self._servo = PositionServo(
                 self.work_arm.chain, self._arm, self.dt, PositionServoConfig(safety=safety)

@@ -52,9 +52,8 @@ class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
         }
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
         if CAMERA in values:
-            self.features[f"pixels/{CAMERA}"] = PolicyFeature(
-                FeatureType.VISUAL, values[CAMERA]
-            )
+            image = PolicyFeature(FeatureType.VISUAL, values[CAMERA])
+            self.features[f"pixels/{CAMERA}"] = image
             self.features_map[f"pixels/{CAMERA}"] = f"{OBS_IMAGES}.{CAMERA}"
 
     def robot_config(self) -> MujocoArmRobotConfig:
@@ -131,9 +130,8 @@ class ArmEnv(gym.Env):
         self, action: Float[np.ndarray, " values"]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Send an action, and let 1/fps pass. The reward is 1 once the task is done, else 0."""
-        self._robot.send_action(
-            dict(zip(self._actions, np.asarray(action).tolist(), strict=True))
-        )
+        values = np.asarray(action).tolist()
+        self._robot.send_action(dict(zip(self._actions, values, strict=True)))
         self._done = self._done + 1 if self._robot.run.succeeded() else 0
         success = self._done * self._robot.dt >= _STEADY
         return self._observation(), float(success), success, False, {"is_success": success}

@@ -193,7 +193,7 @@ def test_actions_that_come_too_fast_are_told(smooth, clock, caplog):
         smooth.send_action(both(0.3))
         assert len(caplog.messages) == (k >= rate - 1)
     (told,) = caplog.messages
-    assert f"faster than at the {rate} a second of" in told
+    assert f"faster than the {rate} a second of" in told
     assert told.endswith("the robot is behind by 1 s")
 
 

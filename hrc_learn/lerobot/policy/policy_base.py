@@ -104,9 +104,7 @@ class MotionPolicyConfig(PreTrainedConfig):
             ValueError: There is no action, or no input.
         """
         if self.action_feature is None:
-            raise ValueError(
-                f"the policy {self.type!r} needs the feature 'action' among its outputs"
-            )
+            raise ValueError(f"the policy {self.type!r} needs 'action' among its outputs")
         if not self.input_features:
             raise ValueError(
                 f"the policy {self.type!r} needs an input: observation.state, "

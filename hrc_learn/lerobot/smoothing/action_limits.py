@@ -64,9 +64,7 @@ class ActionLimits:
                     f"{values!r}"
                 )
         if min(self.state_columns) < -1:
-            raise ValueError(
-                f"state_columns must be columns or -1, but are {self.state_columns}"
-            )
+            raise ValueError(f"state_columns must be columns or -1, not {self.state_columns}")
         for name, low, high in zip(self.names, *self.positions(), strict=True):
             if not low < high:
                 raise ValueError(

@@ -80,9 +80,8 @@ class ActionUpsampler:
         if not 0 <= degree <= LARGEST_DEGREE:
             raise ValueError(f"degree must be 0 to {LARGEST_DEGREE}, got {degree}")
         if not limits.fps <= rate < float("inf"):
-            raise ValueError(
-                f"rate must be at least the {limits.fps:g} actions a second, got {rate:g}"
-            )
+            text = f"rate must be at least the {limits.fps:g} actions a second, got {rate:g}"
+            raise ValueError(text)
         own = (degree + 1) / 2
         latency = own if latency is None else latency
         if not 0 <= latency <= own:
@@ -379,9 +378,7 @@ class SmoothRobot(Robot):
             if self.config.clock == "wall":
                 self._actions.append(values)
                 if len(self._actions) == round(_BEHIND * (fps := self.upsampler.limits.fps)):
-                    text = (
-                        "actions come faster than at the %g a second of %s: the robot is behind"
-                    )
+                    text = "actions come faster than the %g a second of %s: the robot is behind"
                     logger.warning(f"{text} by %g s", fps, self.config.limits, _BEHIND)
             else:
                 for setpoint in self.upsampler.frame(values):
