@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry.numerics import check_settings
@@ -54,6 +55,9 @@ class Ros2Config:
     """Longest wait for the first joint state, and for controllers [s]."""
     lag: float = 0.35
     """Largest distance of commanded positions from the measured ones [rad]."""
+    wrench: str = ""
+    """Topic of a force and torque sensor (WrenchStamped): what acts on the end effector, at its
+    point and along its axes, or along those of `base`. Empty: no sensor."""
     gripper: str = ""
     """Topic of a gripper's position controller (Float64MultiArray); empty: no gripper."""
     gripper_joint: str = ""
@@ -80,10 +84,10 @@ class Ros2Arm(Connected):
     """An arm of ros2_control, or one with the same topics, driven by velocities.
 
     A velocity holds for at most the config's `timeout`. Reordered or incomplete joint states
-    are ignored; once the newest is older than `silence`, `read` and `command` raise
-    `ArmFaultError` until new ones come. If this process dies, a trajectory ends at rest by
-    itself, and a position is held. A velocity controller would hold its last command for ever:
-    therefore, a guard in a process of its own then sends zeros.
+    are ignored; once the newest, or the newest wrench, is older than `silence`, `read` and
+    `command` raise `ArmFaultError` until new ones come. If this process dies, a trajectory ends
+    at rest by itself, and a position is held. A velocity controller would hold its last command
+    for ever: therefore, a guard in a process of its own then sends zeros.
 
     Attributes:
         session: The node.
@@ -106,6 +110,7 @@ class Ros2Arm(Connected):
         self.config = config = config or Ros2Config()
         self._chain, self._names, self.ignored = chain, chain.joint_names, 0
         self.session = Ros2Session("hrc_arm")
+        from geometry_msgs.msg import WrenchStamped
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
         from trajectory_msgs.msg import JointTrajectory
@@ -114,6 +119,9 @@ class Ros2Arm(Connected):
         self._state: ArmState | None = None
         self._offset, self.received, self._seen = math.inf, -math.inf, dict[str, float]()
         self._width = math.nan if config.gripper else 0.0
+        # Time of the newest wrench [s]; its frame, its force [N] and its torque [N m].
+        self._felt = -math.inf if config.wrench else math.inf
+        self._wrench = "", np.zeros((2, 3))
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
         # Times of the last command and of the last change of the goal, and for how long from
@@ -128,6 +136,8 @@ class Ros2Arm(Connected):
             self._hand = node.create_publisher(Float64MultiArray, config.gripper, once)
         self._commands = node.create_publisher(form, config.command, once)
         node.create_subscription(JointState, config.joint_states, self._on_state, quality())
+        if config.wrench:
+            node.create_subscription(WrenchStamped, config.wrench, self._on_wrench, quality())
         self._guard: subprocess.Popen | None = None
         self._dog = Watchdog(config.timeout, self.stop)
         try:
@@ -151,7 +161,7 @@ class Ros2Arm(Connected):
         if self._seen:
             missing = sorted({*self._names, self.config.gripper_joint} - {*self._seen, ""})
             why = f"{', '.join(missing)} are not among {', '.join(self._seen)}"
-            why = why if missing else "their positions are missing or not finite"
+            why = why if missing else "the wrench or their positions are missing or not finite"
         topic, longest = self.config.joint_states, self.config.startup
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
 
@@ -165,6 +175,12 @@ class Ros2Arm(Connected):
                     raise ConnectionError(f"{text} (ros2 control list_controllers)?")
                 time.sleep(0.02)
 
+    def _on_wrench(self, message: Any) -> None:
+        parts = message.wrench.force, message.wrench.torque
+        values = np.array([[part.x, part.y, part.z] for part in parts])
+        if np.isfinite(values).all():
+            self._wrench, self._felt = (message.header.frame_id, values), time.monotonic()
+
     def _on_state(self, message: Any) -> None:
         config, now, last = self.config, time.monotonic(), self._state
         missing = [math.nan] * len(message.name)
@@ -177,7 +193,8 @@ class Ros2Arm(Connected):
         if math.isfinite(opened):
             travel = config.gripper_open - config.gripper_closed
             self._width = config.opening * opened / travel
-        if not {*self._names} <= position.keys() or math.isnan(self._width):
+        complete = not math.isnan(self._width) and self._felt > -math.inf
+        if not (complete and {*self._names} <= position.keys()):
             return
         q, velocity = (np.array([x[name] for name in self._names]) for x in (position, speed))
         stamp = stamp_of(message) or now
@@ -191,8 +208,18 @@ class Ros2Arm(Connected):
             velocity = np.zeros(len(q))
             if last is not None:
                 velocity = (q - last.joint_position) / (stamp - last.time)
+        torque = None
+        if config.wrench:
+            frame, wrench = self._wrench
+            tip, J = self._chain.transform_and_jacobian(torch.from_numpy(q))
+            wrench = wrench if frame == config.base else wrench @ tip[:, :3].numpy().T
+            torque = J.numpy().T @ wrench.ravel()
         state = ArmState(
-            time=stamp, joint_position=q, joint_velocity=velocity, gripper_width=self._width
+            time=stamp,
+            joint_position=q,
+            joint_velocity=velocity,
+            gripper_width=self._width,
+            external_torque=torque,
         )
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
@@ -208,16 +235,18 @@ class Ros2Arm(Connected):
         """Return the newest state; `time` is the stamp of its message [s].
 
         Raises:
-            ArmFaultError: The state is older than the config's `silence`.
+            ArmFaultError: The state or the wrench is older than the config's `silence`.
         """
         with self._changed:
             state, offset = self._state, self._offset
         assert state is not None
-        age = time.monotonic() - (state.time + offset)
-        if age > self.config.silence:
+        config, taken = self.config, state.time + offset
+        wrench = (self._felt, f"wrench on {config.wrench}")
+        since, what = min((taken, f"joint state on {config.joint_states}"), wrench)
+        if (age := time.monotonic() - since) > config.silence:
             raise ArmFaultError(
-                f"the newest joint state on {self.config.joint_states} is {age:.2f} s old: the "
-                "arm is stopped. Check its driver and the network."
+                f"the newest {what} is {age:.2f} s old: the arm is stopped. Check its driver "
+                "and the network."
             )
         return state
 

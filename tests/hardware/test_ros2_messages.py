@@ -423,3 +423,136 @@ def test_commands_are_messages_of_the_controllers_kind(graph, guards, interface,
     Ros2Arm(panda.chain, Ros2Config(interface=interface))
     assert graph.kinds == {COMMANDS: kind}
     assert bool(guards) == (interface == "velocity")
+
+
+def feel(graph, force, torque, frame="tool0"):
+    """Send a wrench, as it comes from the middleware: in CDR."""
+    from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    x, y = (Vector3(**dict(zip("xyz", map(float, v), strict=True))) for v in (force, torque))
+    message = WrenchStamped(wrench=Wrench(force=x, torque=y))
+    message.header.frame_id = frame
+    graph.takers["/wrench"](deserialize_message(serialize_message(message), WrenchStamped))
+
+
+def feeling_arm(graph):
+    """An arm whose sensor is the first to report."""
+    subscribe = graph.create_subscription
+
+    def create_subscription(kind, topic, take, quality):
+        subscribe(kind, topic, take, quality)
+        if topic == "/wrench":
+            feel(graph, np.zeros(3), np.zeros(3))
+            graph.state(10.0, READY)
+
+    graph.create_subscription = create_subscription
+    return Ros2Arm(panda.chain, Ros2Config(wrench="/wrench"))
+
+
+def test_a_wrench_becomes_torques_of_the_joints_as_in_mujoco(graph):
+    import mujoco
+
+    from hrc_learn.sim import SceneConfig, World
+
+    world, rng = World(SceneConfig()), np.random.default_rng(0)
+    with feeling_arm(graph) as arm:
+        for frame in ("tool0", "base_link", ""):
+            q, force, torque = READY + 0.2 * rng.normal(size=7), *rng.normal(size=(2, 3))
+            feel(graph, force, torque, frame)
+            graph.now += 0.01
+            graph.state(graph.now - 40, q)
+            world.reset(q)
+            tool, made = world.arm.tcp_pose(), np.zeros(world.model.nv)
+            turn = np.eye(3) if frame == "base_link" else tool[:3, :3]
+            force, torque, hand = turn @ force, turn @ torque, world.model.body("hand").id
+            mujoco.mj_applyFT(world.model, world.data, force, torque, tool[:3, 3], hand, made)
+            np.testing.assert_allclose(arm.read().external_torque, made[:7], atol=1e-6)
+            feel(graph, force, np.full(3, np.nan))  # is not taken
+        graph.now += 0.185  # since the last wrench: 10 ms more
+        graph.state(graph.now - 40, q)
+        arm.read()
+        graph.now += 0.02
+        graph.state(graph.now - 40, q)
+        text = r"the newest wrench on /wrench is 0\.2[12] s old: the arm is stopped"
+        with pytest.raises(ArmFaultError, match=text):
+            arm.command(np.zeros(7))
+
+
+def test_a_push_that_the_sensor_feels_pauses_the_task(graph):
+    from hrc_learn.teleoperation import Touch
+
+    touch, paused = Touch(panda), []
+    with feeling_arm(graph) as arm:
+        for k in range(200):
+            graph.now += 0.01
+            feel(graph, [0.0, 0.0, 20.0 if k > 100 else 0.0], np.zeros(3))
+            graph.state(graph.now - 40, READY, np.zeros(7))
+            paused.append(touch.read(arm.read()).pause)
+    assert not any(paused[:100])
+    assert all(paused[140:])
+
+
+def test_a_sensor_that_is_silent_is_missed(graph):
+    text = "the wrench or their positions are missing or not finite"
+    with pytest.raises(ConnectionError, match=text):
+        Ros2Arm(panda.chain, Ros2Config(wrench="/wrench", startup=0.01))
+
+
+class MockSystem:
+    """The system of ros2_control's `mock_components`, with its joint state broadcaster.
+
+    Each period, the states become the commands of the period before; with `dynamics`,
+    velocities and positions are integrated and differentiated backwards (`generic_system.cpp`).
+    Velocities that nothing has set are NaN. Times are those of a simulation.
+    """
+
+    def __init__(self, graph, interface, *, dynamics, period=0.01):
+        self.graph, self.interface, self.dynamics = graph, interface, dynamics
+        self.period, self.clock, self.order = period, 3.0, None
+        self.q, self.v = READY.copy(), np.full(7, 0.0 if dynamics else np.nan)
+
+    def turn(self):
+        order, position = self.order, self.q
+        if self.interface == "velocity":
+            self.q = self.q + self.period * self.v if self.dynamics else self.q
+            self.v = self.v if order is None else order
+        elif order is not None:
+            self.q = order
+            self.v = (order - position) / self.period if self.dynamics else self.v
+        sent = [message for topic, message in self.graph.sent if topic == COMMANDS]
+        self.order = np.array(sent[-1].data) if sent else None
+        self.graph.now += self.period
+        self.clock += self.period
+        self.graph.state(self.clock, self.q[::-1], self.v[::-1], NAMES[::-1])
+
+
+@pytest.mark.parametrize("interface", ["position", "velocity"])
+@pytest.mark.parametrize("dynamics", [True, False])
+def test_the_mock_system_of_ros2_control_follows(graph, interface, dynamics):
+    graph.greeting = [(3.0, READY, np.full(7, np.nan))]
+    arm = Ros2Arm(panda.chain, Ros2Config(interface=interface))
+    mock = MockSystem(graph, interface, dynamics=dynamics)
+    velocity = 0.3 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0])
+    for _ in range(50):
+        arm.command(velocity)
+        mock.turn()
+    state = arm.read()
+    # Without dynamics, a commanded velocity moves nothing.
+    factor = 0.0 if interface == "velocity" and not dynamics else 0.01
+    moved = (state.joint_position - READY) / velocity
+    np.testing.assert_allclose(moved, 49 * factor, atol=1.01 * factor + 1e-9)  # one period late
+    np.testing.assert_allclose(state.joint_velocity, velocity)
+    arm.stop()
+    for _ in range(3):
+        mock.turn()
+    rest = arm.read()
+    mock.turn()
+    np.testing.assert_array_equal(arm.read().joint_position, rest.joint_position)
+    np.testing.assert_allclose(arm.read().joint_velocity, np.zeros(7), atol=1e-12)
+
+
+def test_a_mock_system_without_initial_positions_is_refused(graph):
+    graph.greeting = [(3.0, np.full(7, np.nan))]
+    with pytest.raises(ConnectionError, match="are missing or not finite"):
+        position_arm(graph, startup=0.01)
