@@ -143,7 +143,8 @@ def test_a_push_ends_where_limits_and_singularities_begin():
     np.testing.assert_allclose(joints[-1], postures[-1], atol=1e-3)
 
 
-def test_the_null_space_stops_before_a_limit_that_would_move_the_hand():
+def test_the_null_space_stops_before_a_limit_that_would_move_the_hand(monkeypatch):
+    monkeypatch.setattr(complementary_motion, "_STEP", DT)  # a policy as fast as the loop
     limits = replace(panda.limits, lower=panda.ready - 0.4, upper=panda.ready + 0.4)
     wishes = np.repeat(panda.ready.numpy()[None], round(2.5 / DT), axis=0)
     human = Pusher(3 * SIDEWAYS, 0.1, 2.5)
