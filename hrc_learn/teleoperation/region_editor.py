@@ -173,7 +173,7 @@ class RegionEditor:
         )
         self._in_force.on_update(in_loop(lambda _: self._update()))
         self._sizes = [
-            gui.add_slider(f"Size {axis}", 2 * _SMALLEST, 2 * _LARGEST, 0.01, 0.1)
+            gui.add_slider(f"Size {axis} [m]", 2 * _SMALLEST, 2 * _LARGEST, 0.01, 0.1)
             for axis in "xyz"
         ]
         for slider in self._sizes:

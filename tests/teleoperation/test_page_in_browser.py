@@ -111,6 +111,16 @@ def test_view_and_panel_share_a_phone_and_start_throws_nothing_away(browser):
     tab.set_viewport_size(usual)
 
 
+def test_every_control_has_a_name_for_screen_readers(browser):
+    controls = "button, [role=slider], [role=checkbox], input:not([type=hidden])"
+    nameless = f"""() => [...document.querySelectorAll("#root :is({controls})")].filter(
+      (control) => control.checkVisibility() && !control.closest("[inert]")
+        && !control.innerText && !control.ariaLabel && !control.labels?.length
+    ).map((control) => control.outerHTML)"""
+    assert browser.tab.get_by_role("slider", name="Strength [%]").count() == 1
+    assert browser.tab.evaluate(nameless) == []
+
+
 @pytest.mark.slow
 def test_the_twin_is_held_as_the_arm_is(session, browser):
     with browser.dragging(session.frame(4) + np.array(_TWIN_AT), by=(-50, 0)):

@@ -1,6 +1,7 @@
 """Controls of the page's panel, used as a browser uses them."""
 
 import asyncio
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -206,7 +207,8 @@ def test_texts_show_status_input_turn_and_the_latest_intervention(made):
 def bold(html):
     """Names of the rows in bold."""
     rows = html.split("<tr ")[1:]
-    return [row.split("<td>")[1].split("<")[0] for row in rows if "600" in row]
+    names = [row.split("<td>")[1].split("</td>")[0] for row in rows if "600" in row]
+    return [re.sub("<.*?>", "", name) for name in names]
 
 
 TEXT, CHOICE, NUMBER, SWITCH = "Task", "Gripper", "Strength [%]", "Virtual twin"

@@ -165,7 +165,7 @@ def editor(page):
 
 def shown(page):
     """Middle, edges and sliders of the region that is shown."""
-    sliders = [page.made[f"Size {axis}"].value for axis in "xyz"]
+    sliders = [page.made[f"Size {axis} [m]"].value for axis in "xyz"]
     box = page.made["/region/box"]
     corner, edges = page.made["/region/corner"].position, page.made["/region/edges"].points
     np.testing.assert_allclose(np.abs(edges).reshape(-1, 3).max(axis=0), corner)
@@ -192,10 +192,10 @@ def test_a_region_attracts_only_while_it_is_active(page, editor):
 
 def test_sliders_gizmo_and_corner_change_the_region(page, editor):
     for axis, size in zip("xyz", (0.3, 0.2, 0.5), strict=True):
-        page.made[f"Size {axis}"].value = size
-    page.use("Size x", SimpleNamespace(client=None))  # moved by ourselves
+        page.made[f"Size {axis} [m]"].value = size
+    page.use("Size x [m]", SimpleNamespace(client=None))  # moved by ourselves
     assert editor.drawn.half_size != (0.15, 0.1, 0.25)
-    page.use("Size x", SimpleNamespace(client=1))
+    page.use("Size x [m]", SimpleNamespace(client=1))
     assert editor.drawn.half_size == (0.15, 0.1, 0.25)
     page.use("/region", SimpleNamespace(target=SimpleNamespace(position=(0.2, 0.1, 0.4))))
     assert editor.drawn.centre == (0.2, 0.1, 0.4)
@@ -286,7 +286,7 @@ def test_a_click_marks_the_target_above_what_is_nearest(page, editor, aim, marke
 
 def test_controls_and_nodes_begin_as_they_are_described(page, editor):
     for axis in "xyz":
-        slider = page.made[f"Size {axis}"]
+        slider = page.made[f"Size {axis} [m]"]
         assert (slider.low, slider.high) == (0.04, 1.0)
     assert editor.drawn == DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.10))
     assert shown(page) == ((0.35, 0.45, 0.22), (0.28, 0.28, 0.2))

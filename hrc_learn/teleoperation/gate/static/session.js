@@ -1,4 +1,5 @@
-// The page's tie to the program: signs of life, who leads, and what there is to say.
+// The page's tie to the program: signs of life, who leads, and what there is to say. It also
+// names the controls that viser's client leaves without a name.
 //
 // Runs before viser's client. Signs of life come from a worker, which goes on while the page
 // draws, and tell for how long the page itself has not reacted.
@@ -57,8 +58,28 @@
   const over = (text) => {
     ended = true;
     bar.className = "over";
+    document.getElementById("root").inert = true;
     show(text);
   };
+
+  // For screen readers: the label of a row names its inputs and sliders.
+  const name = (element, text) => {
+    if (!element.getAttribute("aria-label")) element.setAttribute("aria-label", text);
+  };
+  const nameControls = () => {
+    for (const label of document.querySelectorAll("#root p > label")) {
+      const row = label.closest("[class*=Flex-root]");
+      const controls = row?.querySelectorAll("input:not([type=hidden]), [role=slider]") ?? [];
+      for (const control of controls) name(control, label.textContent);
+    }
+    const icons = document.querySelectorAll("#root [class*=ActionIcon-root]");
+    icons.forEach((icon, i) => name(icon, i % 2 ? "Settings of the view" : "Commands"));
+    for (const close of document.querySelectorAll("[class*=Notification-closeButton]")) {
+      name(close, "Close");
+    }
+    document.getElementById("root").setAttribute("role", "main");
+  };
+  addEventListener("DOMContentLoaded", () => setInterval(nameControls, 500));
 
   // Where this device has cameras or displays for it, the arm can stand in the room.
   const offerRoom = async () => {
