@@ -1,7 +1,7 @@
 "use strict";
 // The page of `hrc curate`: what the server ranked is looked at, played and decided on here.
 
-const SERIES = ["#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"];
+const SERIES = ["#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#9AA0A6", "#8c564b"];
 const AHEAD = 3; // blocks of images fetched before they are shown
 const KEPT = 12; // blocks of each camera that are kept
 const byId = (id) => document.getElementById(id);
@@ -276,6 +276,8 @@ function show() {
 // Curves.
 
 function charts() {
+  byId("legend").hidden = false;
+  byId("usual").textContent = usual ? `Thin grey: episode ${overview.usual}, the most usual one. ` : "";
   byId("charts").replaceChildren(
     ...curves.charts.map((chart, index) => {
       const canvas = element("canvas");
@@ -290,9 +292,9 @@ function charts() {
       const legend = element("figcaption", { textContent: chart.name + unit });
       chart.lines.forEach((line, i) => {
         if (chart.lines.length > 1) {
-          const key = element("span", { textContent: line.name });
-          key.style.color = lineColour(chart, i);
-          legend.append(key);
+          const swatch = element("i", { className: "swatch" });
+          swatch.style.background = lineColour(chart, i);
+          legend.append(element("span", {}, swatch, line.name));
         }
       });
       return element("figure", {}, canvas, legend);
@@ -316,7 +318,7 @@ function drawChart(canvas) {
     if (v < low) low = v;
     if (v > high) high = v;
   }
-  const y = (v) => h - 6 - ((h - 12) * (v - low)) / (high - low || 1);
+  const y = (v) => h - 16 - ((h - 32) * (v - low)) / (high - low || 1);
   const stroke = (line, count, style, width) => {
     const [frames, points] = line.points;
     pen.beginPath();
