@@ -105,7 +105,7 @@ class CollaborationExperiment(CollaborationScenario):
     def recordings(self, run: CollaborationRun) -> Mapping[str, RunRecording]:
         """Recording of the whole job."""
         recording = record(
-            f"Collaboration, placing on {', '.join(self.shelves)}",
+            f"Collaboration, shelves: {', '.join(self.shelves)}",
             run.cell,
             run.world,
             run.motion,

@@ -58,6 +58,7 @@ LONGEST = 16.0
 """Longest film [s]; a longer run is shown faster."""
 
 _EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
+_EXTENT = 0.8  # a smaller job, as of SO-101, is shown from nearer [m]
 _FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
 
 _CAPTIONS: dict[str, str] = read_toml(Path(__file__).with_name("film_captions.toml"))
@@ -225,12 +226,15 @@ def film(recording: RunRecording) -> Film:
 
 def frames(recording: RunRecording) -> Iterator[Picture]:
     """Pictures of the film, rendered if this machine can, otherwise drawn."""
+    job = np.vstack([recording.position, np.zeros(3)])  # with the base of the arm
+    size = float(np.clip(np.ptp(job, axis=0).max() / _EXTENT, 0.5, 1.0))
+    towards = size * np.array(_TOWARDS) + (1.0 - size) * job.mean(axis=0)
     camera = CameraModel(
         width=WIDTH,
         height=HEIGHT,
         focal=(_FOCAL * HEIGHT, _FOCAL * HEIGHT),
         principal=((WIDTH - 1) / 2, (HEIGHT - 1) / 2),
-    ).look_at(np.array(_EYE), np.array(_TOWARDS))
+    ).look_at(towards + size * (np.array(_EYE) - _TOWARDS), towards)
     begin, end = float(recording.time[0]), float(recording.time[-1])
     shown = min(end - begin, LONGEST)
     speed = (end - begin) / shown if shown else 1.0

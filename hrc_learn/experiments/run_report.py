@@ -141,10 +141,12 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
                 carried |= _within(run.time, (event.time, end))
         for (name, span), colour in zip(objects.items(), palette.SERIES, strict=False):
             rows = _within(run.time, span)
-            axes.plot(*run.position[rows].T, color=colour, lw=0.8, alpha=0.5)
+            axes.plot(
+                *run.position[rows].T, color=colour, lw=0.8, alpha=0.5, label=f"path: {name}"
+            )
             path = run.position[rows & carried]
-            axes.plot(*path.T, color=colour, lw=2.0, label=f"carried: {name}")
             if len(path):
+                axes.plot(*path.T, color=colour, lw=2.0, label=f"carried: {name}")
                 axes.plot(*path[-1], "s", color=colour, ms=5)
         axes.legend(loc="upper right")
         axes.set_title("Paths of the tool centre point (square: release)", loc="left")

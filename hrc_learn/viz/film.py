@@ -126,10 +126,11 @@ def camera_inset(camera: CameraRecording, width: int) -> Callable[[int, float], 
             if np.isfinite(pixel).all():
                 u, v = (scale * pixel).tolist()
                 draw.ellipse((u - 5, v - 5, u + 5, v + 5), outline=colour, width=3)
-        draw.rectangle((0, image.height - 18, image.width, image.height), fill=_SHADE)
-        text, place = "tool red, target green", (5, image.height - 9)
-        draw.text(place, text, font=_font(10), fill="white", anchor="lm")
-        return np.asarray(image)
+        below = Image.new("RGB", (image.width, image.height + 18), _SHADE[:3])
+        below.paste(image)
+        text, place = "tool orange, target green", (5, image.height + 9)
+        ImageDraw.Draw(below).text(place, text, font=_font(10), fill="white", anchor="lm")
+        return np.asarray(below)
 
     return at
 

@@ -240,11 +240,11 @@ def test_the_inset_of_a_camera_is_27_hundredths_wide_with_its_latest_image():
         feature=points,
     )
     at = camera_inset(camera, 1000)
-    assert at(0, 1.0).shape == (162, 270, 3)
+    assert at(0, 1.0).shape == (162 + 18, 270, 3)
     for time, level in ((0.5, 50), (1.0, 50), (1.99, 50), (2.0, 100), (3.0, 150), (9.0, 150)):
         shown = at(1, time)
-        assert (shown[:140] == level).all()
-        assert (shown[150:, -50:] < level).any()
+        assert (shown[:162] == level).all()  # the text covers nothing
+        assert (shown[162:, -50:] < level).any()
     red = np.argwhere((at(0, 1.0) == palette.rgba(palette.VERMILION)[:3]).all(-1))
     scale = 0.27 * 1000 / 200
     np.testing.assert_allclose(red.mean(axis=0)[::-1], points[0] * scale, atol=1)
@@ -254,7 +254,7 @@ def test_the_inset_of_a_camera_is_27_hundredths_wide_with_its_latest_image():
     assert (at(0, 1.0)[v, u] == 50).all()
     assert (at(0, 1.0)[143:, 200:] == np.array(at(1, 1.0))[143:, 200:]).all()
     bar = np.argwhere((at(1, 3.0)[:, 200:] != 150).any(-1))
-    assert bar[:, 0].min() == 162 - 18
+    assert bar[:, 0].min() == 162
 
 
 def side():

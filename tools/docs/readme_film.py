@@ -101,7 +101,7 @@ def frames(run: RunRecording, ending: str) -> Iterator[Picture]:
             body, holds = expert(float(time))
             legend = [("a worker reaches under the arm", "#336B9E")] if near(run, step) else []
             if holds:
-                legend.append(("an expert pulls the elbow aside", palette.PERSON))
+                legend.append(("a person pulls the elbow aside", palette.PERSON))
             picture = renderer.render(view, body)
             if time < begun.get("home", begun["transfer"]):
                 corner = inset(step, float(time))
