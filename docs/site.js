@@ -1,10 +1,14 @@
 // The theme puts tables into boxes that scroll and buttons beside code after a page has loaded:
-// boxes become reachable by keyboard, and each group of buttons has a name of its own.
+// boxes become reachable by keyboard, each group of buttons has a name of its own, and the empty
+// corner of a table is no header.
 function makeAccessible() {
   for (const box of document.querySelectorAll(".md-typeset__scrollwrap:not([tabindex])")) {
     box.tabIndex = 0
     box.setAttribute("role", "region")
     box.setAttribute("aria-label", `Table ${tables++}`)
+  }
+  for (const corner of document.querySelectorAll("th:empty")) {
+    corner.replaceWith(document.createElement("td"))
   }
   for (const nav of document.querySelectorAll(".md-code__nav:not([aria-label])")) {
     nav.setAttribute("aria-label", `Code ${codes++}`)
