@@ -77,6 +77,13 @@
     for (const close of document.querySelectorAll("[class*=Notification-closeButton]")) {
       name(close, "Close");
     }
+    // In viser's settings: the address it has connected to, its logo, and nodes of the scene.
+    for (const input of document.querySelectorAll("#root input[value^=ws]")) name(input, "Server");
+    for (const image of document.querySelectorAll("#root img:not([alt])")) image.alt = "";
+    for (const opener of document.querySelectorAll("#root div[aria-haspopup=dialog]")) {
+      opener.setAttribute("role", "button");
+      name(opener, "Properties");
+    }
     document.getElementById("root").setAttribute("role", "main");
   };
   addEventListener("DOMContentLoaded", () => setInterval(nameControls, 500));
