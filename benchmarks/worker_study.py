@@ -501,7 +501,7 @@ def cycle_time_figure(
         for k, (mode, (nearest, time)) in enumerate(making_way.items()):
             colour = palette.SERIES[k % len(palette.SERIES)]
             axes.plot(1e3 * nearest, time, "D", color=colour, label=f"null space: {mode}")
-        axes.axhline(undisturbed, color=palette.GREY, lw=0.8, ls=":", label="undisturbed")
+        axes.axhline(undisturbed, color=palette.BLACK, lw=1, ls="--", label="undisturbed")
         axes.set_xlabel("smallest distance the arm closed in to, 5 % of the runs [mm]")
         axes.set_ylabel("cycle time, median [s]")
         axes.legend(loc="upper left", fontsize=8)
