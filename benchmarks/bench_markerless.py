@@ -40,7 +40,7 @@ from hrc_learn.sim.scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import UNMARKED
 from hrc_learn.skills.marker_sensor import FeatureSensor, SeenFeature, feature_sensor
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 

@@ -23,8 +23,8 @@ from hrc_learn.kinematics import arm
 from hrc_learn.kinematics.limits import read_limits
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.learning.model_choice import CHOICE, best_models
-from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import MarkerAngle
+from hrc_learn.skills.visual_target import VisualTarget
 from hrc_learn.store import MANIFEST, changed_files, new_folder, read_made_by, write_json
 from hrc_learn.viz.report import Measurement, Report, read_report, write_report
 

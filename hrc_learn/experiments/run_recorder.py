@@ -36,7 +36,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import INTERACT
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, TRANSFER
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.servo_target import VisualServoConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.store import read_toml
 from hrc_learn.vision import CameraModel

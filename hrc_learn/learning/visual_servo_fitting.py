@@ -27,13 +27,13 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,
     OBJECT_FEATURE,
     MarkerAngle,
     VisualServoSkill,
 )
+from hrc_learn.skills.visual_target import VisualTarget
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 from hrc_learn.vision.landmarks import Landmarks
 

@@ -32,8 +32,12 @@ from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.marker_sensor import SeenFeature, longest_occlusion
 from hrc_learn.skills.placing import GraspObject, Plan, Workplace
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
-from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
+from hrc_learn.skills.visual_servoing import (
+    ServoStep,
+    ServoTarget,
+    VisualServo,
+    VisualServoConfig,
+)
 from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,

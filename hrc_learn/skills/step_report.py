@@ -10,11 +10,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller import INTERVENTIONS, SafetyReport, SeparationConfig
+from hrc_learn.controller import (
+    INTERVENTIONS,
+    Command,
+    Goals,
+    SafetyReport,
+    SeparationConfig,
+)
 from hrc_learn.controller.arm_loop_state import ArmReport, Limitation, WatchedPeople
 from hrc_learn.controller.null_space_motion import fraction_kept
+from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reason
+from hrc_learn.skills.drawn_goals import DrawnGoalsState
 from hrc_learn.store import read_toml
 
 # An arm counts as following the person if it keeps more than this fraction of the requested
@@ -216,6 +224,38 @@ NO_VISION: dict[str, Any] = {
     "turn": np.full(3, math.nan),
 }
 """Columns of a step without a camera in the loop."""
+
+
+def vision_columns(
+    command: Command,
+    goals: Goals,
+    feature: Float[np.ndarray, "2"],
+    approach: float,
+    drawn: DrawnGoalsState,
+) -> dict[str, Any]:
+    """Columns of a step of visual servoing.
+
+    Args:
+        command: Command of the controller.
+        goals: Goals of the controller.
+        feature: Pixel of the marker that was used; NaN: none [px].
+        approach: Fraction of a joint-space approach in the command, 0 to 1.
+        drawn: A person's drawing and turn.
+    """
+    region = goals.position
+    return {
+        "feature": feature,
+        "target": goals.vision.target.numpy(),
+        "image_jacobian": command.image_jacobian.numpy(),
+        "weight_norm": float(command.weight_norm),
+        "potential": float(command.potential),
+        "potential_rate": float(command.potential_rate),
+        "vision_activation": float(command.vision_level),
+        "approach": approach,
+        "region": torch.cat([region.centre, region.half_size]).numpy(),
+        "drawn": bool(drawn.active),
+        "turn": quaternion.log(drawn.turn).numpy(),
+    }
 
 
 def step_columns(

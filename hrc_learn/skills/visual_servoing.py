@@ -1,12 +1,13 @@
 """Image-based visual servoing to an object with an uncalibrated camera.
 
-`ServoStep` is a pure step `(state, reading, target) -> (command, state)` that calls the
-adaptive controller; `VisualServo` runs it in a work cell until the marker is at its target.
+`ServoTarget` determines the goals of the adaptive controller. `ServoStep` is a pure step
+`(state, reading, target) -> (command, state)` that calls the controller. `VisualServo` runs it
+in a work cell until the marker is at its target.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,21 +18,22 @@ from hrc_learn.controller import (
     AdaptiveController,
     Command,
     ControllerState,
-    Distances,
     Goals,
     Observation,
     SafetyState,
 )
 from hrc_learn.controller.joint_path import changed_rate
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.jacobian import CameraEstimator, CameraSpread
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
-from hrc_learn.protocols import HumanInput
-from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsState
-from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation, SeenFeature
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
+from hrc_learn.regions import OrientationRegion
+from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsConfig, DrawnGoalsState
+from hrc_learn.skills.marker_sensor import MarkerConsistency, SeenFeature
+from hrc_learn.skills.step_report import vision_columns
 from hrc_learn.skills.visual_skill import MarkerAngle
-from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
+from hrc_learn.skills.visual_target import VisualTarget, object_heading
+from hrc_learn.skills.work_cell import CellReading, MissedGraspError, WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Fractions of the probe height. They are tried in turn until the marker's target pixel at that
@@ -44,36 +46,206 @@ _NOT_SEEN = np.full(2, np.nan)
 _NOT_FOUND = SeenFeature(_NOT_SEEN, np.nan)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ServoReading:
-    """Measurements, and requests of the person, for one step of visual servoing."""
+@dataclass(frozen=True, kw_only=True)
+class VisualServoConfig:
+    """Tolerances, time limits and regions of visual servoing.
 
-    time: float
-    """Time [s]."""
-    dt: float
-    """Time until the next step [s]."""
-    joints: Float[Tensor, " joints"]
-    """Measured joint positions [rad]."""
-    pose: Pose
-    """Pose of the end effector."""
-    markers: MarkerObservation
-    """Markers in the newest image."""
-    human: HumanInput
-    """Input of the person."""
-    return_speed: float
-    """Highest speed at which the null space returns to its posture [rad/s]."""
-    distances: Distances | None = None
-    """Distances from people that the controller keeps; None: people are not tracked."""
+    The end effector moves in a flat box above the table. A probe is a motion from above the box
+    down into the box; it is made while the camera is uncertain.
+    """
+
+    tolerance: float = 1.5
+    """Distance of the feature from the target that counts as reached [px]."""
+    dwell: float = 0.3
+    """Time at the target until it counts as reached [s]."""
+    height_tolerance: float = 0.01
+    """Height error of the end effector that counts as reached [m]."""
+    turn_tolerance: float = 0.03
+    """Orientation error of the end effector that counts as reached [rad]."""
+    timeout: float = 40.0
+    """Give up after this long [s]."""
+    occlusion_timeout: float = 10.0
+    """Give up after the end effector's marker is undetected for this long [s]."""
+    object_error: float = 0.0025
+    """Predicted error above the object below which the gripper may descend to grasp [m], one
+    standard deviation in the plane. With a larger error, the end effector probes."""
+    probe: float = 0.06
+    """Height above the box from which a probe descends [m]. The descent shows how the marker's
+    pixel depends on height."""
+    probe_tolerance: float = 30.0
+    """Distance of the feature from the target at which a probe begins its descent [px]."""
+    probe_aside: float = 0.0
+    """Distance in the image by which all probes but the first are shifted, roughly towards its
+    middle [px]. Motions across the image and in depth together show the camera's tilt."""
+    max_probes: int = 6
+    """Largest number of probes."""
+    border: float = 80.0
+    """Smallest distance of the target from the border of the image [px]; a marker closer than
+    50 px is cut off."""
+    turn_border: float = 60.0
+    """Distance of the marker from the border below which the gripper does not turn if the turn
+    would reduce the distance [px]."""
+    turn_rate: float = 0.8
+    """Highest angular speed at which the gripper turns for the object [rad/s]. A turn moves the
+    marker by 0.15 m per radian. At this speed, the marker stays within 10 px of its target even
+    with delayed images."""
+    marker_tolerance: float = 1.5
+    """Deviation of the marker from its predicted pixel, while the end effector is held, above
+    which it counts as half hidden [px]: three times the noise of pixel and prediction."""
+    lost_after: float = 1.0
+    """Time without detection after which a marker last seen near the border counts as out of
+    view, not as occluded [s]. The end effector then returns to the middle of the box."""
+    half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
+    """Half edges of the box in which vision feedback acts [m]. The box is flat: the image shows
+    little about height, and an object has to be grasped at the demonstrated height."""
+    acquisition_half_size: tuple[float, float, float] = (0.03, 0.03, 0.003)
+    """Half edges of the box until the marker is first detected [m]. A camera that was moved may
+    not see the whole box, but will see the middle of the box."""
+    angle: float = 0.01
+    """Half angle of the tolerated cone of orientations [rad]. The paper's cone of 7.6 degrees
+    would shift the marker by 1 cm."""
+    rate: float = 4.0
+    """Rate at which the end effector returns into the box and into the cone [1/s]."""
+    rest_rate: float = 1.0
+    """Rate at which the null space returns to the posture above the table [1/s]."""
+    drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
+    """Effect of a person's drawing on the goals."""
+
+    def __post_init__(self) -> None:
+        tolerances = "tolerance", "height_tolerance", "turn_tolerance"
+        check_settings(self, positive=(*tolerances, "max_probes", "turn_rate", "angle", "rate"))
+
+    def scaled(self, size: float) -> "VisualServoConfig":
+        """The same settings, with the lengths above the table scaled to a hand.
+
+        Args:
+            size: Size of the hand relative to the Franka hand.
+        """
+        (a, b, c), (d, e, f) = self.half_size, self.acquisition_half_size
+        return replace(
+            self,
+            height_tolerance=size * self.height_tolerance,
+            probe=size * self.probe,
+            half_size=(size * a, size * b, c),
+            acquisition_half_size=(size * d, size * e, f),
+        )
+
+    def within(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        """The nearest pixel at least `border` pixels away from the border of the image [px]."""
+        return np.clip(pixel, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
+
+    def goals(
+        self, above: Pose, target: Float[np.ndarray, "2"], *, detected: bool = True
+    ) -> Goals:
+        """Goals of the controller.
+
+        Args:
+            above: Middle of the box above the table, and orientation of the end effector.
+            target: Target of the end effector's marker [px]. A target outside the image may be
+                due to a wrong image Jacobian. It is moved to the border, and the motion towards
+                it corrects the image Jacobian.
+            detected: False until the end effector's marker is first detected.
+        """
+        half_size = self.half_size if detected else self.acquisition_half_size
+        goals = Goals.at(
+            above.position,
+            above.orientation,
+            torch.from_numpy(self.within(target)),
+            half_size=half_size,
+        )
+        # Just outside a region, the distance from its wall decays at the rate 4 k_c / h^2 for
+        # positions (stiffness k_c, half edge h) and k_o (alpha_o / 2)^2 for orientations
+        # (stiffness k_o, sharpness alpha_o). With the paper's k_c = 4e-4, an arm whose marker
+        # has left the image would move on until it is fully stretched.
+        walls = tuple(self.rate / 4 * h**2 for h in half_size)
+        sharpness = 2 / self.angle
+        return replace(
+            goals,
+            # This region attracts from anywhere in the image, unlike the paper's region.
+            vision=replace(goals.vision, formulation="saturated"),
+            position=replace(goals.position, stiffness=walls),
+            orientation=OrientationRegion(
+                goal=above.orientation,
+                sharpness=sharpness,
+                stiffness=4 * self.rate / sharpness**2,
+            ),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoTarget:
+    """Pose that the end effector servos to, with all that determines its target pixel."""
+
+    config: VisualServoConfig
+    above: Pose
+    """Middle of the box above the table, and orientation of the end effector."""
+    posture: Float[Tensor, " joints"] | None
+    """Joint positions at `above`, approached in joint space [rad]; None: the Cartesian regions
+    guide the approach."""
+    visual: VisualTarget
+    """Position of the object's marker in the tool frame."""
+    item: Float[np.ndarray, "2"]
+    """Pixel of the object's marker [px]."""
+    angle: float | None = None
+    """Direction of the object's marker in the image [rad]; None: the gripper does not turn."""
+    turn_range: tuple[float, float] = (0.0, 0.0)
+    """Smallest and largest turn of the gripper about the vertical [rad]."""
+    orientation: Float[Tensor, "4"] | None = None
+    """Orientation of the end effector, turned for the object; None: orientation of `above`."""
+    rest: Float[Tensor, " joints"] | None = None
+    """Posture to which the null space returns [rad]; None: the null space does not return."""
+    raised: float = 0.0
+    """Height of the goal above the box [m], for probes."""
+    kept_camera: Float[Tensor, "13"] | None = None
+    """Camera that determines the target pixel. It keeps the target in place while the estimate
+    of the camera changes. None: the present estimate determines the target pixel."""
+
+    def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool) -> Goals:
+        """Goals from an estimate of the camera, for the present pose of the end effector."""
+        # A camera that was moved may not see above the box: do not raise the goal until the
+        # marker is detected.
+        offset = torch.tensor([0.0, 0.0, self.raised if detected else 0.0], dtype=torch.float64)
+        above = Pose(self.above.position + offset, self.tool_orientation)
+        goals = self.config.goals(above, self.pixel(camera, pose), detected=detected)
+        return goals.approached_by(self.posture)
+
+    def pixel(self, camera: Float[Tensor, "13"], pose: Pose) -> Float[np.ndarray, "2"]:
+        """Target of the marker with the end effector at its present height [px].
+
+        At any height, the target is the pixel of a marker right above the object. Therefore a
+        height error of some millimetres does not move the gripper sideways.
+        """
+        camera = camera if self.kept_camera is None else self.kept_camera
+        lower_wall = float(self.above.position[2]) - self.config.half_size[2]
+        height = pose.position[2].clamp(min=lower_wall)
+        return self.visual(
+            camera, torch.from_numpy(self.item), self.demonstrated, height
+        ).numpy()
+
+    def uncertainty(
+        self, cameras: CameraSpread, image_jacobian: Float[np.ndarray, "2 6"]
+    ) -> float:
+        """Predicted error above the object: standard deviation in the horizontal plane [m]."""
+        item = torch.from_numpy(self.item)
+        return self.visual.uncertainty(cameras, image_jacobian, item, self.demonstrated)
+
+    def heading(self, camera: Float[Tensor, "13"]) -> float | None:
+        """Heading of the object's marker in the base frame [rad]; None without a direction."""
+        if self.angle is None:
+            return None
+        offset = quaternion.rotate(self.tool_orientation, torch.from_numpy(self.visual.offset))
+        height = float(self.above.position[2] + offset[2])
+        return object_heading(camera, torch.from_numpy(self.item), self.angle, height)
 
     @property
-    def effort(self) -> Float[np.ndarray, " joints"]:
-        """Null-space effort of the person on each joint [N m]."""
-        return self.human.effort(len(self.joints))
+    def demonstrated(self) -> Pose:
+        """Height at which demonstrations end, and present orientation of the end effector."""
+        return Pose(self.above.position, self.tool_orientation)
 
     @property
-    def image_joints(self) -> Float[Tensor, " joints"]:
-        """Joint positions when the newest image was taken [rad]."""
-        return self.joints if self.markers.joints is None else self.markers.joints
+    def tool_orientation(self) -> Float[Tensor, "4"]:
+        """Orientation of the end effector: turned for the object, or else that of `above`."""
+        return self.above.orientation if self.orientation is None else self.orientation
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,23 +297,6 @@ class ServoCommand(NamedTuple):
     """Fraction of a joint-space approach in the command, 0 to 1."""
     remark: str
     """Message to the person; empty: none."""
-
-    def columns(self, drawn: DrawnGoalsState) -> dict[str, Any]:
-        """Columns of the log."""
-        command, region = self.command, self.goals.position
-        return {
-            "feature": self.feature,
-            "target": self.goals.vision.target.numpy(),
-            "image_jacobian": command.image_jacobian.numpy(),
-            "weight_norm": float(command.weight_norm),
-            "potential": float(command.potential),
-            "potential_rate": float(command.potential_rate),
-            "vision_activation": float(command.vision_level),
-            "approach": self.approach,
-            "region": torch.cat([region.centre, region.half_size]).numpy(),
-            "drawn": bool(drawn.active),
-            "turn": quaternion.log(drawn.turn).numpy(),
-        }
 
 
 class ServoStep:
@@ -214,7 +369,7 @@ class ServoStep:
             arrived=False,
         )
 
-    def observed(self, state: ServoState, reading: ServoReading) -> ServoState:
+    def observed(self, state: ServoState, reading: CellReading) -> ServoState:
         """State with the camera and the image Jacobian estimated for the newest image."""
         if reading.markers.time == state.image_jacobian_time:
             return state
@@ -227,7 +382,7 @@ class ServoStep:
         )
 
     def step(
-        self, state: ServoState, reading: ServoReading, target: ServoTarget
+        self, state: ServoState, reading: CellReading, target: ServoTarget
     ) -> tuple[ServoCommand, ServoState]:
         """Take one step.
 
@@ -278,7 +433,7 @@ class ServoStep:
         return self._oriented(state, target, state.wanted_orientation)
 
     def pixel_error(
-        self, state: ServoState, reading: ServoReading, target: ServoTarget
+        self, state: ServoState, reading: CellReading, target: ServoTarget
     ) -> float:
         """Distance of the marker from its target [px]; NaN if the marker is not detected."""
         pixel = self.tool_target(state, target).pixel(state.camera, reading.pose)
@@ -313,12 +468,12 @@ class ServoStep:
         missing = time - state.last_detection
         return missing > self.config.lost_after and not inside.all()
 
-    def feature(self, reading: ServoReading) -> Float[np.ndarray, "2"]:
+    def feature(self, reading: CellReading) -> Float[np.ndarray, "2"]:
         """Pixel of the end effector's marker [px]; NaN if the marker is not detected."""
         return reading.markers.features.get(self.marker, _NOT_FOUND).pixel
 
     def _visible_feature(
-        self, state: ServoState, reading: ServoReading
+        self, state: ServoState, reading: CellReading
     ) -> tuple[ServoState, Float[np.ndarray, "2"]]:
         """Next state, and pixel of the marker [px].
 
@@ -336,7 +491,7 @@ class ServoStep:
         return replace(state, held=held), feature if held.consistent else _NOT_SEEN
 
     def _with_wanted_orientation(
-        self, state: ServoState, reading: ServoReading, target: ServoTarget
+        self, state: ServoState, reading: CellReading, target: ServoTarget
     ) -> ServoState:
         """State with the orientation that suits the object in a new image."""
         if self._angle is None or target.angle is None or not state.detected:
@@ -374,7 +529,7 @@ class ServoStep:
         return replace(state, goal_orientation=quaternion.slerp(now, wanted, fraction))
 
     def _goals(
-        self, state: ServoState, reading: ServoReading, target: ServoTarget
+        self, state: ServoState, reading: CellReading, target: ServoTarget
     ) -> tuple[Goals, ServoState, str]:
         """Goals of the controller, next state, and message to the person (empty: none).
 
@@ -565,26 +720,16 @@ class VisualServo:
         if result.remark:
             cell.tell(result.remark)
         explained = result.approach == 0
-        columns = result.columns(self.state.drawn)
+        columns = vision_columns(*result[:4], self.state.drawn)
         cell.execute(
             result.command, result.goals.position, explained=explained, columns=columns
         )
         if self.state.drawn.away:
             self._override_time += cell.task_time - clock
 
-    def _read(self) -> ServoReading:
+    def _read(self) -> CellReading:
         """Present reading of the cell; also updates the state from the newest image."""
-        cell = self._cell
-        reading = ServoReading(
-            time=cell.time,
-            dt=cell.config.dt,
-            joints=cell.joints,
-            pose=cell.pose,
-            markers=cell.observation,
-            human=cell.human_input,
-            return_speed=cell.config.return_speed,
-            distances=cell.distances,
-        )
+        reading = self._cell.reading
         self.state = self._law.observed(self.state, reading)
         return reading
 

@@ -16,7 +16,7 @@ from hrc_learn.jacobian import CellErrors, EvidenceResult, RBFImageJacobian
 from hrc_learn.jacobian.perspective import FOCAL
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.model_files import SavedModel, write_model
-from hrc_learn.skills.servo_target import VisualTarget, object_heading
+from hrc_learn.skills.visual_target import VisualTarget, object_heading
 from hrc_learn.store import Radians, read_json, write_json
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 

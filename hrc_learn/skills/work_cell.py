@@ -105,6 +105,38 @@ class KeptImage:
     image: UInt8[np.ndarray, "height width 3"]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CellReading:
+    """Measurements, and requests of the person, for one control step."""
+
+    time: float
+    """Time [s]."""
+    dt: float
+    """Time until the next step [s]."""
+    joints: Float[Tensor, " joints"]
+    """Measured joint positions [rad]."""
+    pose: Pose
+    """Pose of the end effector."""
+    markers: MarkerObservation
+    """Markers in the newest image."""
+    human: HumanInput
+    """Input of the person."""
+    return_speed: float
+    """Highest speed at which the null space returns to its posture [rad/s]."""
+    distances: Distances | None = None
+    """Distances from people that the controller keeps; None: people are not tracked."""
+
+    @property
+    def effort(self) -> Float[np.ndarray, " joints"]:
+        """Null-space effort of the person on each joint [N m]."""
+        return self.human.effort(len(self.joints))
+
+    @property
+    def image_joints(self) -> Float[Tensor, " joints"]:
+        """Joint positions when the newest image was taken [rad]."""
+        return self.joints if self.markers.joints is None else self.markers.joints
+
+
 class WorkCell:
     """Control loop of a work cell: read, command, let time pass, detect, log.
 
@@ -222,6 +254,20 @@ class WorkCell:
     def distances(self) -> Distances | None:
         """Distances from people that a safety filter keeps; None: people are not tracked."""
         return None if self._reading.people is None else self._reading.people.distances
+
+    @property
+    def reading(self) -> CellReading:
+        """All that a law with a camera in the loop needs for its next step."""
+        return CellReading(
+            time=self.time,
+            dt=self.config.dt,
+            joints=self.joints,
+            pose=self.pose,
+            markers=self.observation,
+            human=self.human_input,
+            return_speed=self.config.return_speed,
+            distances=self.distances,
+        )
 
     @property
     def pace(self) -> TaskPace:

@@ -39,7 +39,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.marker_sensor import LatencyConfig
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
-from hrc_learn.skills.servo_target import VisualServoConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce
 

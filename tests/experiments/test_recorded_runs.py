@@ -24,7 +24,7 @@ from hrc_learn.experiments.run_recorder import (
 from hrc_learn.kinematics import panda
 from hrc_learn.log import Event, StepLog
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.servo_target import VisualServoConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
 from hrc_learn.viz import palette
 
 

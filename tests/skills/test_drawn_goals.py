@@ -20,7 +20,7 @@ from hrc_learn.skills.drawn_goals import (
     drawn_position,
     vision_scale,
 )
-from hrc_learn.skills.servo_target import VisualServoConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
 
 pytestmark = pytest.mark.simulation
 

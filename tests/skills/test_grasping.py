@@ -43,8 +43,8 @@ from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping
 from hrc_learn.skills.marker_sensor import SeenFeature
 from hrc_learn.skills.placing import check_plan
-from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.visual_target import VisualTarget
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 
 pytestmark = [pytest.mark.simulation, pytest.mark.long]

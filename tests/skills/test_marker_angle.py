@@ -11,8 +11,8 @@ from seen_cameras import camera_vector
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
-from hrc_learn.skills.servo_target import VisualTarget, object_heading
 from hrc_learn.skills.visual_skill import MarkerAngle
+from hrc_learn.skills.visual_target import VisualTarget, object_heading
 from hrc_learn.vision import CameraModel, Marker, angle, centre
 
 MARKER = Marker(7, 0.048)

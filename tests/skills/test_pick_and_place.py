@@ -18,7 +18,7 @@ from hrc_learn.skills.pick_and_place import (
     UndetectedObjectError,
 )
 from hrc_learn.skills.receiving import ReceivingConfig
-from hrc_learn.skills.servo_target import VisualServoConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
 
 pytestmark = pytest.mark.simulation
 

@@ -1,6 +1,6 @@
 """Steps of visual servoing that a whole grasp would hide."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,8 +18,14 @@ from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MissedGraspError
 from hrc_learn.skills.marker_sensor import MarkerObservation, SeenFeature
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, VisualTarget
-from hrc_learn.skills.visual_servoing import ServoReading, ServoStep, VisualServo
+from hrc_learn.skills.visual_servoing import (
+    ServoStep,
+    ServoTarget,
+    VisualServo,
+    VisualServoConfig,
+)
+from hrc_learn.skills.visual_target import VisualTarget
+from hrc_learn.skills.work_cell import CellReading
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CONFIG = VisualServoConfig()
@@ -55,7 +61,7 @@ def reading(pixel=None, *, time=1.0, image_joints=None, push=0.0):
     joints = panda.ready + 0.2
     effort = np.zeros(7)
     effort[1] = push
-    return ServoReading(
+    return CellReading(
         time=time,
         dt=0.01,
         joints=joints,
@@ -255,32 +261,17 @@ def test_the_null_space_returns_except_while_a_person_pushes_it(law):
     assert result.goals.rest is None
 
 
-@dataclass(frozen=True)
-class Drawn:
-    away, active, turn = False, False, torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
-
-
-@dataclass(frozen=True)
-class State:
-    last_detection: float = 0.0
-    detected: bool = True
-    drawn: Drawn = Drawn()
-
-
 class Cell:
     """A work cell whose arm is at once where the step wants it."""
 
-    chain, joints, distances = panda, panda.ready, None
-    config, human_input = SimpleNamespace(dt=0.02, return_speed=0.4), HumanInput()
-    pose, loop_state = ABOVE, SimpleNamespace(safety=None)
+    joints, pose, loop_state = panda.ready, ABOVE, SimpleNamespace(safety=None)
 
     def __init__(self, waits=1):
         self.time, self.task_time, self.waits = 0.0, 0.0, waits
 
     @property
-    def observation(self):
-        seen = {MARKER: SeenFeature(MIDDLE, 0.0)}
-        return MarkerObservation(time=self.time, joints=panda.ready, features=seen)
+    def reading(self):
+        return replace(reading(MIDDLE, time=self.time), pose=self.pose)
 
     def execute(self, *_args, **_columns):
         self.time += 0.02
@@ -296,9 +287,14 @@ class IdealStep:
 
     def __init__(self, cell, errors):
         self.cell, self.errors, self.heights = cell, list(errors), []
+        goals = Goals.at(ABOVE.position, ABOVE.orientation)
+        self.law = ServoStep(AdaptiveController(panda, Estimator(), goals), MARKER)
+        first = self.initial_state(panda.ready)
+        with torch.inference_mode():
+            self.result, _ = self.law.step(first, reading(MIDDLE), target_above())
 
     def initial_state(self, joints):
-        return State()
+        return self.law.initial_state(joints)
 
     restarted = observed = staticmethod(lambda state, *_: state)
     probe_height = staticmethod(lambda state, target: CONFIG.probe)
@@ -317,11 +313,7 @@ class IdealStep:
     def step(self, state, now, target):
         self.heights.append(target.raised)
         self.cell.pose = raised_by(target.raised)
-        goals = SimpleNamespace(position=None)
-        result = SimpleNamespace(
-            command=None, goals=goals, approach=0.0, remark="", columns=lambda drawn: {}
-        )
-        return result, state
+        return self.result, state
 
 
 def raised_by(height):
@@ -399,7 +391,7 @@ def test_it_gives_up_after_its_own_time_and_counts_no_time_of_people(
     def led(state, now, target):
         result, state = move(state, now, target)
         led_away = cell.time - begun < away
-        return result, replace(state, drawn=SimpleNamespace(away=led_away))
+        return result, replace(state, drawn=replace(state.drawn, away=led_away))
 
     step.step = led
     with shapes_unchecked(), pytest.raises(MissedGraspError, match=text):

@@ -12,8 +12,8 @@ from hrc_learn.jacobian.fitting import ImageJacobianFitReport
 from hrc_learn.jacobian.perspective import marker_pixels
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.sim.scene import overhead_camera
-from hrc_learn.skills.servo_target import LONGEST_OFFSET, VisualTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.visual_target import LONGEST_OFFSET, VisualTarget
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OFFSET = np.array([0.012, -0.01, 0.11])
