@@ -140,7 +140,7 @@ class ImageReader:
         entry = self.entry(episode)
         wanted = range(entry.length) if frames is None else frames
         if camera not in self.cameras:
-            text = f"there is no such camera; there are {', '.join(self.cameras) or 'none'}"
+            text = f"there is no such camera; cameras: {', '.join(self.cameras) or 'none'}"
             raise DatasetError(text, file=self._folder.root, key=camera)
         if not len(wanted):
             return

@@ -225,7 +225,7 @@ def cut(demo: Demonstration, start: int, stop: int) -> Demonstration:
 
 
 def trim_rest(demo: Demonstration, keep: float | int = 0.1) -> Demonstration:
-    """Trim the rest before and after the motion.
+    """Remove the standstill before and after the motion.
 
     Args:
         demo: The demonstration.

@@ -239,7 +239,7 @@ class FieldSearch:
                 whole = "action" if command else "observation.state"
                 groups.setdefault(whole, []).append((name, plain))
             else:
-                self.left_out[name] = "its name says nothing"
+                self.left_out[name] = "its name is unknown"
         for key, members in groups.items():
             names = tuple(plain for _, plain in members)
             # Names that only number the columns, such as q_0, say no more than their order.

@@ -392,6 +392,6 @@ class _Video:
         return image_statistics(np.stack(self._samples))
 
     def discard(self) -> None:
-        with contextlib.suppress(Exception):  # closing an unfinished file may complain
+        with contextlib.suppress(Exception):  # closing an unfinished file may fail
             self._container.close()
         self._path.unlink(missing_ok=True)

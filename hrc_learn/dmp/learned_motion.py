@@ -1,13 +1,14 @@
 """Learning of a motion with the model that predicts each demonstration best from the others.
 
 A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n.
-All models except frames compute the coordinates for a context c (known before the motion) as
-x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest demonstration, means
-weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge regression on
-contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a trajectory
-database"). The weights without demonstration i have a closed form (for the regression: PRESS
-from the hat matrix, Allen 1974), so these models are not fitted again. Each model may be shrunk
-towards the straight minimum-jerk motion, by the factor from 0 to 1 that predicts best.
+All models but the one with frames compute the coordinates for a context c (known before the
+motion) as x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest
+demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
+regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
+trajectory database"). The weights without demonstration i have a closed form (for the
+regression: PRESS from the hat matrix, Allen 1974), so these models are not fitted again. Each
+model may be shrunk towards the straight minimum-jerk motion, by the factor from 0 to 1 that
+predicts best.
 """
 
 import math
@@ -48,9 +49,9 @@ PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
 FEWEST = 4
 """Smallest number of demonstrations for which a regression is tried besides the mean."""
 CLEARLY, DEVIATIONS = 0.02, 0.8
-"""`CLEARLY`: fraction of the mean error by which a more complex model has to decrease it.
-`DEVIATIONS`: number of standard errors by which the model has to decrease it, too. On seven
-datasets, 0.5 to 1 gave the best predictions of new motions (`benchmarks/bench_learn.py`)."""
+"""A more complex model is chosen only if it decreases the mean error by the fraction `CLEARLY`
+and by `DEVIATIONS` standard errors. On seven datasets, 0.5 to 1 standard errors gave the best
+predictions of new motions (`benchmarks/bench_learn.py`)."""
 GRID = 101
 """Number of times at which motions are compared."""
 CONSTANT = 1e-9
@@ -161,7 +162,7 @@ def choose(
             demonstrations for a regression.
     """
     if frames is not None and not isinstance(fits[0], JointDMP):
-        raise ValueError("frames move positions alone: leave out orientations or frames")
+        raise ValueError("frames apply to positions only: leave out orientations or frames")
     fits = [with_common_reference(each) for each in fits]
     x = _coordinates(fits[0])
     n = len(x)
@@ -271,7 +272,7 @@ class LearnedMotion:
     def _primitives(
         self, x: Float[Tensor, "q D M"], w: Float[Tensor, "q n"]
     ) -> MotionPrimitive:
-        """Primitives with shrunk coordinates `x` and geometric means of durations, weighted."""
+        """Primitives with shrunk coordinates `x` and weighted geometric means of durations."""
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x, self.chosen.shrinkage)
         middle, reference = mean_primitive(self.each).motion, common_reference(self.each)

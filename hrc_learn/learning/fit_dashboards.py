@@ -273,7 +273,11 @@ def _convergence(learned: EvidenceResult) -> Tab:
         curve = single(path, name, values, palette.RUN_ON_DARK)
         dot = single(f"{path}/kept", "kept", values[[learned.best]], palette.LIMIT)
         plots.append(Plot(title=name, curves=(curve, dot)))
-    return Tab(title="Convergence over rounds, red: kept", plots=tuple(plots), columns=2)
+    return Tab(
+        title="Convergence over rounds (red: the round that was kept)",
+        plots=tuple(plots),
+        columns=2,
+    )
 
 
 def _rounds(numbers: np.ndarray) -> list[rr.TimeColumn]:

@@ -63,7 +63,7 @@ def fit_visual_servo(
         learning: Settings for learning neurons, noise and prior. These are not learned if it
             is None or there are fewer than `learning.hold_out` demonstrations.
         on_round: Called with the number and result of each round of learning.
-        landmarks: Landmarks that gave the image features; None: markers gave them.
+        landmarks: Landmarks whose pixels are the image features; None: they are of markers.
 
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
@@ -152,7 +152,7 @@ class _End(NamedTuple):
 
 
 def _ends(demos: Demonstrations, *, partial: bool = False) -> list[_End]:
-    """Ends of all demonstrations with an object; if `partial`, others may have none."""
+    """Ends of demonstrations that show an object: of all of them unless `partial`."""
     ends, without = [], []
     for demo in demos:
         if OBJECT_FEATURE in demo.extra:

@@ -25,16 +25,17 @@ _NO_PERSON = 100.0
 # Largest time by which the tracker's clock may be ahead of the arm's [s]. The age of an
 # observation that comes from further ahead is unknown.
 _CLOCK_ERROR = 0.05
-# Time in which an arm comes to rest [s]: as drivers plan, a joint of a Panda brakes from 0.8
-# rad/s with 0.7 of its highest acceleration. This time determines a speed scale near people.
-# Without the scale, the arm came too close to a worker in up to 7 of 60 jobs.
+# Time in which an arm comes to rest [s]. The arm's drivers brake with 0.7 of the highest joint
+# acceleration; a joint of a Panda then stops from 0.8 rad/s in this time. It determines a speed
+# scale near people. Without this scale, the arm came too close to a worker in up to 7 of 60
+# jobs.
 _COMING_TO_REST = 0.15
 
 NEAR_PEOPLE = ConstraintConfig(distance_weight=0.1)
 """Constraint layer of an arm near people. The path has priority over the distance: the arm need
 not leave its path, since it can brake on the path within the reaction time that the protective
 distance includes. The end effector then deviates from its path by 0.5 mm; if the distance had
-priority, by 6 mm. In steps that are not compiled, the solver stops once it has converged."""
+priority, by 6 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,7 @@ class PersonWatchConfig:
     acceleration: float = 5.0
     """Highest acceleration of a person between two observations [m/s^2]. People begin a step
     with 1 to 2 m/s^2; a hand that reaches for an object near the arm accelerates with up to
-    9 m/s^2. With 3 m/s^2, 3 of 1000 jobs near such hands came too close."""
+    9 m/s^2. With 3 m/s^2, the arm came too close to such a hand in 3 of 1000 jobs."""
     pairs: int = 8
     """Number of pairs (a part of the arm, a part of a person) that are kept apart. The most
     urgent pairs are chosen."""
@@ -53,8 +54,8 @@ class PersonWatchConfig:
     deviations of a tracker's noise. The arm stops, as the direction away from the person is
     unknown. Where contact is allowed, only the limits of lasting contacts apply."""
     fastest: float = 0.5
-    """Assumption for the speed cap: from this speed, the arm needs 0.15 s to come to rest
-    [m/s]."""
+    """Speed of the arm from which it is assumed to need 0.15 s to come to rest [m/s]. The speed
+    cap follows from this assumption."""
 
     def __post_init__(self) -> None:
         check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])

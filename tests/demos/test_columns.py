@@ -315,7 +315,7 @@ def test_what_a_dataset_declares_replaces_all_guesses():
     ("mapping", "fault"),
     [
         ({"joints": "bare"}, "unknown quantity 'joints'; known are time, joint_position"),
-        ({"position": "bare"}, "mapping gives position 4 columns, it takes 3"),
+        ({"position": "bare"}, "mapping gives position 4 columns, but it needs 3"),
         ({"position": []}, "mapping gives position no columns; None leaves it out"),
         ({"position": ["bare[0:2]", "bare[3]", "a.pos"]}, "gives position 4 columns"),
     ],

@@ -366,7 +366,7 @@ def test_quantities_are_read_in_the_order_of_the_contract():
         ([part("x", 0, key="none")], "none/x is no component of the dataset"),
         (
             [part(str(k), k, key="bare", role="position", unit="m") for k in range(2)],
-            "position has 2 components, it takes 3",
+            "position has 2 components, but needs 3",
         ),
     ],
 )

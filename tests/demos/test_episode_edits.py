@@ -93,7 +93,7 @@ def test_frames_are_dropped_with_their_stamps_and_their_count():
     assert half.changes == ("halved",)
     assert given.only(np.ones(60, bool), "none") is given
     assert len(given.only(np.arange(60) < 2, "two")) == 2
-    with pytest.raises(DatasetError, match="one: no two frames are left"):
+    with pytest.raises(DatasetError, match="one: fewer than two frames are left"):
         given.only(np.arange(60) < 1, "one")
     assert half.fault("odd", frame=3).frame == 6
     assert replace(half, resampled=True).fault("odd", frame=3).frame is None

@@ -222,7 +222,7 @@ def test_a_repair_moves_the_zeros_that_are_named_and_no_others(model, tmp_path, 
     repair_dataset(root, tmp_path / "plain", RepairOptions(trim=False))
     for demo, q in zip(load_demos(tmp_path / "plain"), episodes, strict=True):
         np.testing.assert_allclose(demo.joint_position, q - offset, atol=1e-6)
-    with pytest.raises(DatasetError, match="is measured; there are joint_0"):
+    with pytest.raises(DatasetError, match="measured joints: joint_0"):
         repair_dataset(root, tmp_path / "no", RepairOptions(offsets={"elbow": 1.0}))
     assert not (tmp_path / "no").exists()
 

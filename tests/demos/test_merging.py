@@ -72,7 +72,7 @@ def test_values_take_the_unit_of_the_first(tmp_path):
 def test_components_and_features_that_one_lacks(tmp_path):
     write(tmp_path / "a", [joint_path(60)])
     write(tmp_path / "b", [joint_path(60)], ["shoulder.pos", "elbow.pos", "hand.pos"])
-    with pytest.raises(DatasetError, match=r"no component wrist\.pos"):
+    with pytest.raises(DatasetError, match=r"lacks the component wrist\.pos"):
         merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
     episode = {STATE: joint_path(60), ACTION: joint_path(60), "observation.x": joint_path(60)}
     write_folder(tmp_path / "c", [episode], {STATE: NAMES, ACTION: NAMES})
@@ -106,7 +106,7 @@ def in_between(root):
         ),
         (
             in_between,
-            r"hrc check .*/b --units joint_position UNIT --keep-contract` declares it",
+            r"declare the unit with `hrc check .*/b --units joint_position UNIT --keep",
         ),
         (
             lambda r: (write(r, [joint_path(60)], HOBBY), sidecar(r, joint_position="%")),
@@ -114,7 +114,7 @@ def in_between(root):
         ),
         (
             lambda r: write(r, [joint_path(60)], [HOBBY[0], HOBBY[0], HOBBY[2]]),
-            "one to one|no component",
+            "one to one|lacks the component",
         ),
     ],
 )
@@ -248,8 +248,8 @@ def test_features_that_some_lack_are_named_with_those_datasets(tmp_path):
         )
     notes = merge_datasets([tmp_path / name for name in "abc"], tmp_path / "new").notes
     a, c = tmp_path / "a", tmp_path / "c"
-    assert f"observation.x: left out, {a}, {c} has none" in notes
-    assert f"observation.y: left out, {c} has none" in notes
+    assert f"observation.x: left out, as {a}, {c} lacks it" in notes
+    assert f"observation.y: left out, as {c} lacks it" in notes
 
 
 def test_types_and_shapes_are_those_of_the_first(tmp_path):

@@ -496,7 +496,7 @@ def test_mapping_overrules_what_names_say(tmp_path):
         ({"joints": STATE}, "unknown quantity 'joints'"),
         ({"joint_position": "observation.qpos"}, "no column 'observation.qpos'"),
         ({"joint_position": ["elbow"]}, "no column 'elbow'.*panda_joint1"),
-        ({"position": f"{STATE}[0:2]"}, "position 2 columns, it takes 3"),
+        ({"position": f"{STATE}[0:2]"}, "position 2 columns, but it needs 3"),
         ({"joint_position": []}, "joint_position no columns"),
         *(
             (

@@ -147,7 +147,7 @@ def set_rows(key, change):
         (
             set_rows(STATE, lambda v: np.nan * v),
             {"drop_bad_frames": True},
-            "not finite: no two frames are left",
+            "not finite: fewer than two frames are left",
             None,
         ),
         (
@@ -352,7 +352,9 @@ def test_bad_episodes_go_only_when_asked_for(tmp_path):
 
 def test_a_dataset_of_nothing_but_bad_episodes_is_none(tmp_path):
     root = write(tmp_path / "old", [np.ones((60, 3))])
-    with pytest.raises(DatasetError, match=r"episode 0: .*rests all the time|no two frames"):
+    with pytest.raises(
+        DatasetError, match=r"episode 0: .*rests all the time|fewer than two frames"
+    ):
         repair_dataset(root, tmp_path / "new")
     with pytest.raises(DatasetError, match="no episode could be repaired"):
         repair_dataset(root, tmp_path / "new", RepairOptions(drop_bad_episodes=True))

@@ -29,9 +29,10 @@ _RESTING = 0.01
 """Largest change of a value at rest, relative to its range; more than the noise of encoders."""
 _MEASURED_ANGLES = ("joint_position", "euler_xyz", "euler_intrinsic_xyz")
 _LARGEST_REMAINDER = 0.3 / (2 * np.pi)
-"""Largest part of a jump beyond whole turns [turns]; it comes from motion within a frame."""
+"""Largest difference between a jump and a whole number of turns [turns]: the joint also moves
+from one frame to the next."""
 _NEIGHBOURS = 4
-"""Number of steps on either side that indicate the speed of a joint."""
+"""Number of steps before and after a jump from which the speed of a joint is estimated."""
 _SMOOTH = ("joint_position", "joint_velocity", "position")
 
 
@@ -46,7 +47,7 @@ class EpisodeEdit:
     frames: RawFrames
     """Columns to be written; of LeRobot's index columns, only `task_index`."""
     time: Float64[np.ndarray, " _frames"]
-    """True stamps if there are any, LeRobot's otherwise [s]."""
+    """Recorded times if a column holds them, otherwise LeRobot's stamps [s]."""
     kept: Int64[np.ndarray, " _frames"]
     """Index of each frame in the old episode; after resampling, that of the nearest frame."""
     resampled: bool = False
@@ -85,7 +86,7 @@ class EpisodeEdit:
         if wanted.all():
             return self
         if wanted.sum() < 2:
-            raise self.fault(f"{change}: no two frames are left")
+            raise self.fault(f"{change}: fewer than two frames are left")
         return replace(
             self,
             frames={key: values[wanted] for key, values in self.frames.items()},
@@ -170,7 +171,7 @@ def drop_late(edit: EpisodeEdit) -> EpisodeEdit:
     """Drop the frames whose stamp is not later than all earlier ones.
 
     Raises:
-        DatasetError: No two frames are left.
+        DatasetError: Fewer than two frames are left.
     """
     highest = np.maximum.accumulate(edit.time)
     later = np.concatenate([[True], edit.time[1:] > highest[:-1]])
@@ -185,7 +186,7 @@ def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
     longer than `_PAUSE` show an arm at rest, and stay too.
 
     Raises:
-        DatasetError: No two frames are left.
+        DatasetError: Fewer than two frames are left.
     """
     repeated = repeated_frames(edit.frames)
     for values in edit.frames.values():
@@ -199,7 +200,7 @@ def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
 
 
 def trim(edit: EpisodeEdit) -> EpisodeEdit:
-    """Trim the rest before and after the motion to 0.1 s.
+    """Shorten the standstill before and after the motion to 0.1 s.
 
     Raises:
         DatasetError: The arm never moves, or the stamps do not increase.
@@ -250,7 +251,8 @@ def move_zeros(edit: EpisodeEdit, offsets: Mapping[str, float]) -> EpisodeEdit:
     labels = [*edit.selections[role].labels] if role in edit.selections else []
     for joint, angle in offsets.items():
         if joint not in labels or edit.units[role].si_unit != "rad":
-            text = f"no angle of {joint!r} is measured; there are {', '.join(labels) or 'none'}"
+            known = ", ".join(labels) or "none"
+            text = f"{joint!r} is no joint with a measured angle; measured joints: {known}"
             raise edit.fault(text, key=role)
         moved = edit.quantities[role].copy()
         moved[:, labels.index(joint)] += angle / 360 * edit.turn(role)[labels.index(joint)]
@@ -317,8 +319,8 @@ def _turns(
     usual = np.where(whole == 0, np.abs(steps), 0.0)
     padded = np.pad(usual, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)))
     around = sliding_window_view(padded, 2 * _NEIGHBOURS + 1, axis=0).max(-1)
-    # The remainder may reach three times the neighbouring steps, because the joint may
-    # accelerate, and a thousandth of a turn more for noise.
+    # The remainder may be up to three times the neighbouring steps, since the joint may
+    # accelerate, plus a thousandth of a turn for noise.
     jumps[left > 3 * around + 1e-3] = 0.0
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(jumps, axis=0)])
 
@@ -355,11 +357,11 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     except ValueError as error:
         raise edit.fault(str(error)) from error
     if "pose_matrix" in edit.selections:
-        text = "holds poses as matrices, which are not resampled; map them away"
-        text += " (mapping={'pose_matrix': None}) or leave the frames as they are (no fps)"
+        text = "holds poses as matrices, which are not resampled: leave them out"
+        text += " (mapping={'pose_matrix': None}), or keep the frame rate (give no fps)"
         raise edit.fault(text, key="pose_matrix")
     if "command_position" in edit.units and edit.units["command_position"].steps.any():
-        text = "holds changes per step, which would be wrong at another rate: keep the frames"
+        text = "holds changes per step, which would be wrong at another frame rate: give no fps"
         raise edit.fault(text, key="command_position")
     time = np.minimum(grid, known[-1])
     smooth, seen = fix_signs(_unwrapped_all(edit)), None

@@ -156,7 +156,7 @@ class _Merge:
             if without and key in _ESSENTIAL:
                 raise DatasetError(f"has no {key}, unlike the others", file=without[0])
             if without:
-                self.report.notes.append(f"{key}: left out, {', '.join(without)} has none")
+                self.report.notes.append(f"{key}: left out, as {', '.join(without)} lacks it")
             elif self.first.features[key].dtype != "video" or self.videos:
                 common[key] = self.first.features[key]
         for source in self.sources:
@@ -207,7 +207,7 @@ class _Merge:
         for place in range(len(names)):
             if wanted is not None and source.meanings.get((key, place)) == wanted:
                 return place
-        text = f"has no component {name} of {self.first.root}; there are {', '.join(names)}"
+        text = f"lacks the component {name} of {self.first.root}, but has {', '.join(names)}"
         raise source.fault(f"{text}: rename it in {source.root}/meta/info.json", key)
 
     def _factor(self, source: _Source, key: str, index: int, place: int) -> float:
@@ -222,7 +222,7 @@ class _Merge:
         for asked, decision in ((self.first, own), (source, other)):
             if decision.doubt:
                 advice = f"hrc check {asked.root} --units {decision.role} UNIT --keep-contract"
-                raise asked.fault(f"{decision.doubt}; `{advice}` declares it", key)
+                raise asked.fault(f"{decision.doubt}; declare the unit with `{advice}`", key)
         if own.role != other.role or own.si_unit != other.si_unit:
             raise source.fault(
                 f"{source.features[key].component(place)} is {other.role} in {other.unit}, but "
@@ -261,7 +261,9 @@ class _Merge:
         for key, feature in features.items():
             others = [source.folder.info["features"].get(key, {}) for source in self.sources]
             if any(other.get("info") != feature.get("info") for other in others):
-                feature.pop("info", None)  # about videos; LeRobot finds it again
+                feature.pop(
+                    "info", None
+                )  # describes the videos; LeRobot reads it from the files
         old = own.sidecar
         columns = {role: c for role, c in old.columns.items() if c.key in features}
         parts = tuple(part for part in old.contract.components if part.key in features)

@@ -53,7 +53,7 @@ class RepairOptions:
     """Changes that a repair may make in the copy."""
 
     trim: bool = True
-    """Trim the rest before and after the motion to 0.1 s."""
+    """Shorten the standstill before and after the motion to 0.1 s."""
     drop_late: bool = True
     """Drop frames whose true stamp is not later than all earlier ones."""
     drop_repeats: bool = False

@@ -170,7 +170,7 @@ def _named_selection(
         raise DatasetError(f"mapping gives {role} no columns; None leaves it out")
     width = ROLES[role].width
     if width is not None and len(places) != width:
-        raise DatasetError(f"mapping gives {role} {len(places)} columns, it takes {width}")
+        raise DatasetError(f"mapping gives {role} {len(places)} columns, but it needs {width}")
     named, labels = [features[key].names for key, _ in places], []
     for number, (names, (_, index)) in enumerate(zip(named, places, strict=True), start=1):
         name = f"joint_{number}" if names is None else names[index]

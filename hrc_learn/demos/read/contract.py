@@ -142,7 +142,7 @@ class Contract:
         for role, parts in found.items():
             width = ROLES[role].width
             if width is not None and len(parts) != width:
-                raise _faulty(f"{role} has {len(parts)} components, it takes {width}")
+                raise _faulty(f"{role} has {len(parts)} components, but needs {width}")
         return {
             role: ColumnSelection(
                 role=role,
@@ -156,9 +156,9 @@ class Contract:
     def keeping(self, kept: "Contract") -> "Contract":
         """This contract with the names and roles of an older one, which may have been edited.
 
-        A component that is now read as another quantity keeps its new role. Components of
-        quantities keep the unit of this contract; it already follows the older contract. Other
-        components get the unit of the older contract.
+        A component that is now read as another quantity keeps its new role. A component of a
+        quantity keeps its unit: the units of this contract were read with the older one. Every
+        other component gets its unit from the older contract.
         """
         known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:
@@ -311,7 +311,7 @@ def _describe_extra(part: ComponentContract, smooth: bool) -> ComponentContract:
         return replace(part, role=role, evidence="switches between few levels")
     if is_command:
         return replace(part, role="gripper command", evidence="named as a gripper")
-    return replace(part, confidence=0.5, evidence="the name says nothing")
+    return replace(part, confidence=0.5, evidence="the name is unknown")
 
 
 def _describe(
@@ -345,7 +345,7 @@ def _describe(
     # Estimated delays scatter by two frames.
     agreeing = int((np.abs(delays - delay) <= 2).sum())
     evidence = (
-        f"state follows it with slope {slope:.2f}, R2 {fit:.2f}, "
+        f"the state follows this command with slope {slope:.2f}, R2 {fit:.2f}, "
         f"same delay in {agreeing} of {len(tracked)} episodes"
     )
     part = replace(part, sign=int(np.sign(slope)), delay=delay / fps)

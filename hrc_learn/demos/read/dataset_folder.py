@@ -359,7 +359,7 @@ def select_episodes(
         raise DatasetError("no episode was asked for; None reads all", file=root)
     for index in indices:
         if index not in by_index:
-            text = f"there is no such episode; there are {min(by_index)} to {max(by_index)}"
+            text = f"there is no such episode: choose from {min(by_index)} to {max(by_index)}"
             raise DatasetError(text, file=root, episode=index)
     chosen = [by_index[index] for index in indices]
     if tasks is not None:
