@@ -15,6 +15,8 @@ def test_inside_it_is_still():
     assert (region.value(x) < 0).all()
     assert region.potential(x) == 0
     assert (region.gradient(x) == 0).all()
+    corner = BOX["centre"] + torch.tensor([1.0, -1.0, 2.0]) * BOX["half_size"]
+    assert region.value(corner).tolist() == pytest.approx([0.0, 0.0, 3.0], abs=1e-12)
 
 
 def test_printed_gradient():
