@@ -17,6 +17,7 @@ from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.kinematics import Arm, MissingModelError, arm
+from hrc_learn.kinematics.urdf import read_urdf
 
 NAMES = [f"j{i}" for i in range(1, 7)]
 MESH = '<visual><geometry><mesh filename="package://not/there.stl"/></geometry></visual>'
@@ -504,6 +505,37 @@ def test_shapes_that_are_no_capsules_leave_the_arm_as_it_is(tmp_path):
         mujoco.mj_kinematics(model, data)
         tool = shaped.forward(joints).position
         np.testing.assert_allclose(tool, data.site("tcp").xpos, rtol=0, atol=1e-9)
+
+
+def test_shapes_of_a_urdf_are_as_large_and_where_mujoco_has_them(tmp_path):
+    forms = (
+        '<box size="0.1 0.2 0.4"/>',
+        '<cylinder radius="0.03" length="0.5"/>',
+        '<capsule radius="0.02" length="0.3"/>',
+        '<sphere radius="0.07"/>',
+    )
+    shapes = "".join(
+        f'<collision><origin xyz="0.{i} 0.1 -0.2" rpy="0.{i} 0.5 -0.3"/>'
+        f"<geometry>{form}</geometry></collision>"
+        for i, form in enumerate(forms)
+    )
+    weight = '<mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<link name="l1"><inertial>{weight}</inertial>{shapes}</link>'
+    text = robot(f'<link name="l0"/>{link}{joint(1)}')
+    path = tmp_path / "robot.urdf"
+    path.write_text(text, encoding="utf-8")
+    ours = read_urdf(path).links["l1"]
+    model = mujoco.MjModel.from_xml_string(text)
+    for geom, shape in enumerate(ours.collisions):
+        kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+        assert shape.kind == kind
+        size = model.geom_size[geom][: 1 if kind == "sphere" else None]
+        np.testing.assert_allclose(shape.size[: len(size)], size[: len(shape.size)])
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+        np.testing.assert_allclose(shape.pose[:3, :3], turn.reshape(3, 3), atol=1e-9)
+        np.testing.assert_allclose(shape.pose[:3, 3], model.geom_pos[geom], atol=1e-9)
+    assert geom == model.ngeom - 1 == 3
 
 
 def test_limits_of_motion_have_to_be_positive(tmp_path):
