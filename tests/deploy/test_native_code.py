@@ -22,6 +22,7 @@ def operations(x: Tensor) -> list[Tensor]:
     """Results of all kinds of operations that a step may use; x (24, *batch)."""
     a, b, c = x.unflatten(0, (3, 8))
     yes, no = a > b, ~(a >= 0.5)
+    pairs = a.unflatten(0, (2, 4))  # reduced along an axis that is not the first
     return [
         a + b, torch.sub(a, b, alpha=2), a * b, a / b, -a, a.abs(), a.abs().sqrt(), a.trunc(),
         a.floor(), a.ceil(), a.round(), a.sin(), a.cos(), a.exp(), a.log(), a.tanh(),
@@ -41,6 +42,8 @@ def operations(x: Tensor) -> list[Tensor]:
         torch.linalg.vector_norm(a, ord=math.inf, dim=0)[None],
         a.softmax(0), a.argmax(0)[None].to(x.dtype),
         a.logsumexp(0, keepdim=True), a.logsumexp(0)[None],
+        pairs.logsumexp(1), pairs.softmax(1).flatten(0, 1), pairs.argmax(1).to(x.dtype),
+        pairs.roll(1, 1).flatten(0, 1), torch.linalg.vector_norm(pairs, dim=1),
         a.argmin(0, keepdim=True).to(x.dtype), a.gather(0, b.argmax(0, keepdim=True)),
         filled(a), a.flip(0), a.roll(3, 0), torch.stack([a, b], 1).reshape(16, *a.shape[1:]),
         torch.nn.functional.pad(a.movedim(0, -1), (1, 2)).movedim(-1, 0),
