@@ -232,6 +232,20 @@ def test_features_are_of_what_changed_and_near_the_line_that_is_given():
     assert len(changed_features(grey, usual, near).pixels) > 20
 
 
+def test_features_between_two_changes_do_not_count():
+    rng = np.random.default_rng(0)
+    usual = cv2.GaussianBlur(rng.integers(0, 256, (300, 400), np.uint8), (0, 0), 2.0)
+    usual = cv2.normalize(usual, None, 0, 255, cv2.NORM_MINMAX)
+    image = usual.copy()
+    corners = ((30, 40), (200, 300))
+    for v, u in corners:
+        image[v : v + 60, u : u + 60] = usual[v : v + 60, u : u + 60].T
+    found = changed_features(image, usual).pixels
+    from_changes = [np.abs(found - (u + 30, v + 30)).max(axis=1) < 30 + 10 for v, u in corners]
+    assert np.logical_or(*from_changes).all()
+    assert all(of.sum() > 3 for of in from_changes)
+
+
 def test_a_finding_is_drawn_about_its_place():
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     points = np.array([[500.0, 400.0], [700.0, 400.0], [600.0, 500.0]])
