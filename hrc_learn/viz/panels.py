@@ -39,6 +39,8 @@ class Plot:
     """Range of the vertical axis; None: that of the data."""
     legend: bool = False
     """Show a legend, because the title does not explain the colours."""
+    rows: bool = False
+    """The curves are rows at heights 1, 2, ...; figures write their names there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +264,8 @@ def _rows(path: str, title: str, active: Mapping[str, np.ndarray], marks: bool =
     rows = np.column_stack([np.where(on, k, np.nan) for k, on in enumerate(acted, start=1)])
     names = [name.replace("_", " ") for name in active]
     curves = replace(several(path, names, rows, width=4.0), marks=marks)
-    return Plot(title=title, curves=(curves,), range=(0.0, len(acted) + 1.0), legend=True)
+    span = 0.0, len(acted) + 1.0
+    return Plot(title=title, curves=(curves,), range=span, legend=True, rows=True)
 
 
 def _within(

@@ -84,7 +84,7 @@ def test_shaded_intervals_and_curves_of_a_dashboard_are_drawn():
         (span,) = axes.patches
         assert span.get_x() == pytest.approx(run.time[80])
         assert span.get_x() + span.get_width() == pytest.approx(run.time[119])
-        assert (axes.get_legend() is not None) == plot.legend
+        assert (axes.get_legend() is not None) == (plot.legend and not plot.rows)
     assert figure.axes[1].get_ylim() == plots[1].range
 
 
@@ -125,3 +125,18 @@ def test_boxes_are_cut_to_the_surroundings_of_the_paths():
     (part,) = near((tall, far), np.zeros((1, 3)))
     assert part.centre == (0.0, 0.0, 0.0)
     assert part.half_size == pytest.approx((0.1, 0.1, 0.22))
+
+
+def test_reasons_stand_beside_their_rows_in_place_of_numbers():
+    run = sample_run()
+    figure = person_figure(run)
+    (axes,) = (axes for axes in figure.axes if axes.get_title("left").startswith("Reasons"))
+    named = {
+        text.get_text(): height
+        for height, text in zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+    }
+    assert list(named) == [name.replace("_", " ") for name in run.hindered]
+    assert axes.get_legend() is None
+    for line in axes.get_lines():
+        heights = line.get_ydata()
+        assert set(heights[np.isfinite(heights)]) <= {named[line.get_label()]}
