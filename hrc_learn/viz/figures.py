@@ -226,11 +226,10 @@ def plots_figure(
             axes.set_title(plot.title, fontsize=10 if columns == 1 else 8)
             axes.set_ylim(plot.range)
             axes.margins(x=0)
+            handles, names = axes.get_legend_handles_labels()
             if plot.rows:
-                names = [name for curves in plot.curves for name in curves.names]
                 axes.set_yticks(range(1, len(names) + 1), names, fontsize=7)
             elif plot.legend:
-                handles, names = axes.get_legend_handles_labels()
                 once = dict(zip(names, handles, strict=True))  # names may be repeated
                 beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
                 place = beside if columns == 1 else {"loc": "best", "ncols": 2}

@@ -54,11 +54,7 @@ class Tab:
 
 def without_empty_plots(tab: Tab) -> Tab:
     """Tab without its empty plots."""
-    seen = [
-        plot
-        for plot in tab.plots
-        if any(np.isfinite(curves.values).any() for curves in plot.curves)
-    ]
+    seen = [p for p in tab.plots if any(np.isfinite(c.values).any() for c in p.curves)]
     return replace(tab, plots=tuple(seen))
 
 
