@@ -233,7 +233,7 @@ class _Batch:
             drawn, np.broadcast_to(acceleration, self._q.shape).copy()
         )
         request = FollowPath(paths=self._paths, path=job.cycle)
-        self._state = self._loop.begin_path(
+        self._state = self._loop.path_law.begin(
             self._loop.initial_state(self._q.clone()), begin, request
         )
         zeros, count = torch.zeros(runs, dtype=torch.float64), torch.zeros(runs).long()

@@ -78,8 +78,8 @@ class ArmLoop:
         config = config or ArmLoopConfig()
         elbow_speed = min(config.elbow_speed, guided_elbow_speed(config.safety.tcp_speed))
         self.config = config = replace(config, elbow_speed=elbow_speed)
-        self._law = PathLaw(chain, config, clearance)
-        self.safety = self._law.safety
+        self.path_law = PathLaw(chain, config, clearance)
+        self.safety = self.path_law.safety
 
     def initial_state(
         self,
@@ -106,21 +106,6 @@ class ArmLoop:
             lost=never,
             path=PathState.none(joint_position, self.chain.forward(joint_position)),
         )
-
-    def begin_path(
-        self,
-        state: ArmLoopState,
-        joint_position: Float[Tensor, "*batch n"],
-        request: FollowPath,
-    ) -> ArmLoopState:
-        """State at the start of joint paths.
-
-        Args:
-            state: State of the last step.
-            joint_position: Joint positions now [rad].
-            request: The paths.
-        """
-        return self._law.begin(state, joint_position, request)
 
     def step(
         self, state: ArmLoopState, reading: ArmReading, request: ArmRequest
@@ -155,7 +140,7 @@ class ArmLoop:
         null_velocity, limitations = self._eased_push(state, reading)
         pace = state.pace.overridden(reading.pause, self.config.dt)
         state = replace(state, null_velocity=null_velocity, pace=pace)
-        return replace(state, path=self._law.go_on(state, reading)), limitations
+        return replace(state, path=self.path_law.go_on(state, reading)), limitations
 
     def act(
         self, state: ArmLoopState, reading: ArmReading, request: ArmRequest
@@ -168,7 +153,7 @@ class ArmLoop:
         if isinstance(request, Command):
             return self._send(state, reading, request)
         if isinstance(request, FollowPath):
-            wanted, state = self._law.follow(state, reading, request)
+            wanted, state = self.path_law.follow(state, reading, request)
         elif isinstance(request, TrackPose):
             wanted, state = self._track(state, reading, request), _without_path(state)
         else:
@@ -202,7 +187,7 @@ class ArmLoop:
         if not bool(acts.any()):
             return requested, ()
         q, J = reading.joint_position, reading.jacobian
-        config, bounds = self.config, self._law.task_margin.velocity_bounds(q)
+        config, bounds = self.config, self.path_law.task_margin.velocity_bounds(q)
 
         one = q.new_ones(q.shape[:-1])
         eased = apply_where(
@@ -241,7 +226,7 @@ class ArmLoop:
     ) -> WantedMotion:
         """Joint velocity that tracks the requested pose of the end effector [rad/s]."""
         every, push = torch.ones_like(state.aside), state.null_velocity
-        tracked = self._law.track(
+        tracked = self.path_law.track(
             state, reading, request.pose, request.twist, push, every, slows=False
         )
         limitations = tracked.limitations() if reading.explain else ()

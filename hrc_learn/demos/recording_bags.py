@@ -37,11 +37,6 @@ together after the motion are closer."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
 
 
-def is_bag(path: Path) -> bool:
-    """True for the folder of a ROS 2 bag."""
-    return (path / "metadata.yaml").is_file()
-
-
 def read_bag(path: Path) -> list[Recording]:
     """Episodes of a bag; gaps in its joints or images divide it into several episodes.
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.recording_bags import is_bag, read_bag
+from hrc_learn.demos.recording_bags import read_bag
 from hrc_learn.demos.recording_files import (
     UNNAMED,
     Field,
@@ -85,7 +85,8 @@ def _known_reader(path: Path) -> Callable[..., list[Recording]] | None:
     if path.is_dir():
         stores = (".zgroup", "zarr.json", ".zarray")
         is_zarr = any((path / name).is_file() for name in stores)
-        return read_bag if is_bag(path) else read_zarr if is_zarr else None
+        is_bag = (path / "metadata.yaml").is_file()
+        return read_bag if is_bag else read_zarr if is_zarr else None
     name = path.name.lower()
     for suffix, reader in READERS.items():
         # The files of an RLDS dataset have a number after the suffix.

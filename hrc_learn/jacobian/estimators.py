@@ -165,11 +165,9 @@ class KeyFrame:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class KeyFrameState:
+class KeyFrameState(WeightState):
     """Weights, and the key frame with which the next frame is compared."""
 
-    weight: Float[Tensor, "*batch entries K"]
-    """Weights W [px/m, px/rad]."""
     key: KeyFrame
     """Last key frame."""
 

@@ -123,22 +123,16 @@ class RBFImageJacobian(nn.Module):
 
     @classmethod
     def from_jacobian(
-        cls,
-        jacobian: Float[Tensor, "rows 6"],
-        centers: Float[Tensor, "K n"],
-        width: float,
-        *,
-        input_indices: Sequence[int] = (0, 1),
+        cls, jacobian: Float[Tensor, "rows 6"], centers: Float[Tensor, "K n"], width: float
     ) -> RBFImageJacobian:
         """Network whose image Jacobian is the same initial guess everywhere.
 
         Args:
             jacobian: The guess J_s0 [px/m, px/rad].
-            centers: Centres of the neurons.
+            centers: Centres of the neurons, x and y [m].
             width: Standard deviation of the neurons.
-            input_indices: Components of r that are inputs of the neurons.
         """
-        network = cls(centers, width, input_indices=input_indices)
+        network = cls(centers, width)
         network.weight.data = jacobian.to(centers).flatten()[:, None].repeat(1, len(centers))
         return network
 

@@ -454,7 +454,7 @@ class WorkCell:
             return 0
         paths = JointPaths.of(self.chain, [path], self.config.dt)
         request = FollowPath(paths=paths, path=torch.tensor(0))
-        self.loop_state = self._loop.begin_path(self.loop_state, self.joints, request)
+        self.loop_state = self._loop.path_law.begin(self.loop_state, self.joints, request)
         self.plan = path
         try:
             while not self.loop_state.path.finished:

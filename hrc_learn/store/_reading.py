@@ -48,16 +48,14 @@ def read_json[T](
     return parse_json(_content(Path(path), advice), schema, str(path), advice)
 
 
-def read_toml[T](
-    path: str | os.PathLike[str], schema: type[T] = dict, advice: str = "correct it"
-) -> T:
+def read_toml[T](path: str | os.PathLike[str], schema: type[T] = dict) -> T:
     """Read a TOML file; arguments and errors as for `read_json`."""
-    data = _content(Path(path), advice)
+    data = _content(Path(path), "correct it")
     try:
         content = tomllib.loads(data.decode(), parse_float=_finite)
         return msgspec.convert(content, schema)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {_complaint(error)}; {advice}") from None
+        raise ValueError(f"{path}: {_complaint(error)}; correct it") from None
 
 
 def parse_json[T](

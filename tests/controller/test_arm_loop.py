@@ -89,7 +89,7 @@ def test_a_batch_does_what_each_arm_does_alone():
     which = torch.tensor([0, 1, 0, 1])
     q = table.position[which, 0] + 0.02 * torch.arange(ARMS).double()[:, None]
     follow = FollowPath(paths=table, path=which)
-    state = law.begin_path(law.initial_state(q), q, follow)
+    state = law.path_law.begin(law.initial_state(q), q, follow)
     alone = [element(state, k) for k in range(ARMS)]
     aside, waited = False, False
     with torch.inference_mode():
@@ -143,7 +143,7 @@ def test_joints_that_find_no_way_back_return_directly(blocked):
     law = ArmLoop(panda, clearance=obstacle)
     table = JointPaths.of(panda, [np.repeat(panda.ready.numpy()[None], 3000, axis=0)], DT)
     follow, q = FollowPath(paths=table, path=torch.tensor(0)), away
-    state = law.begin_path(law.initial_state(q), q, follow)
+    state = law.path_law.begin(law.initial_state(q), q, follow)
     state = replace(state, path=replace(state.path, waited=torch.tensor(21.0).double()))
     fastest = 0.0
     with torch.inference_mode():
