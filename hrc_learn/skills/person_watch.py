@@ -100,7 +100,7 @@ class PersonWatch:
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
     ) -> WatchedPeople:
-        """People near the arm now; the arm brakes after an observation that is not usable.
+        """People near the arm now; the arm brakes if an observation or its joints are unusable.
 
         Args:
             time: Reading of the clock [s].
@@ -108,9 +108,11 @@ class PersonWatch:
             load: Object in the gripper; None: no object.
         """
         seen, number = self._tracker.read(), self._config.pairs
-        age = _NAN if seen is None else time - seen.time
-        known = age >= -_CLOCK_ERROR
-        usable = seen is not None and known and np.isfinite([seen.ends, seen.velocity]).all()
+        age, usable = _NAN, False
+        if seen is not None:
+            age, numbers = time - seen.time, (seen.ends, seen.velocity, seen.radius)
+            usable = age >= -_CLOCK_ERROR and all(np.isfinite(x).all() for x in numbers)
+            usable = usable and (seen.radius >= 0).all() and bool(joints.isfinite().all())
         if seen is None or not usable or not len(seen.ends):
             distance = joints.new_full((number,), _NO_PERSON if usable else _NAN)
             return WatchedPeople(

@@ -83,20 +83,32 @@ def test_an_observation_of_no_person_leaves_the_arm_free():
 
 
 @pytest.mark.parametrize(
-    ("ahead", "lost", "known"),
-    [(0.04, None, True), (0.06, None, False), (0.0, "ends", False), (0.0, "velocity", False)],
+    ("ahead", "lost", "value", "known"),
+    [
+        (0.04, None, 0.0, True),
+        (0.06, None, 0.0, False),
+        (0.0, "ends", np.nan, False),
+        (0.0, "velocity", np.nan, False),
+        (0.0, "radius", np.nan, False),
+        (0.0, "radius", np.inf, False),
+        (0.0, "radius", -0.1, False),
+        (0.0, "joints", np.nan, False),
+    ],
 )
-def test_what_cannot_be_is_nothing_known(ahead, lost, known):
-    """A tracker whose clock is ahead of the arm's, or that lost one of many body parts."""
-    seen = observed()
-    if lost is not None:
+def test_what_cannot_be_is_nothing_known(ahead, lost, value, known):
+    """A tracker whose clock is ahead of the arm's, or that lost one of many body parts; or an
+    encoder without a reading."""
+    seen, joints = observed(), WORKPLACE.hover_joints()
+    if lost == "joints":
+        joints[3] = value
+    elif lost is not None:
         broken = getattr(seen, lost).copy()
-        broken[3, 0] = np.nan
+        broken[3] = value
         seen = replace(seen, **{lost: broken})
     pfl = replace(SEPARATION, mode="ssm+pfl")
     for person in (seen, replace(seen, regions=("hand",) * len(seen.ends))):
         tracker = SimpleNamespace(read=lambda person=person: person)
-        found = PersonWatch(tracker, ARM, pfl).look(1.0 - ahead, WORKPLACE.hover_joints())
+        found = PersonWatch(tracker, ARM, pfl).look(1.0 - ahead, joints)
         assert bool(found.distances.known()) == known
         assert math.isfinite(found.nearest) == known
 
