@@ -24,9 +24,9 @@ from hrc_learn.experiments.surroundings import NearWorker, worker_contacts
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach
-from hrc_learn.skills.grasping import Mishap
 from hrc_learn.skills.pick_and_place import RELEASE
 from hrc_learn.skills.receiving import Receipt
+from hrc_learn.skills.work_cell import Mishap
 
 type Measure = Callable[[CollaborationRun], float | int | None]
 

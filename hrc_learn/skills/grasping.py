@@ -18,7 +18,6 @@ import copy
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -41,6 +40,7 @@ from hrc_learn.skills.visual_servoing import (
 from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
+    Mishap,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
@@ -57,11 +57,6 @@ CLOSING_TIME = 0.7
 """Shortest time for the fingers to close and the grip to settle [s]."""
 INTERACT = "interact"
 """Phase in which a person pulls the elbow aside."""
-
-Mishap = Literal[
-    "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
-]
-"""Kinds of failures from which a job recovers."""
 
 # Longest delay or occlusion that does not count as a recovery [s]: a few lost images.
 _NEGLIGIBLE = 0.3
@@ -229,19 +224,17 @@ class Grasping:
             MissedGraspError: All attempts failed.
         """
         self._cell.gripper.move(OPEN)
-        mishap: Mishap
         while True:
-            begun, mishap = self._cell.time, "marker occluded"
+            begun = self._cell.time
             target = self.locate(job.item)
             if (waited := self._cell.time - begun) > _NEGLIGIBLE:
                 what = f"waited {waited:.1f} s for its marker"
                 self.note(job, "object not detected", what)
             try:
                 self._aim(job, target)
-                mishap = "missed grasp"
                 self.close_on(job.item)
             except MissedGraspError as error:
-                self.note(job, mishap, str(error))
+                self.note(job, error.mishap, str(error))
                 if job.attempts == self._config.attempts:
                     raise
                 self.start_over()

@@ -33,7 +33,12 @@ from hrc_learn.skills.marker_sensor import MarkerConsistency, SeenFeature
 from hrc_learn.skills.step_report import vision_columns
 from hrc_learn.skills.visual_skill import MarkerAngle
 from hrc_learn.skills.visual_target import VisualTarget, object_heading
-from hrc_learn.skills.work_cell import CellReading, MissedGraspError, WorkCell
+from hrc_learn.skills.work_cell import (
+    CellReading,
+    HiddenMarkerError,
+    MissedTargetError,
+    WorkCell,
+)
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Fractions of the probe height. They are tried in turn until the marker's target pixel at that
@@ -367,6 +372,7 @@ class ServoStep:
             goal_orientation=None,
             detected=False,
             arrived=False,
+            held=None,  # an error may have ended a hold
         )
 
     def observed(self, state: ServoState, reading: CellReading) -> ServoState:
@@ -599,8 +605,9 @@ class VisualServo:
             Duration [s].
 
         Raises:
-            MissedGraspError: The timeout is over, the marker stays undetected, or the predicted
-                error above the object stays too large.
+            HiddenMarkerError: The marker stays undetected.
+            MissedTargetError: The timeout is over, or the predicted error above the object
+                stays too large.
         """
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
@@ -617,7 +624,7 @@ class VisualServo:
             error = self._law.uncertainty(self.state, target)
             if error <= config.object_error:
                 return reached - begun
-        raise MissedGraspError(
+        raise MissedTargetError(
             f"visual servoing: after {config.max_probes} probes the end effector may still be "
             f"{1e3 * error:.1f} mm off the object, more than {1e3 * config.object_error:.1f}: "
             "check that the camera stands still and the marker is in view."
@@ -702,13 +709,13 @@ class VisualServo:
             return
         config, spent = self._config, self._clock - start
         if self._cell.time - self.state.last_detection > config.occlusion_timeout:
-            raise MissedGraspError(
+            raise HiddenMarkerError(
                 f"visual servoing: the end effector's marker {self._law.marker} was not "
                 f"detected for {config.occlusion_timeout:.0f} s. Remove what hides it, or move "
                 "the object nearer to the middle of the image."
             )
         if spent > config.timeout:
-            raise MissedGraspError(
+            raise MissedTargetError(
                 f"visual servoing: after {spent:.0f} s the marker is still "
                 f"{self.error(target):.1f} px from its target (NaN: not detected)."
             )

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -68,8 +68,33 @@ class TaskFailedError(RuntimeError):
     """A task failed; the message says in which phase and why."""
 
 
+Mishap = Literal[
+    "object not detected",
+    "marker occluded",
+    "target not reached",
+    "missed grasp",
+    "dropped object",
+    "blocked path",
+]
+"""Kinds of failures from which a job recovers."""
+
+
 class MissedGraspError(TaskFailedError):
     """A grasp failed; another attempt may succeed."""
+
+    mishap: Mishap = "missed grasp"
+
+
+class MissedTargetError(MissedGraspError):
+    """Visual servoing did not bring the end effector to its target."""
+
+    mishap = "target not reached"
+
+
+class HiddenMarkerError(MissedTargetError):
+    """The end effector's marker stayed undetected."""
+
+    mishap = "marker occluded"
 
 
 class StoppedByPersonError(TaskFailedError):

@@ -17,7 +17,7 @@ from hrc_learn.protocols import HumanInput
 from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MissedGraspError
-from hrc_learn.skills.marker_sensor import MarkerObservation, SeenFeature
+from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation, SeenFeature
 from hrc_learn.skills.visual_servoing import (
     ServoStep,
     ServoTarget,
@@ -243,6 +243,13 @@ def test_only_a_marker_last_seen_near_the_border_has_left_the_image(law, pixel, 
     assert law.out_of_view(state, 10.0) == out
 
 
+def test_a_hold_that_an_error_ended_does_not_reach_into_the_next_target(law):
+    """Its test of the marker would compare the next target's pixels with those held."""
+    state = law.initial_state(panda.ready)
+    held = replace(state, held=MarkerConsistency(tolerance=CONFIG.marker_tolerance))
+    assert law.restarted(held, 2.0, state.controller.safety).held is None
+
+
 @pytest.mark.long
 def test_the_null_space_returns_except_while_a_person_pushes_it(law):
     state, speeds = law.initial_state(panda.ready), []
@@ -394,6 +401,8 @@ def test_it_gives_up_after_its_own_time_and_counts_no_time_of_people(
         return result, replace(state, drawn=replace(state.drawn, away=led_away))
 
     step.step = led
-    with shapes_unchecked(), pytest.raises(MissedGraspError, match=text):
+    with shapes_unchecked(), pytest.raises(MissedGraspError, match=text) as raised:
         VisualServo(cell, step).servo_to(target_above())
+    hidden = "was not detected" in text
+    assert raised.value.mishap == ("marker occluded" if hidden else "target not reached")
     assert cell.time - begun == pytest.approx(passed, abs=0.05)
