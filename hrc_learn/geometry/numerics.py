@@ -39,6 +39,9 @@ def as_tensor(values: ArrayLike, like: Tensor | None = None) -> Tensor:
         Tensor of the same shape.
     """
     if not isinstance(values, Tensor):
+        if isinstance(values, np.ndarray):
+            # PyTorch takes neither negative strides nor other byte orders.
+            values = np.require(values, values.dtype.newbyteorder("="), ["C", "W"])
         values = torch.as_tensor(np.asarray(values))
     if not values.is_floating_point():
         values = values.double()

@@ -120,7 +120,7 @@ class Approach:
             raise ValueError("an approach is learned from one demonstration or more: got none.")
         paths = [_unturned(path) for path in paths]
         ends = torch.stack([path.orientation[-1] for path in paths])
-        demonstrated = quaternion.mean(ends.double())
+        demonstrated = quaternion.mean(ends)
         tangents = torch.stack([tangent(path.position) for path in paths])
         mean = tangents.mean(dim=0)
         mean = mean / mean.norm().clamp(min=_SHORTEST)
@@ -162,12 +162,13 @@ def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:
 
 
 def _unturned(path: Pose) -> Pose:
-    """The path, turned about the vertical so that the gripper closes along x at its end."""
+    """The path in float64, turned about the vertical so that the gripper closes along x at its
+    end.
+    """
     turn = turn_about_vertical(path.orientation[-1], gripper_down())
     back = quaternion.exp(torch.tensor([0.0, 0.0, -turn], dtype=torch.float64))
-    return Pose(
-        quaternion.rotate(back, path.position), quaternion.multiply(back, path.orientation)
-    )
+    orientation = quaternion.multiply(back, path.orientation.double())
+    return Pose(quaternion.rotate(back, path.position.double()), orientation)
 
 
 def _angle(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "3"]) -> Float[Tensor, "*batch"]:

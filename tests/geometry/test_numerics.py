@@ -165,11 +165,28 @@ def test_settings_are_held_to_their_range(rule, good, bad, words):
             check_settings(SimpleNamespace(x=value), **{rule: ["x"]})
 
 
+def frozen(array):
+    array.flags.writeable = False
+    return array
+
+
 def test_whole_numbers_and_lists_become_float64_and_floats_stay():
     for values in (3, [1, 2], torch.arange(3), np.arange(3, dtype=np.int32), [[1.5]]):
         assert as_tensor(values).dtype == torch.float64
     assert as_tensor(np.zeros(2, np.float32)).dtype == torch.float32
     assert as_tensor([1.0, 2.0], torch.zeros(1)).dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "laid_out",
+    [lambda a: a[::-1], lambda a: a.astype(">f8"), lambda a: a[::-1].astype(">f4"), frozen],
+)
+def test_arrays_of_any_layout_become_the_same_tensor(laid_out):
+    """Reversed motions, columns of HDF5 files from other machines, read-only views."""
+    array = laid_out(np.arange(8.0).reshape(4, 2))
+    tensor = as_tensor(array)
+    np.testing.assert_array_equal(tensor.numpy(), array)
+    assert tensor.element_size() == array.itemsize
 
 
 def test_numbers_in_si_units_are_no_larger_than_a_million_millions():

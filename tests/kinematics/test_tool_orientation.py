@@ -73,6 +73,13 @@ def test_where_the_hand_came_from_the_side_it_keeps_its_orientation(angles):
     assert approach.turned_rad == 0.0
 
 
+def test_poses_of_single_precision_give_the_same_approach():
+    path = path_along(tilted(0.2))
+    single = Pose(path.position.float(), path.orientation.float())
+    found, expected = Approach.fit([single]), Approach.fit([path])
+    torch.testing.assert_close(found.orientation, expected.orientation, rtol=0, atol=1e-6)
+
+
 def test_a_path_that_already_points_the_right_way_turns_nothing():
     approach = Approach.fit([path_along(tilted(0.0))])
     assert torch.isfinite(approach.orientation).all()
