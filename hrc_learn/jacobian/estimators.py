@@ -29,6 +29,9 @@ from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_c
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import chosen, pytree
 
+# Shortest motion between key frames that counts as motion [m].
+_LEAST_MOTION = 1e-12
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +182,10 @@ class LearningConfig(KeyFrameConfig):
     weight_bound: float = 2e4
     """Largest entry of the weights [px/m], rotation scaled with `rotation_scale`."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, positive=["weight_bound"])
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
@@ -300,7 +307,9 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         config = self.config
         twist = key.pose.twist_to(measurement.pose)
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
-        moved = measurement.valid & key.present & (distance >= config.min_step)
+        # At rest there is nothing to learn from, even where every frame is a key frame.
+        least = max(config.min_step, _LEAST_MOTION)
+        moved = measurement.valid & key.present & (distance >= least)
         valid = moved & (distance <= config.max_step)
         now, before = map(self.network.first_pixel, (measurement.pose, key.pose))
         explained = 0.0 if now is None or before is None else now - before
@@ -377,6 +386,12 @@ class CompositeConfig(LearningConfig):
     """Motion at which half of `prediction_gain` applies [m]; smaller motions are mostly
     noise."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, not_negative=("task_gain", "prediction_gain", "noise_floor"))
+        if self.prediction_gain >= 2:
+            raise ValueError(f"prediction_gain must be below 2, but is {self.prediction_gain}")
+
 
 class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
     """Composite adaptation: task error and prediction error (Slotine and Li 1989).
@@ -425,6 +440,10 @@ class BroydenConfig(LearningConfig):
     gain: float = 0.5
     """Fraction of the prediction error removed by one pair, in (0, 1]."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, fraction=["gain"])
+
 
 class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     """Broyden's update,  J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997).
@@ -443,7 +462,7 @@ class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     ) -> KeyFrameState:
         """State after an update with a new pair, if there is a pair."""
         # dr is zero without a pair; the floor avoids 0 / 0.
-        size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
+        size = pair.dr.square().sum(-1).clamp_min((_LEAST_MOTION / 2) ** 2)
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
         return replace(state, weight=state.weight + self.along(step, pair))
 
@@ -463,7 +482,8 @@ class KalmanConfig(LearningConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_settings(self, positive=["pixel_noise"], not_negative=["drift"])
+        prior = "drift", "bias_std", "weight_std"
+        check_settings(self, positive=["pixel_noise"], not_negative=prior)
 
 
 @pytree

@@ -344,6 +344,32 @@ def test_weights_stay_bounded(estimator):
     assert 2999 < max(largest) <= 3000 * (1 + 1e-12)
 
 
+@pytest.mark.parametrize("kind", LEARNING)
+def test_an_arm_at_rest_teaches_nothing_even_if_every_frame_is_compared(kind):
+    config = replace(kind(guess()).config, min_step=0.0)
+    poses = wander(1, 1, rng=generator(18))[:, [0] * 5]
+    x = 1440 * torch.rand(1, 5, 2, generator=generator(19), dtype=torch.float64)
+    *_, last = run(kind(guess(), config), poses, x)
+    assert_close(last.weight[0], guess().weight.detach())
+
+
+@pytest.mark.parametrize(
+    ("config", "wrong", "words"),
+    [
+        (BroydenConfig, {"gain": 1.01}, r"gain must be in \(0, 1\]"),
+        (BroydenConfig, {"weight_bound": 0.0}, "weight_bound must be positive"),
+        (CompositeConfig, {"prediction_gain": 2.0}, "prediction_gain must be below 2"),
+        (CompositeConfig, {"noise_floor": -1e-3}, "noise_floor must not be negative"),
+        (KalmanConfig, {"bias_std": np.nan}, "bias_std must not be negative"),
+        (KalmanConfig, {"pixel_noise": 0.0}, "pixel_noise must be positive"),
+        (KalmanConfig, {"max_step": 0.0}, "max_step must be positive"),
+    ],
+)
+def test_gains_that_cannot_converge_are_refused(config, wrong, words):
+    with pytest.raises(ValueError, match=words):
+        config(**wrong)
+
+
 def test_kalman_filter_against_the_textbook():
     network = guess()
     path = wander(60, rng=generator(20))
