@@ -370,7 +370,8 @@ def near_worker(
         pushes = -found.rate(v[steps], torch.zeros_like(speed)) > _AT_REST
         # The force grows with the relative speed.
         part = -found.rate(v[steps], speed).clamp(max=0) / contact
-        part = torch.where(pushes & (found.distance <= 0), part.nan_to_num(nan=torch.inf), 0.0)
+        touches = pushes & (found.distance <= 0)
+        part = torch.where(touches, part.nan_to_num(torch.inf, torch.inf), 0.0)
         force[steps] = part.amax((-2, -1)).numpy()
 
     rest = np.ones(len(time), dtype=bool)
