@@ -25,6 +25,7 @@ from hrc_learn.distributed import ByValue, worker_pool
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import PhysicsError
+from hrc_learn.sim.step_checks import PhysicsWatch
 from hrc_learn.teleoperation.scenarios import SCENARIOS, ScenarioRun, make_scenario
 
 # pyright: reportAttributeAccessIssue=false
@@ -150,6 +151,7 @@ class SceneJudge:
             )
         self.model = model = mujoco.MjModel.from_xml_path(config.scene)
         self.data, self._config = mujoco.MjData(model), config
+        self._watch = PhysicsWatch(model, self.data)
         self.succeeded, self._widest = _function(config.success), widest or 1.0
         self._steps = max(1, round(1 / fps / model.opt.timestep))
         known = {model.joint(i).name: i for i in range(model.njnt)}
@@ -180,6 +182,7 @@ class SceneJudge:
         for name, pose in trial.objects.items():
             self._put(name, np.concatenate([pose[:3] + self._config.base, pose[3:]]))
         mujoco.mj_forward(self.model, self.data)
+        self._watch.restart()
 
     def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
         """Joint positions, NaN for the gripper's opening, and poses of the objects."""
@@ -196,6 +199,8 @@ class SceneJudge:
         self.data.ctrl[self._arm] = joints
         self.data.ctrl[self._hand] = low + (high - low) * width / self._widest
         mujoco.mj_step(self.model, self.data, self._steps)
+        self._watch.after_step()
+        self._watch.check()
         return joints
 
     def failure(self) -> str:

@@ -165,3 +165,13 @@ def test_a_replay_commands_the_next_frame_and_reads_before_it(judge):
     again = replay(found, given)
     np.testing.assert_array_equal(again.joints, made.joints)
     assert isinstance(found.model, mujoco.MjModel)
+
+
+def test_a_motion_whose_simulation_diverges_fails_whatever_the_function_says(judge):
+    """MuJoCo would reset the scene, and the motion could look like a success."""
+    found = judge()
+    found.model.actuator_gainprm[3, 0] = 1e9
+    diverged = replay(found, trial())
+    assert diverged.failure.startswith("physics: physics failed at one")
+    found.model.actuator_gainprm[3, 0] = 50.0
+    assert replay(found, trial()).failure == ""
