@@ -290,6 +290,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         if duration is not None:
             motion = self.primitive.motion
             ratio = positive("duration", duration, self.mean) / motion.duration.double()
+            if ratio.ndim:
+                raise ValueError(f"duration must be one number, got {tuple(ratio.shape)}")
             # Condition on the logarithm of the duration, almost without noise.
             known = self._given(
                 self.timing[None] / KNOWN_DURATION, ratio.log()[None] / KNOWN_DURATION

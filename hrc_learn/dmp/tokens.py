@@ -386,7 +386,12 @@ class ActionProcessor:
             vocab_size: Number of tokens.
             time_horizon: Ignored; T is read from the chunks.
             action_dim: Ignored; D is read from the chunks.
+
+        Raises:
+            ValueError: The scale leaves no tolerance below 1.
         """
+        if not OF_SCALE < scale < np.inf:
+            raise ValueError(f"scale must be above {OF_SCALE} and finite, got {scale}")
         chunks = np.stack(list(action_data))
         time, tolerance = np.arange(chunks.shape[1]), OF_SCALE / scale
         return cls(

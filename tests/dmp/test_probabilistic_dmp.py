@@ -206,6 +206,9 @@ def test_what_cannot_be_is_refused(distribution):
         distribution.condition([0.5], [[0.0, 0.0]], noise=[0.1, 0.1, 0.1])
     with pytest.raises(ValueError, match=r"one motion, got a batch \(3,\)"):
         distribution.at(goal=torch.zeros(3, 2))
+    for duration in ([1.0, 2.0], torch.ones(1)):
+        with pytest.raises(ValueError, match=r"duration must be one number, got \("):
+            distribution.condition([], duration=duration)
     for slack in (float("nan"), -1.0):
         with pytest.raises(ValueError, match="slack must be finite and not negative"):
             ProbabilisticDMP.fit(JointDMP.fit(time, both), slack=slack)

@@ -405,6 +405,13 @@ def test_a_processor_has_the_accuracy_of_fasts_scale():
     np.testing.assert_allclose(made.decode(tokens, time_horizon=7), made.decode(tokens)[:, :7])
 
 
+@pytest.mark.parametrize("scale", [0.0, -1.0, 0.07, np.nan, np.inf])
+def test_a_scale_without_a_tolerance_is_refused_by_its_name(scale):
+    chunks = list(motions(60)[0].numpy())
+    with pytest.raises(ValueError, match=f"scale must be above 0.07 and finite, got {scale}"):
+        ActionProcessor.fit(chunks, scale=scale)
+
+
 @pytest.mark.slow
 def test_lerobot_measures_a_processor(processor):
     from lerobot.scripts.lerobot_train_tokenizer import compute_compression_stats
