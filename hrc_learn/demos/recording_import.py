@@ -257,8 +257,10 @@ def _images(images: Field, index: Int64[np.ndarray, " frames"]) -> Iterator[Imag
             if images.kind == "encoded":
                 image = decode_image(bytes(image))
             elif image.dtype != np.uint8:
-                # Images of real numbers range from 0 to 1 or from 0 to 255.
-                scale = scale or (255.0 if float(batch.max()) <= 1.0 else 1.0)
+                # Images of real numbers range from 0 to 1 or from 0 to 255. Black ones, which
+                # may come first, do not tell.
+                if not scale and (largest := float(batch.max())) > 0:
+                    scale = 255.0 if largest <= 1.0 else 1.0
                 image = np.clip(np.rint(image * scale), 0, 255).astype(np.uint8)
             rgb = _rgb(image)
             yield rgb[: len(rgb) // 2 * 2, : rgb.shape[1] // 2 * 2]

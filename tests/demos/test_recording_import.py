@@ -50,6 +50,15 @@ def test_images_of_any_form_become_rgb(pixels, first):
     assert {int(v) for image in shown for v in image.ravel()} == {first}
 
 
+@pytest.mark.parametrize(("brightest", "first"), [(1.0, 255), (200.0, 200)])
+def test_black_images_at_the_beginning_do_not_decide_on_the_range(brightest, first):
+    pixels = np.zeros((70, 16, 16, 3), np.float32)
+    pixels[40:] = brightest
+    shown = np.stack([*_images(array_field("rgb", pixels), np.arange(70))])
+    assert not shown[:40].any()
+    assert (shown[40:] == first).all()
+
+
 def test_the_next_state_is_the_action_where_none_was_recorded():
     time = np.arange(4.0)
     q = np.arange(8.0).reshape(4, 2)
