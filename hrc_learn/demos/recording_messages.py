@@ -7,14 +7,14 @@ import base64
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import compress, islice
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.recording_files import Field, StreamRead
+from hrc_learn.demos.recording_files import Field, StreamRead, longest_hold
 from hrc_learn.demos.videos import Image, decode_image, rgb_image
 
 _JOINTS = {"position": "joint_positions", "velocity": "joint_velocities"}
@@ -108,7 +108,9 @@ def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
-    """Poses in the base frame of tools and of frames without children, from `/tf` topics."""
+    """Poses in the base frame of tools and of frames without children, from `/tf` topics. Times
+    at which a moving frame on the way has been silent for too long are left out.
+    """
     parents = {child: parent for parent, child in edges}
     moving = {c for (_, c), rows in edges.items() if np.ptp([r[2] for r in rows], axis=0).any()}
     wanted = [c for c in parents if TOOL.search(c) or c not in parents.values()]
@@ -126,13 +128,17 @@ def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, T
         rows = [edges[parents[c], c] for c in links]
         main = max((r for c, r in zip(links, rows, strict=True) if c in moving), key=len)
         times = np.array([r[1] or r[0] for r in main])
-        poses = np.broadcast_to(np.eye(4), (len(times), 4, 4))
+        poses, fresh = np.broadcast_to(np.eye(4), (len(times), 4, 4)), np.ones(len(times), bool)
         for frame, one in zip(links, rows, strict=True):
             own = np.array([r[1] or r[0] for r in one])
             at = np.maximum(np.searchsorted(own, times, side="right") - 1, 0)
             poses = np.stack([one[k if frame in moving else -1][2] for k in at]) @ poses
-        received, stamps, _ = map(list, zip(*main, strict=True))
-        paths[f"tf/{base}/{tip}"] = Topic(received=received, stamps=stamps, values=[*poses])
+            if frame in moving:
+                fresh &= times - own[at] <= longest_hold(own)
+        if fresh.any():
+            received, stamps, _ = map(list, zip(*compress(main, fresh), strict=True))
+            values = [*poses[fresh]]
+            paths[f"tf/{base}/{tip}"] = Topic(received=received, stamps=stamps, values=values)
     return paths
 
 

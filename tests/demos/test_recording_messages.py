@@ -169,6 +169,18 @@ def test_frames_of_a_slower_link_hold_their_last_transform():
     assert [m[:2, 3].tolist() for m in tool.values] == expected
 
 
+def test_a_frame_that_falls_silent_tells_of_no_more_poses():
+    """Its last transform would put the tool anywhere."""
+    edges = {("base", "a"): moving(0, 40), ("a", "tcp"): moving(1, 10)}
+    (tool,) = poses_of_frames(edges).values()
+    # The last transform, of 9.5 s, is held for three periods.
+    assert tool.stamps == [k + 0.5 for k in range(13)]
+    assert len(tool.received) == len(tool.values) == 13
+    assert tool.values[-1][:2, 3].tolist() == [12, 9]
+    edges["base", "a"] = moving(0, 40, late=90.0)  # both are never there together
+    assert poses_of_frames(edges) == {}
+
+
 def test_without_a_name_the_root_is_the_base_and_still_frames_are_none():
     edges = {("world", "a"): moving(0), ("a", "b"): fixed(0, 1, 0)}
     assert [*poses_of_frames(edges)] == ["tf/world/b"]

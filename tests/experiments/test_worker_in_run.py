@@ -148,9 +148,7 @@ def test_force_of_contacts_grows_with_the_speed_of_both_and_is_zero_without_cont
     assert pushed[found == 0].any()
     # Where no contact is allowed, any force exceeds the limit without bound.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "hrc_learn.experiments.surroundings.REGIONS", ("head",) * len(REGIONS)
-        )
+        patch.setattr("hrc_learn.experiments.surroundings.REGIONS", ("head",) * len(REGIONS))
         forbidden = near_worker(log, VISIT, arm, config, encoder_offset=np.zeros(7), loads={})
     np.testing.assert_array_equal(forbidden.force, np.where(found > 0, np.inf, 0.0))
 
