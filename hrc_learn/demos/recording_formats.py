@@ -202,7 +202,9 @@ def _attributes(attributes: Mapping[str, Any], details: dict[str, Any]) -> None:
                 details.setdefault("task", _text(value))
             elif key in (*_RATES, "dt"):
                 number = float(np.asarray(value).item())
-                details.setdefault("fps", 1 / number if key == "dt" else number)
+                rate = 1 / number if key == "dt" else number
+                if 0 < rate < np.inf:
+                    details.setdefault("fps", rate)
 
 
 def read_zarr(path: Path) -> list[Recording]:

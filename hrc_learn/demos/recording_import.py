@@ -149,6 +149,10 @@ def plan_import(
         DatasetError: A file cannot be read, or its content is not understood.
     """
     recordings = [one for path in paths for one in open_recordings(path, columns)]
+    read = {name.rpartition("/")[2] for one in recordings for name in one.fields}
+    if columns and read.isdisjoint(columns):
+        text = "name no columns of the files, which name their own"
+        raise ValueError(f"{', '.join(columns)} (--columns) {text}: leave them out")
     if not recordings:
         raise DatasetError("holds no episodes", file=paths[0])
     meaning = understand(recordings, options, hinted=bool(columns))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hrc_learn.demos import DatasetError
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.recording_files import Recording, array_field
-from hrc_learn.demos.recording_import import ImportPlan, _images, _with_next_states
+from hrc_learn.demos.recording_import import ImportPlan, _images, _with_next_states, plan_import
 from hrc_learn.demos.recording_meaning import understand
 from hrc_learn.demos.recording_names import ImportOptions
 
@@ -104,6 +104,17 @@ def test_a_preview_counts_and_names_ranges_of_fields():
     assert "no commands were recorded: the dataset has no actions" in [*bare.lines(False)]
     sure = [line.split() for line in bare.lines() if line.startswith("qpos")]
     assert sure[0][:6] == ["qpos", "joint_position", "of", "3", "rad", "95"]
+
+
+def test_names_of_columns_that_no_file_takes_are_refused(tmp_path):
+    np.savez(tmp_path / "own.npz", qpos=Q, time=np.arange(len(Q)))
+    named = ImportOptions(fps=10)
+    with pytest.raises(ValueError, match=r"x, y \(--columns\) name no columns of the files"):
+        plan_import([tmp_path / "own.npz"], named, ["x", "y"])
+    np.save(tmp_path / "bare.npy", Q)
+    files = [tmp_path / "bare.npy"]
+    names = [f"j{k}" for k in range(Q.shape[1])]
+    assert {*names} <= {*plan_import(files, named, names).recordings[0].fields}
 
 
 def test_a_value_that_is_not_finite_is_named_with_its_frame():
