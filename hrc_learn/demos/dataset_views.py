@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.kinematic_evidence import arm_columns
+from hrc_learn.demos.read.quantities import DIMENSIONS
 from hrc_learn.demos.read.source import DemonstrationSource
 from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.kinematics import Arm, ArmChoice
@@ -96,7 +97,8 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
     )
 
 
-_MOTIONS = {"measured": "joint_position", "commanded": "command_position"}
+_MEASURED = "joint_position"
+_MOTIONS = {"measured": _MEASURED, "commanded": "command_position"}
 
 
 class Chart(NamedTuple):
@@ -130,13 +132,18 @@ def demonstration_charts(
         units: Quantity -> its unit in the dataset.
     """
     for k, joint in enumerate(demo.joint_names):
-        lines = {
-            name: values[:, k] / own_unit(units, role, k)[1]
-            for name, role in _MOTIONS.items()
-            if (values := getattr(demo, role)) is not None
-        }
-        if lines:
-            yield Chart(f"joint_{k}", joint, own_unit(units, "joint_position", k)[0], lines)
+        charts: dict[tuple[bool, bool], tuple[str, float, dict[str, Any]]] = {}
+        for name, role in _MOTIONS.items():
+            if (values := getattr(demo, role)) is not None:
+                unit, factor = own_unit(units, role if role in units else _MEASURED, k)
+                # Commands of the same quantity are shown in the unit of the measured joint.
+                kind = unit in DIMENSIONS["ratio"], unit.endswith("/step")
+                unit, factor, lines = charts.setdefault(kind, (unit, factor, {}))
+                lines[name] = values[:, k] / factor
+        for key, (unit, _, lines) in zip(
+            (f"joint_{k}", f"command_{k}"), charts.values(), strict=False
+        ):
+            yield Chart(key, joint, unit, lines)
     if demo.gripper is not None:
         unit, factor = own_unit(units, "gripper", 0)
         lines = {"opening": demo.gripper.reshape(len(demo)) / factor}

@@ -136,8 +136,19 @@ def test_charts_are_in_the_units_of_the_dataset():
         ("effort", "Effort of the person", "N m"),
     ]
     np.testing.assert_allclose(charts["joint_0"].lines["measured"], np.rad2deg(q[:, 0]))
-    # Its unit is not known: commands stay in radians.
-    np.testing.assert_allclose(charts["joint_0"].lines["commanded"], q[:, 0] + 1)
+    # Commands are shown in the unit of the joint, whatever theirs is on disk.
+    np.testing.assert_allclose(charts["joint_0"].lines["commanded"], np.rad2deg(q[:, 0] + 1))
+    own = units | {"command_position": unit("command_position", "0.5 rad")}
+    (again, *_) = demonstration_charts(demo, own)
+    assert again.unit == "deg"
+    np.testing.assert_allclose(again.lines["commanded"], np.rad2deg(q[:, 0] + 1))
+    # Fractions of a range, or changes, are another quantity.
+    for other, factor in (("%", 100.0), ("deg/step", 180 / np.pi)):
+        own["command_position"] = unit("command_position", other)
+        joint, command, *_ = demonstration_charts(demo, own)
+        assert (joint.key, command.key, command.unit) == ("joint_0", "command_0", other)
+        assert ([*joint.lines], [*command.lines]) == (["measured"], ["commanded"])
+        np.testing.assert_allclose(command.lines["commanded"], factor * (q[:, 0] + 1))
     np.testing.assert_allclose(charts["joint_1"].lines["measured"], q[:, 1])
     np.testing.assert_allclose(charts["gripper"].lines["opening"], 40 + 1000 * time)
     np.testing.assert_allclose(charts["position"].lines["z"], p[:, 2])
