@@ -36,7 +36,7 @@ from hrc_learn.skills.visual_target import VisualTarget, object_heading
 from hrc_learn.skills.work_cell import (
     CellReading,
     HiddenMarkerError,
-    MissedTargetError,
+    MissedGraspError,
     WorkCell,
 )
 from hrc_learn.vision.camera_model import IMAGE_SIZE
@@ -606,7 +606,7 @@ class VisualServo:
 
         Raises:
             HiddenMarkerError: The marker stays undetected.
-            MissedTargetError: The timeout is over, or the predicted error above the object
+            MissedGraspError: The timeout is over, or the predicted error above the object
                 stays too large.
         """
         begun, start, config = self._cell.time, self._clock, self._config
@@ -624,7 +624,7 @@ class VisualServo:
             error = self._law.uncertainty(self.state, target)
             if error <= config.object_error:
                 return reached - begun
-        raise MissedTargetError(
+        raise MissedGraspError(
             f"visual servoing: after {config.max_probes} probes the end effector may still be "
             f"{1e3 * error:.1f} mm off the object, more than {1e3 * config.object_error:.1f}: "
             "check that the camera stands still and the marker is in view."
@@ -715,7 +715,7 @@ class VisualServo:
                 "the object nearer to the middle of the image."
             )
         if spent > config.timeout:
-            raise MissedTargetError(
+            raise MissedGraspError(
                 f"visual servoing: after {spent:.0f} s the marker is still "
                 f"{self.error(target):.1f} px from its target (NaN: not detected)."
             )

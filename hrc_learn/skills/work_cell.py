@@ -69,12 +69,7 @@ class TaskFailedError(RuntimeError):
 
 
 Mishap = Literal[
-    "object not detected",
-    "marker occluded",
-    "target not reached",
-    "missed grasp",
-    "dropped object",
-    "blocked path",
+    "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
 ]
 """Kinds of failures from which a job recovers."""
 
@@ -85,13 +80,7 @@ class MissedGraspError(TaskFailedError):
     mishap: Mishap = "missed grasp"
 
 
-class MissedTargetError(MissedGraspError):
-    """Visual servoing did not bring the end effector to its target."""
-
-    mishap = "target not reached"
-
-
-class HiddenMarkerError(MissedTargetError):
+class HiddenMarkerError(MissedGraspError):
     """The end effector's marker stayed undetected."""
 
     mishap = "marker occluded"

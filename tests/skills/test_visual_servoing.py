@@ -404,5 +404,5 @@ def test_it_gives_up_after_its_own_time_and_counts_no_time_of_people(
     with shapes_unchecked(), pytest.raises(MissedGraspError, match=text) as raised:
         VisualServo(cell, step).servo_to(target_above())
     hidden = "was not detected" in text
-    assert raised.value.mishap == ("marker occluded" if hidden else "target not reached")
+    assert raised.value.mishap == ("marker occluded" if hidden else "missed grasp")
     assert cell.time - begun == pytest.approx(passed, abs=0.05)
