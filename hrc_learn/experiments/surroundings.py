@@ -15,6 +15,7 @@ from hrc_learn.dmp import InteractionPrimitive
 from hrc_learn.geometry import Box, Pose, minimum_jerk, quaternion
 from hrc_learn.jacobian.perspective import MARKER
 from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, separation
+from hrc_learn.kinematics.collision import segment_distance
 from hrc_learn.log import LoggedSteps
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import (
@@ -102,7 +103,7 @@ _ARRANGEMENTS = 10_000
 _ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
 # Distance that people keep from a resting arm that they see, the thickness of a sleeve [m];
 # time between checks of this distance [s]; and workers drawn until one can reach and keep it.
-_KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 200
+_KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 60
 # Drawn workers of whom at least one can reach under the arm: where there is room, one in three.
 _HOPELESS = 30
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
@@ -220,6 +221,7 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
     # -x is there. Then they are turned back.
     table = workplace.scene.table
     arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
+    links = arm.segments(waiting)[:, None]
     origins = workplace.robot.joint_origins(waiting)
     lengths = (origins[1:] - origins[:-1]).norm(dim=-1)
     # The forearm is the last long link.
@@ -236,8 +238,8 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
         def is_clear(ends: Float[np.ndarray, "time parts 2 3"], radius=radius) -> bool:
             """True if the body stays clear of the arm that waits, as people do."""
             there = torch.from_numpy(turned_about_base(ends, np.pi / 2))
-            found = separation(arm, waiting, there, radius)
-            return bool((found.distance >= _KEPT_CLEAR).all())
+            apart = segment_distance(links, there.unsqueeze(-4))
+            return bool((apart >= arm.radius[:, None] + radius + _KEPT_CLEAR).all())
 
         try:
             visit = random_visit(
