@@ -219,10 +219,8 @@ class ConstraintConfig:
     control step."""
 
     def __post_init__(self):
-        positive = "rate", "task_weight", "path_weight", "distance_weight"
+        positive = "rate", "task_weight", "path_weight", "distance_weight", "steps"
         check_settings(self, positive=positive, not_negative=["clearance"])
-        if self.steps < 1:
-            raise ValueError(f"steps must be at least 1, but is {self.steps}")
 
     @property
     def path_cost(self) -> float:

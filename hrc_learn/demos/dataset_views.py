@@ -140,9 +140,8 @@ def demonstration_charts(
                 kind = unit in DIMENSIONS["ratio"], unit.endswith("/step")
                 unit, factor, lines = charts.setdefault(kind, (unit, factor, {}))
                 lines[name] = values[:, k] / factor
-        for key, (unit, _, lines) in zip(
-            (f"joint_{k}", f"command_{k}"), charts.values(), strict=False
-        ):
+        keys = f"joint_{k}", f"command_{k}"
+        for key, (unit, _, lines) in zip(keys, charts.values(), strict=False):
             yield Chart(key, joint, unit, lines)
     if demo.gripper is not None:
         unit, factor = own_unit(units, "gripper", 0)

@@ -24,8 +24,7 @@ from jaxtyping import Float
 from hrc_learn.distributed import ByValue, worker_pool
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice
-from hrc_learn.sim import PhysicsError
-from hrc_learn.sim.step_checks import PhysicsWatch
+from hrc_learn.sim.step_checks import PhysicsError, PhysicsWatch
 from hrc_learn.teleoperation.scenarios import SCENARIOS, ScenarioRun, make_scenario
 
 # pyright: reportAttributeAccessIssue=false

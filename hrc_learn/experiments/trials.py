@@ -88,9 +88,6 @@ class TrialFile(Claim):
             self.release()
             raise
 
-    def __enter__(self) -> "TrialFile":
-        return self
-
     def append(self, trial: Trial) -> None:
         """Add a trial; it is on disk when this method returns."""
         with naming(self._path), self._path.open("a", encoding="utf-8") as file:

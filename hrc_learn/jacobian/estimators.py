@@ -29,8 +29,8 @@ from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_c
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import chosen, pytree
 
-# Shortest motion between key frames that counts as motion [m].
-_LEAST_MOTION = 1e-12
+# Shorter motions between key frames count as rest [m].
+_REST = 1e-12
 
 
 @pytree
@@ -308,8 +308,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         twist = key.pose.twist_to(measurement.pose)
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
         # At rest there is nothing to learn from, even where every frame is a key frame.
-        least = max(config.min_step, _LEAST_MOTION)
-        moved = measurement.valid & key.present & (distance >= least)
+        moved = measurement.valid & key.present & (distance >= max(config.min_step, _REST))
         valid = moved & (distance <= config.max_step)
         now, before = map(self.network.first_pixel, (measurement.pose, key.pose))
         explained = 0.0 if now is None or before is None else now - before
@@ -462,7 +461,7 @@ class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     ) -> KeyFrameState:
         """State after an update with a new pair, if there is a pair."""
         # dr is zero without a pair; the floor avoids 0 / 0.
-        size = pair.dr.square().sum(-1).clamp_min((_LEAST_MOTION / 2) ** 2)
+        size = pair.dr.square().sum(-1).clamp_min(_REST**2 / 4)
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
         return replace(state, weight=state.weight + self.along(step, pair))
 

@@ -112,12 +112,10 @@ class RBFImageJacobian(nn.Module):
             reference = reference.detach().clone().to(centers)
         self.register_buffer("reference", reference)
         self.register_buffer("covariance", None)
-        none = camera is None
-        self.register_buffer("camera", None if none else camera.camera.to(centers))
-        spread = None if none else camera.covariance.to(centers)
-        self.register_buffer("camera_covariance", spread)
-        if weight is None:
-            weight = centers.new_zeros(12, len(centers))
+        found = (None, None) if camera is None else (camera.camera, camera.covariance)
+        for name, value in zip(("camera", "camera_covariance"), found, strict=True):
+            self.register_buffer(name, None if value is None else value.to(centers))
+        weight = centers.new_zeros(12, len(centers)) if weight is None else weight
         self.weight = nn.Parameter(weight.detach().clone().to(centers))
         self.report: ImageJacobianFitReport | None = None
 

@@ -163,8 +163,7 @@ def marked_plate(size: float = 1.0, thickness: float = 0.0) -> Plate:
     )
 
 
-def _marked_arm() -> ArmModelConfig:
-    return ArmModelConfig(robot=panda, marker=marked_plate())
+_ARM = ArmModelConfig(robot=panda, marker=marked_plate())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +231,7 @@ class UnmarkedLook:
 class SceneConfig:
     """Everything that stands in the workplace."""
 
-    arm: ArmModelConfig = field(default_factory=_marked_arm)
+    arm: ArmModelConfig = _ARM
     table: Box = _TABLE
     cabinet: CabinetConfig = field(default_factory=CabinetConfig)
     objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)

@@ -76,13 +76,7 @@ class World:
         self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, ("link0",))
         workers = WORKER_BODIES if self.config.worker is not None else ()
         self.worker_contacts = ContactMonitor(self.model, (*_ARM_BODIES, *objects), workers)
-        self._monitors = (
-            self.cabinet_contacts,
-            self.object_contacts,
-            self.table_contacts,
-            self.self_contacts,
-            self.worker_contacts,
-        )
+        self._monitors = [x for x in vars(self).values() if isinstance(x, ContactMonitor)]
         self._pads = {self.model.geom(pad).id for pad in _PADS}
         self._watched = np.logical_or.reduce([monitor.watched for monitor in self._monitors])
         self._worker = np.array([self.model.body(name).mocapid[0] for name in workers], int)

@@ -71,7 +71,7 @@ class Claim:
                     self.release()
                 raise
 
-    def __enter__(self) -> "Claim":
+    def __enter__[C: Claim](self: C) -> C:
         return self
 
     def __exit__(self, *_: object) -> None:

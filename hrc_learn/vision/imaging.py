@@ -30,10 +30,8 @@ class ImageNoise:
     """Standard deviation of the noise, in grey levels of 255; 0 switches it off."""
 
     def __post_init__(self) -> None:
-        if min(self.blur, self.noise) < 0:
-            raise ValueError(
-                f"blur and noise must not be negative, but are {self.blur} and {self.noise}."
-            )
+        if not (self.blur >= 0 and self.noise >= 0):
+            raise ValueError(f"blur and noise must not be negative: {self.blur}, {self.noise}.")
 
     def degrade(
         self, image: UInt8[np.ndarray, "h w 3"], rng: np.random.Generator
