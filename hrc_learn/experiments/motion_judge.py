@@ -144,10 +144,8 @@ class SceneJudge:
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float, widest: float):
         """Read the scene."""
         if not Path(config.scene).is_file():
-            known = ", ".join(SCENARIOS)
-            raise FileNotFoundError(
-                f"no scene {config.scene!r}: there are {known}, or an MJCF file"
-            )
+            known = f"there are {', '.join(SCENARIOS)}, or an MJCF file"
+            raise FileNotFoundError(f"no scene {config.scene!r}: {known}")
         self.model = model = mujoco.MjModel.from_xml_path(config.scene)
         self.data, self._config = mujoco.MjData(model), config
         self._watch = PhysicsWatch(model, self.data)

@@ -174,10 +174,8 @@ def repeat(
 
     seeds = list(dict.fromkeys(seeds))
     if not seeds or processes < 1:
-        raise ValueError(
-            f"at least one seed and one process are needed, but there are {len(seeds)} and "
-            f"{processes}."
-        )
+        counts = f"{len(seeds)} and {processes}"
+        raise ValueError(f"at least one seed and one process are needed, not {counts}.")
     with TrialFile(file, made_by) as done:
         waiting = [seed for seed in seeds if seed not in done.trials]
         trials = _trials(run, waiting, min(processes, len(waiting)), failures)

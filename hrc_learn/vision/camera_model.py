@@ -50,11 +50,9 @@ class CameraModel:
                 f"identity by {np.abs(R @ R.T - np.eye(3)).max():.2g} and det R is "
                 f"{np.linalg.det(R):.3g}. CameraModel.look_at() builds a pose from two points."
             )
-        if min(self.width, self.height, *self.focal) <= 0:
-            raise ValueError(
-                "width, height and focal must be positive, but are "
-                f"{self.width}, {self.height} and {self.focal}."
-            )
+        sizes = self.width, self.height, self.focal
+        if not min(self.width, self.height, *self.focal) > 0:
+            raise ValueError(f"width, height and focal must be positive, but are {sizes}.")
 
     def look_at(
         self, eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, roll: float = 0.0
