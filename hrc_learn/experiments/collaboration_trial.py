@@ -191,10 +191,8 @@ def simulate_collaboration(
     scenario = scenario or CollaborationScenario()
     workplace = (workplace or Workplace()).approached(aiming.approach)
     if not len(shelves) == len(workplace.scene.objects) == len(set(shelves)):
-        raise ValueError(
-            f"each of the {len(workplace.scene.objects)} objects needs a shelf of its own, but "
-            f"the shelves are {', '.join(shelves)}."
-        )
+        text = f"each of the {len(workplace.scene.objects)} objects needs a shelf of its own,"
+        raise ValueError(f"{text} but the shelves are {', '.join(shelves)}.")
     if scenario.worker and scenario.handover:
         raise ValueError("only one person can come: give --worker or --handover, not both.")
     rng, sizes = np.random.default_rng(seed), scenario.imperfections

@@ -217,10 +217,8 @@ def demonstrated_path(
     """
     joints = demonstration.joint_position
     if joints is None or demonstration.joint_names != chain.joint_names:
-        raise ValueError(
-            f"the demonstrations have the joints {demonstration.joint_names}, but the arm has "
-            f"{chain.joint_names}: give demonstrations of this arm."
-        )
+        text = f"the demonstrations have the joints {demonstration.joint_names}, but the arm"
+        raise ValueError(f"{text} has {chain.joint_names}: give demonstrations of this arm.")
     return chain.forward(torch.from_numpy(joints)).position.numpy()
 
 

@@ -88,10 +88,8 @@ def access_by(
     if driver == "sim":
         return SIMULATED
     if not robot.is_franka:
-        raise ValueError(
-            f"--arm {driver} drives Franka arms only, not the {robot.name}: leave it out to "
-            "simulate without a driver."
-        )
+        text = f"--arm {driver} drives Franka arms only, not the {robot.name}: leave it out to"
+        raise ValueError(f"{text} simulate without a driver.")
 
     def connected(address: str) -> Any:
         # No real-time check: a server that waits for each answer does not need it.

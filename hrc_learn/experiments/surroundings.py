@@ -142,10 +142,8 @@ def workplace_for(shelves: Sequence[str], robot: Arm) -> Workplace:
         ValueError: If no shelf is named, or more shelves than there are objects.
     """
     if not 1 <= len(shelves) <= len(THREE_OBJECTS):
-        raise ValueError(
-            f"{len(shelves)} shelves are named, but there are 1 to {len(THREE_OBJECTS)} "
-            "objects, each with a shelf of its own."
-        )
+        text = f"{len(shelves)} shelves are named, but there are 1 to {len(THREE_OBJECTS)}"
+        raise ValueError(f"{text} objects, each with a shelf of its own.")
     items = [item.scaled(robot.hand_size) for item in THREE_OBJECTS[: len(shelves)]]
     return with_objects(Workplace.of(robot), items)
 
@@ -177,10 +175,8 @@ def draw_object_poses(
                 )
                 for item, position in zip(items, positions, strict=True)
             }
-    raise ValueError(
-        f"{len(items)} objects do not fit within {reach[0]:g} and {reach[1]:g} m of the "
-        "middle with clearance for the fingers: use fewer objects."
-    )
+    text = f"{len(items)} objects do not fit within {reach[0]:g} and {reach[1]:g} m of the"
+    raise ValueError(f"{text} middle with clearance for the fingers: use fewer objects.")
 
 
 def points_to_see(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:

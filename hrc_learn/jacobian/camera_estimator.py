@@ -177,10 +177,8 @@ class CameraEstimator(ImageJacobianEstimator):
         super().__init__(network)
         self.config = config = config or CameraConfig()
         if network.camera is None or network.camera_covariance is None:
-            raise ValueError(
-                "the image Jacobian has no camera: fit it again with `hrc fit image-jacobian`, "
-                "or choose another estimator."
-            )
+            text = "the image Jacobian has no camera: fit it again with `hrc fit"
+            raise ValueError(f"{text} image-jacobian`, or choose another estimator.")
         camera, K = network.camera, len(network.centers)
         known = network.camera_covariance[_KNOWN][:, _KNOWN]
         widened = [0.0] * 4 + [config.marker**2] * 3

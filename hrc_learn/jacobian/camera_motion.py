@@ -152,10 +152,8 @@ class CameraReference:
             ValueError: There are fewer than two demonstrations, or they hardly show the marker.
         """
         if len(demonstrations) < 2:
-            raise ValueError(
-                f"a camera's reference needs two demonstrations or more, to hold one out; got "
-                f"{len(demonstrations)}."
-            )
+            text = "a camera's reference needs two demonstrations or more, to hold one out;"
+            raise ValueError(f"{text} got {len(demonstrations)}.")
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}.")
         largest, folds = 0.0, min(FOLDS, len(demonstrations))
@@ -168,10 +166,8 @@ class CameraReference:
                     watch.update(k / fps, demo.pose[k], demo.feature[k])
                     largest = max(largest, watch.displacement)
         if not largest:
-            raise ValueError(
-                f"no demonstration shows the marker {FEWEST_FRAMES} times within {_WINDOW} s: "
-                "record some in which the camera sees the marker."
-            )
+            text = f"no demonstration shows the marker {FEWEST_FRAMES} times within {_WINDOW}"
+            raise ValueError(f"{text} s: record some in which the camera sees the marker.")
         return _reference(demonstrations, image_size, _MARGIN * largest)
 
 
@@ -241,16 +237,12 @@ class CameraWatch:
             ValueError: Time or pixel are not finite, or time does not increase.
         """
         if not (np.isfinite(time) and bool(pixel.isfinite().all())):
-            raise ValueError(
-                f"time and pixel must be finite, got {time} and {pixel.tolist()}: leave out "
-                "frames without the marker."
-            )
+            text = f"time and pixel must be finite, got {time} and {pixel.tolist()}: leave out"
+            raise ValueError(f"{text} frames without the marker.")
         frames = self._frames
         if frames and not time > frames[-1][0]:
-            raise ValueError(
-                f"time must increase, but {time} follows {frames[-1][0]}: call clear() "
-                "between episodes."
-            )
+            text = f"time must increase, but {time} follows {frames[-1][0]}: call clear()"
+            raise ValueError(f"{text} between episodes.")
         camera, point = self._camera, _marker_point(self._camera, pose)
         if self.reference.covers(point):
             frames.append((time, point, pixel.double()))
@@ -468,10 +460,8 @@ def object_height(
         offset = offset + torch.linalg.pinv(jacobian) @ errors.flatten()
     off = _root_mean_square(errors)
     if not off <= _AGREEMENT:
-        raise ValueError(
-            f"object pixels and grasp positions disagree by {off:.0f} px: they belong to "
-            "different objects, or the objects were moved in between."
-        )
+        text = f"object pixels and grasp positions disagree by {off:.0f} px: they belong to"
+        raise ValueError(f"{text} different objects, or the objects were moved in between.")
     return float((places + offset)[:, 2].mean())
 
 

@@ -236,10 +236,8 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         super().__init__(network)
         # Equal weights of all normalised neurons give a constant Jacobian.
         if self.constant and not network.normalized:
-            raise ValueError(
-                f"{type(self).__name__} adds a constant, which only normalised neurons "
-                "can represent: build the network with normalized=True."
-            )
+            text = f"{type(self).__name__} adds a constant, which only normalised neurons"
+            raise ValueError(f"{text} can represent: build the network with normalized=True.")
         self.config = config
         scale = component_scale(network.centers, config.rotation_scale)
         bound = config.weight_bound * scale.repeat(network.rows).unsqueeze(-1)

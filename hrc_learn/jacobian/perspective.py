@@ -271,10 +271,8 @@ def fit_camera(
     """
     pose, pixel = _sampled(demonstrations)
     if len(pixel) < 10:
-        raise ValueError(
-            f"the marker is visible in {len(pixel)} frames of the demonstrations, but a camera "
-            "needs ten or more: record with the marker in view."
-        )
+        text = f"the marker is visible in {len(pixel)} frames of the demonstrations, but a"
+        raise ValueError(f"{text} camera needs ten or more: record with the marker in view.")
     prior, spread = _prior(image_size)
     width = image_size[0]
     few = slice(None, None, -(-len(pixel) // _FEW_FRAMES))

@@ -262,10 +262,8 @@ class Arm(SerialChain):
         """
         task = task or self.task
         if q7 is not None and (self._closed_form is None or task != self.task):
-            raise ValueError(
-                f"{self.name} has no closed-form inverse for the task {task!r}, so q7 does not "
-                "apply: pass near= to choose among its solutions."
-            )
+            text = f"{self.name} has no closed-form inverse for the task {task!r}, so q7 does"
+            raise ValueError(f"{text} not apply: pass near= to choose among its solutions.")
         shapes = [pose.position.shape[:-1], pose.orientation.shape[:-1]]
         batch = np.broadcast_shapes(*shapes, () if q7 is None else as_tensor(q7).shape)
         if near is None and batch and math.prod(batch):
@@ -403,10 +401,8 @@ class Arm(SerialChain):
         """
         n = self.joints
         if n < _FEWEST_JOINTS:
-            raise ValueError(
-                f"{self.name} has {n} joints, but grasping and placing need position, tilt and "
-                f"turn of the tool: at least {_FEWEST_JOINTS} joints."
-            )
+            text = f"{self.name} has {n} joints, but grasping and placing need position, tilt"
+            raise ValueError(f"{text} and turn of the tool: at least {_FEWEST_JOINTS} joints.")
         flange, tcp = self.flange, self.tcp.clone()
         links = [capsule for capsule in self.whole.capsules if capsule.link <= n]
         if mount is not None:

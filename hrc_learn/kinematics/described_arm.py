@@ -163,10 +163,8 @@ def _ready(
         wrong = next(
             i for i, x in enumerate(ready) if not limits.lower[i] <= x <= limits.upper[i]
         )
-        raise ValueError(
-            f"ready posture: joint {names[wrong]} at {ready[wrong]:g} is outside its limits "
-            f"{limits.lower[wrong]:g} to {limits.upper[wrong]:g}"
-        )
+        text = f"ready posture: joint {names[wrong]} at {ready[wrong]:g} is outside its limits"
+        raise ValueError(f"{text} {limits.lower[wrong]:g} to {limits.upper[wrong]:g}")
     return ready
 
 

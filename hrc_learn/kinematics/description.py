@@ -217,10 +217,8 @@ class Description:
     def _check_lengths(self, what: str, pose: Transform) -> None:
         furthest = np.abs(pose[:3, 3]).max()
         if not furthest < _FURTHEST:
-            raise ValueError(
-                f"{self.path}: {what} is {furthest:.3g} m from the frame that carries it: "
-                "lengths are in metres"
-            )
+            text = f"{self.path}: {what} is {furthest:.3g} m from the frame that carries it:"
+            raise ValueError(f"{text} lengths are in metres")
 
     @property
     def roots(self) -> list[str]:
@@ -263,10 +261,8 @@ class Description:
         """
         for role, name in (("base", base), ("tip", tip)):
             if name is not None and name not in self.links:
-                raise ValueError(
-                    f"{self.path} has no link {name!r} to be the {role}; its links are "
-                    f"{', '.join(self.links)}"
-                )
+                text = f"{self.path} has no link {name!r} to be the {role}; its links are"
+                raise ValueError(f"{text} {', '.join(self.links)}")
         if base is None and len(self.roots) > 1:
             raise ValueError(
                 f"{self.path} is in several pieces, since no joint carries the links "
@@ -320,10 +316,8 @@ class Description:
         if not frames:
             raise ValueError(f"{self.path}: no joint moves a link that hangs on {base!r}")
         if len(frames) > 1:
-            raise ValueError(
-                f"{self.path} has several ends; say which is the tool (tip=, FILE:TIP), the "
-                f"likeliest first: {', '.join(frames)}"
-            )
+            text = f"{self.path} has several ends; say which is the tool (tip=, FILE:TIP), the"
+            raise ValueError(f"{text} likeliest first: {', '.join(frames)}")
         if fingers:
             names = ", ".join(joint.name for joint in fingers)
             warnings.warn(

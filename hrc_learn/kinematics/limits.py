@@ -44,10 +44,8 @@ class MotionLimits:
 
     def __post_init__(self):
         if (self.velocity_offset is None) != (self.deceleration is None):
-            raise ValueError(
-                "velocity_offset and deceleration define position-dependent velocity limits: "
-                "give both, or neither"
-            )
+            text = "velocity_offset and deceleration define position-dependent velocity limits:"
+            raise ValueError(f"{text} give both, or neither")
 
     def slowed[Limits: MotionLimits](self: Limits, fraction: float) -> Limits:
         """Limits with the velocity limit multiplied by a fraction at every position."""
@@ -195,10 +193,8 @@ def complete_limits(
         turn = _TURN if kind == "continuous" else math.nan
         full = {"lower": -turn, "upper": turn, **given}
         if not -math.inf < full["lower"] < full["upper"] < math.inf:
-            raise ValueError(
-                f"{source}: joint {name} has the range {given.get('lower')} to "
-                f"{given.get('upper')}; {advice}"
-            )
+            text = f"{source}: joint {name} has the range {given.get('lower')} to"
+            raise ValueError(f"{text} {given.get('upper')}; {advice}")
         slides = kind == "prismatic"
         full.setdefault("velocity", DEFAULT_SLIDING_VELOCITY if slides else DEFAULT_VELOCITY)
         full.setdefault("acceleration", full["velocity"] / _SECONDS_TO_FULL_SPEED)
@@ -207,10 +203,8 @@ def complete_limits(
         for column in ("velocity", "acceleration", "jerk", "torque"):
             unlimited = column == "torque" and full[column] == math.inf
             if not (0 < full[column] < math.inf or unlimited):
-                raise ValueError(
-                    f"{source}: joint {name} has the {column} limit {full[column]:g}, which is "
-                    f"not positive and finite; {advice}"
-                )
+                text = f"{source}: joint {name} has the {column} limit {full[column]:g}, which"
+                raise ValueError(f"{text} is not positive and finite; {advice}")
         for column in _COLUMNS:
             table[column].append(float(full[column]))
     columns = {name: torch.tensor(row, dtype=torch.float64) for name, row in table.items()}

@@ -144,10 +144,8 @@ def arm(
         return arm_from_file(path, **choice)
     if found := installed_descriptions(name):
         if len(found) > 1:
-            raise ValueError(
-                f"several installed descriptions are named {name!r}: give one of the files "
-                f"{', '.join(map(str, found))}"
-            )
+            text = f"several installed descriptions are named {name!r}: give one of the files"
+            raise ValueError(f"{text} {', '.join(map(str, found))}")
         return arm_from_file(found[0], name=name, **choice)
     raise ValueError(
         f"no arm {name!r}: there are {', '.join(registered_arms())}, descriptions in installed "

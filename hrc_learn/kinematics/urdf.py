@@ -41,10 +41,8 @@ def read_urdf(path: Path) -> Description:
     """
     robot = _parsed(path)
     if robot.tag != "robot":
-        raise ValueError(
-            f"{path} is neither URDF nor MJCF: it begins with <{robot.tag}>, not with <robot> "
-            "or <mujoco>"
-        )
+        text = f"{path} is neither URDF nor MJCF: it begins with <{robot.tag}>, not with"
+        raise ValueError(f"{text} <robot> or <mujoco>")
     _check_texts(path, robot)
     reader = _Reader(path, robot)
     links = [reader.link(element) for element in robot.findall("link")]
@@ -83,10 +81,8 @@ def _check_texts(path: Path, robot: ElementTree.Element) -> None:
                 if "${" in text or "$(" in text:
                     left.append(text)
                 elif key not in _WORDS and _NOT_FINITE.search(text):
-                    raise ValueError(
-                        f"{path}: {part.tag} {part.get('name')} has {key}={text!r}, not finite "
-                        "numbers"
-                    )
+                    text = f"{path}: {part.tag} {part.get('name')} has {key}={text!r}, not"
+                    raise ValueError(f"{text} finite numbers")
     if left:
         raise ValueError(f"{path} holds {left[0]}: expand it with xacro first")
 
@@ -259,8 +255,6 @@ class _Reader:
             values = []
         # Python allows "_" between digits, URDF does not.
         if "_" in text or len(values) != count or not all(map(math.isfinite, values)):
-            raise ValueError(
-                f"{self.path}: {what} has {key}={text!r}, not {count} finite number"
-                f"{'s' if count > 1 else ''}"
-            )
+            text = f"{self.path}: {what} has {key}={text!r}, not {count} finite number"
+            raise ValueError(f"{text}{'s' if count > 1 else ''}")
         return np.array(values)

@@ -280,10 +280,8 @@ class VisionRegion(Region):
         far_edge = target.new_tensor(image_size).repeat(target.shape[-1] // 2) - 1
         half_size = torch.minimum(target, far_edge - target)
         if not bool((half_size > 0).all()):
-            raise ValueError(
-                f"the vision target must lie inside the image of {image_size[0]} x "
-                f"{image_size[1]} px, but is {target.tolist()}"
-            )
+            text = f"the vision target must lie inside the image of {image_size[0]} x"
+            raise ValueError(f"{text} {image_size[1]} px, but is {target.tolist()}")
         return cls(target=target, half_size=half_size)
 
     def value(self, x: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*both"]:

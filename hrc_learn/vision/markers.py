@@ -81,10 +81,8 @@ def marker_texture(id: int, pixels: int) -> UInt8[np.ndarray, "pixels pixels"]:
 
     module, rest = divmod(pixels, PLATE_MODULES)
     if module < 1 or rest:
-        raise ValueError(
-            f"pixels must be a positive multiple of {PLATE_MODULES}, the modules along the "
-            f"edge of a plate, but is {pixels}."
-        )
+        text = f"pixels must be a positive multiple of {PLATE_MODULES}, the modules along the"
+        raise ValueError(f"{text} edge of a plate, but is {pixels}.")
     inner = cv2.aruco.generateImageMarker(dictionary(), id, module * MODULES, borderBits=1)
     return np.pad(inner, module * QUIET_MODULES, constant_values=255)
 
