@@ -29,7 +29,7 @@ from hrc_learn.distributed import ByValue
 from hrc_learn.protocols import Arm, ArmState, Gripper
 from hrc_learn.watchdog import Watchdog, WatchdogError, bring_to_rest
 
-_STARTUP = 60.0
+_STARTUP = 180.0
 """Timeout for connecting [s]."""
 
 
