@@ -95,7 +95,7 @@ def test_a_camera_without_images_says_so():
         Ros2CameraConfig(topic="/nothing")
 
 
-CAMERA = "{type: ros2, topic: /front/image_raw, width: 64, height: 48}"
+CAMERA = "{type: ros2, topic: /front/image_raw, width: 64, height: 48, timeout: 30}"
 TELEOPERATOR = """
 import math, time
 from dataclasses import dataclass
@@ -129,40 +129,68 @@ class Wave(Device, Teleoperator):
 """
 
 
+ROBOT = (
+    "--robot.discover_packages_path=hrc_learn.lerobot",
+    *("--robot.type=ros2", "--robot.arm=panda", "--robot.fps=15", "--robot.timeout=1.0"),
+    f"--robot.cameras={{front: {CAMERA}}}",
+    "--play_sounds=false",
+)
+
+
 @pytest.mark.slow
-def test_lerobot_record_records_it(robot, images, tmp_path):
+def test_lerobot_records_it_and_rolls_a_policy_out(robot, images, tmp_path):
     from lerobot.datasets import LeRobotDataset
 
     (tmp_path / "lerobot_teleoperator_wave").mkdir()
     (tmp_path / "lerobot_teleoperator_wave/__init__.py").write_text(TELEOPERATOR)
-    root = str(Path(__file__).parents[2])
+    root = Path(__file__).parents[2]
     environment = os.environ | {
         "HF_HUB_OFFLINE": "1",
         "HF_LEROBOT_HOME": str(tmp_path / "home"),
+        "OMP_NUM_THREADS": "1",
         "PYTHONPATH": f"{root}:{tmp_path}",
     }
-    done = subprocess.run(
-        [
-            str(Path(sys.executable).parent / "lerobot-record"),
-            "--robot.discover_packages_path=hrc_learn.lerobot",
-            "--teleop.discover_packages_path=lerobot_teleoperator_wave",
-            *("--robot.type=ros2", "--robot.arm=panda", "--robot.fps=15"),
-            "--robot.timeout=1.0",
-            f"--robot.cameras={{front: {CAMERA}}}",
-            *("--teleop.type=wave", "--dataset.repo_id=local/wave"),
-            f"--dataset.root={tmp_path / 'set'}",
-            *("--dataset.single_task=wave", "--dataset.fps=15", "--dataset.num_episodes=1"),
-            *("--dataset.episode_time_s=4", "--dataset.reset_time_s=0"),
-            *("--dataset.push_to_hub=false", "--play_sounds=false"),
-        ],
-        env=environment,
-        capture_output=True,
-        text=True,
+
+    def run(*command):
+        words = list(map(str, command))
+        done = subprocess.run(words, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-3000:]
+
+    programs = Path(sys.executable).parent
+    run(
+        programs / "lerobot-record",
+        *ROBOT,
+        "--teleop.discover_packages_path=lerobot_teleoperator_wave",
+        *("--teleop.type=wave", "--dataset.repo_id=local/wave"),
+        f"--dataset.root={tmp_path / 'set'}",
+        *("--dataset.single_task=wave", "--dataset.fps=15", "--dataset.num_episodes=1"),
+        *("--dataset.episode_time_s=4", "--dataset.reset_time_s=0"),
+        "--dataset.push_to_hub=false",
     )
-    assert done.returncode == 0, done.stderr[-3000:]
     dataset = LeRobotDataset("local/wave", root=tmp_path / "set")
     assert len(dataset) > 20
     states = np.stack([dataset[k]["observation.state"].numpy() for k in range(len(dataset))])
     assert np.ptp(states[:, 0]) > 0.1
     image = 255 * dataset[5]["observation.images.front"].numpy()[:, 24, 32]
     np.testing.assert_allclose(image, COLOUR, atol=12)
+
+    fit = sys.executable, root / "training/fit_dmp.py", "--as-lerobot-policy"
+    run(*fit, "--dataset", tmp_path / "set", "--out", tmp_path / "policy")
+    positions, ended = [], threading.Event()
+
+    def watch():
+        while not ended.wait(0.02):
+            positions.append(robot.state.joint_position[0])
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    run(
+        programs / "lerobot-rollout",
+        *ROBOT,
+        f"--policy.path={tmp_path / 'policy'}",
+        *("--fps=15", "--duration=4", "--task=wave"),
+    )
+    ended.set()
+    watcher.join()
+    assert np.ptp(positions) > 0.1
+    assert robot.violations == 0
