@@ -24,7 +24,10 @@ class Region(ABC):
 
     @abstractmethod
     def value(self, x: Float[Tensor, "*batch n"]) -> Tensor:
-        """Region function f, at most zero inside: a scalar, or a value per component of x."""
+        """Region function f, a scalar or a value per component of x.
+
+        It is at most zero inside; that of `JointRegion` is at least zero inside.
+        """
 
     @abstractmethod
     def feedback(
@@ -341,7 +344,7 @@ class JointRegion(Region):
         return cls(centre=(lower + upper) / 2, half_range=(upper - lower) / 2, **options)
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both n"]:
-        """Region function f_i of every joint [rad] ("paper": [rad^2])."""
+        """Region function f_i of every joint, at least zero inside [rad] ("paper": [rad^2])."""
         return self._depths(self.half_range - (x - self.centre).abs())[0]
 
     def feedback(
