@@ -1,13 +1,13 @@
 """Compile a scalar program (see `scalar_program`) with LLVM, and run its machine code.
 
-For a batch, the code computes as many arms at once as a vector register holds numbers. The
-code is a sequence of short functions, so that the compile time is only proportional to the
-length of the program. A value that a later function reads is kept in a slot of the workspace, a
-small array that the caller provides.
+For a batch, the code computes as many arms at once as a vector register holds numbers; for one
+arm, successive elements of a tensor where their operands are successive or equal. The code is a
+sequence of short functions, so that the compile time is only proportional to the length of the
+program. A value that a later function reads is kept in a slot of the workspace, a small array
+that the caller provides.
 """
 
 import ctypes
-import heapq
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -33,10 +33,14 @@ _BUILT = {
     "or": ir.IRBuilder.or_, "not": ir.IRBuilder.not_, "select": ir.IRBuilder.select,
 }  # fmt: skip
 _ORDERED = {"gt": ">", "lt": "<", "ge": ">=", "le": "<=", "eq": "=="}
-# Comparisons that are also true if an operand is NaN.
-_UNORDERED = {"ne": "!=", "not gt": "<=", "not lt": ">=", "not ge": "<", "not le": ">"}
+# Operations that a processor computes for one number at a time.
+_SINGLE = {"sin", "cos", "exp", "log", "tanh", "asin", "acos", "atan", "atan2", "pow"}
+_TRUTH, _INDEX = ir.IntType(1), ir.IntType(32)
 # Names of LLVM's intrinsic functions, where they differ from ours.
 _INTRINSICS = {"abs": "fabs", "round": "roundeven"}
+
+type Unit = tuple[int, ...]
+"""Value numbers that one instruction computes, consecutive ones."""
 
 ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.
@@ -66,14 +70,13 @@ class NativeCode:
         self._program, self._vectors, self.lanes = program, tuple(vectors), lanes
         self._size = np.dtype(program.number).itemsize
         self._scalar = {8: ir.DoubleType(), 4: ir.FloatType()}[self._size]
-        self._number, self._truth, self._flag = (
-            kind if lanes == 1 else ir.VectorType(kind, lanes)
-            for kind in (self._scalar, ir.IntType(1), ir.IntType(8))
-        )
         self._module = ir.Module()
-        order = _depth_first(program)
+        self._unit = _units(program, wide=lanes == 1)
+        results = [x for rows in program.results.values() for x in rows]
+        last = [self._unit[x] for x in results if x in self._unit]
+        order = _depth_first(reads := _reads(program, self._unit), last)
         chunks = [order[k : k + _LENGTH] for k in range(0, len(order), _LENGTH)]
-        self._slot, slots = _allocate(program, chunks)
+        self._slot, slots = _allocate(chunks, reads, last)
         self.workspace = slots * lanes
         parts = [self._part(k, chunk) for k, chunk in enumerate(chunks)]
         self._entry([*parts, self._store()])
@@ -109,28 +112,31 @@ class NativeCode:
         builder.position_at_end(end)
         builder.ret_void()
 
-    def _part(self, index: int, chunk: Sequence[int]) -> ir.Function:
-        """Function that loads operands, executes a chunk of instructions and stores values."""
-        builder, values = self._begun_part(f"part{index}"), {}
-        read = {x for v in chunk for x in operands(self._program.instructions[v])}
-        for x in sorted(read - set(chunk)):
-            values[x] = self._fetched(builder, x)
-        for v in chunk:
-            name, *parts = self._program.instructions[v]
-            values[v] = self._calculated(builder, name, [values[x] for x in parts])
-            if v in self._slot:
-                self._keep(builder, v, values[v])
+    def _part(self, index: int, chunk: Sequence[Unit]) -> ir.Function:
+        """Function that executes a chunk of instructions and stores values for later ones."""
+        builder, made = self._begun_part(f"part{index}"), {}
+        for unit in chunk:
+            names, *parts = zip(*(self._program.instructions[x] for x in unit), strict=True)
+            values = [self._value(builder, made, xs) for xs in parts]
+            made[unit] = value = self._calculated(builder, names[0], values)
+            if unit in self._slot:
+                builder.store(value, self._place(builder, unit), align=self._size)
         builder.ret_void()
         return builder.function
 
     def _store(self) -> ir.Function:
         """Function that writes the results, once all inputs have been read."""
-        builder = self._begun_part("store")
-        results = self._program.results
-        values = {x: self._fetched(builder, x) for rows in results.values() for x in rows}
+        builder, results = self._begun_part("store"), self._program.results
+        inputs = {x for rows in results.values() for x in rows if x not in self._unit}
+        made = {(x,): self._value(builder, {}, (x,)) for x in inputs}
         for vector, rows in results.items():
-            for row, x in enumerate(rows):
-                builder.store(values[x], self._row(builder, vector, row), align=self._size)
+            row = 0
+            while row < len(rows):
+                unit = self._unit.get(rows[row], ())
+                xs = unit if tuple(rows[row : row + len(unit)]) == unit != () else (rows[row],)
+                place = self._row(builder, vector, row)
+                builder.store(self._value(builder, made, xs), place, align=self._size)
+                row += len(xs)
         builder.ret_void()
         return builder.function
 
@@ -142,36 +148,47 @@ class NativeCode:
 
     def _row(self, builder: ir.IRBuilder, vector: str, row: int) -> ir.Value:
         """Address of the present arms' numbers in a row of a vector."""
-        *_, stride = builder.function.args
-        first = builder.function.args[self._vectors.index(vector)]
-        offset = builder.mul(stride, ir.IntType(64)(row))
+        first, offset = builder.function.args[self._vectors.index(vector)], ir.IntType(64)(row)
+        if self.lanes > 1:
+            offset = builder.mul(builder.function.args[-1], offset)
         return builder.gep(first, [offset], source_etype=self._scalar)
 
-    def _place(self, builder: ir.IRBuilder, x: int) -> ir.Value:
-        """Address of a value's slot in the workspace."""
-        offset = ir.IntType(64)(self._slot[x] * self.lanes)
+    def _place(self, builder: ir.IRBuilder, unit: Unit) -> ir.Value:
+        """Address of a unit's slots in the workspace."""
+        offset = ir.IntType(64)(self._slot[unit] * self.lanes)
         return builder.gep(builder.function.args[-2], [offset], source_etype=self._scalar)
 
-    def _fetched(self, builder: ir.IRBuilder, x: int) -> Any:
-        """Value number `x`: a constant, or loaded from an input vector or the workspace."""
-        kind, *where = self._program.instructions[x]
-        boolean = self._program.boolean[x]
-        if kind == "constant":
-            return (self._truth if boolean else self._number)(self._program.value(x))
-        if kind == "input":
-            place = self._row(builder, where[0], where[1])
-        else:
-            place = self._place(builder, x)
-        if not boolean:
-            return builder.load(place, align=self._size, typ=self._number)
-        return builder.trunc(builder.load(place, align=1, typ=self._flag), self._truth)
+    def _value(self, builder: ir.IRBuilder, made: dict[Unit, Any], xs: Unit) -> Any:
+        """Operand: made by this function, constant, or loaded from an input or the workspace.
 
-    def _keep(self, builder: ir.IRBuilder, x: int, value: Any) -> None:
-        """Store a value in the workspace for later functions."""
-        place, align = self._place(builder, x), self._size
-        if self._program.boolean[x]:
-            value, align = builder.zext(value, self._flag), 1
-        builder.store(value, place, align=align)
+        Loads are repeated at each use, since the processor's instructions load an operand.
+        """
+        if xs in made:
+            return made[xs]
+        unit, (name, *where) = self._unit.get(xs[0], ()), self._program.instructions[xs[0]]
+        scalar = _TRUTH if self._program.boolean[xs[0]] else self._scalar
+        kind = (
+            scalar if len(xs) * self.lanes == 1 else ir.VectorType(scalar, len(xs) * self.lanes)
+        )
+        if unit == xs:
+            return builder.load(self._place(builder, unit), align=self._size, typ=kind)
+        if len(xs) == 1 and unit:
+            return builder.extract_element(
+                self._value(builder, made, unit), _INDEX(unit.index(*xs))
+            )
+        if name == "constant" and _fixed(self._program, xs):
+            values = [self._program.value(x) for x in xs]
+            return kind(values if len(xs) > 1 else values[0])
+        if name == "input" and _fixed(self._program, xs):
+            return builder.load(self._row(builder, *where[:2]), align=self._size, typ=kind)
+        # One or two values, each in several places.
+        order = ir.VectorType(_INDEX, len(xs))([0] * len(xs))
+        repeated = []
+        for value in [self._value(builder, made, (x,)) for x in dict.fromkeys(xs)]:
+            alone = builder.insert_element(kind(None), value, _INDEX(0))
+            repeated.append(builder.shuffle_vector(alone, kind(None), order))
+        first = ir.VectorType(_TRUTH, len(xs))([x == xs[0] for x in xs])
+        return builder.select(first, *repeated) if len(repeated) > 1 else repeated[0]
 
     def _calculated(self, builder: ir.IRBuilder, name: str, parts: list[Any]) -> ir.Value:
         """Result of one instruction."""
@@ -179,8 +196,8 @@ class NativeCode:
             return _BUILT[name](builder, *parts)
         if name in _ORDERED:
             return builder.fcmp_ordered(_ORDERED[name], *parts)
-        if name in _UNORDERED:
-            return builder.fcmp_unordered(_UNORDERED[name], *parts)
+        if name == "ne":  # true for NaN, too
+            return builder.fcmp_unordered("!=", *parts)
         if name in ("max", "min"):
             # NaN if either operand is NaN, as in PyTorch.
             a, b = parts
@@ -188,68 +205,98 @@ class NativeCode:
             return builder.select(
                 builder.fcmp_unordered("uno", a, a), a, builder.select(better, a, b)
             )
-        width = f"f{8 * self._size}" if self.lanes == 1 else f"v{self.lanes}f{8 * self._size}"
-        intrinsic = f"llvm.{_INTRINSICS.get(name, name)}.{width}"
+        kind = parts[0].type
+        lanes = f"v{kind.count}" if isinstance(kind, ir.VectorType) else ""
+        intrinsic = f"llvm.{_INTRINSICS.get(name, name)}.{lanes}f{8 * self._size}"
         function = self._module.globals.get(intrinsic)
         if function is None:
-            kind = ir.FunctionType(self._number, [self._number] * len(parts))
-            function = ir.Function(self._module, kind, intrinsic)
+            signature = ir.FunctionType(kind, [kind] * len(parts))
+            function = ir.Function(self._module, signature, intrinsic)
         return builder.call(function, parts)
 
 
-def _depth_first(program: ScalarProgram) -> list[int]:
-    """Instructions that the results need, each soon after its operands.
+def _fixed(program: ScalarProgram, xs: Unit) -> bool:
+    """True for constants, and for successive rows of one vector."""
+    first, *_, last = (program.instructions[x] for x in (xs[0], *xs))
+    if first[0] == "constant":
+        return all(program.instructions[x][0] == "constant" for x in xs)
+    return first[:2] == ("input", last[1]) and xs == tuple(range(xs[0], xs[0] + len(xs)))
+
+
+def _units(program: ScalarProgram, *, wide: bool) -> dict[int, Unit]:
+    """Unit of each value that the results need, with up to 8 values if `wide`."""
+    needed = {x for x in program.needed() if operands(program.instructions[x])}
+    units: dict[int, Unit] = {}
+
+    def fits(xs: Unit) -> bool:
+        names, *parts = zip(*(program.instructions[x] for x in xs), strict=False)
+        return (
+            needed.issuperset(xs)
+            and len({*names}) == 1
+            and names[0] not in _SINGLE
+            and len({program.boolean[x] for x in xs}) == 1
+            # Only operands with lower numbers: no unit depends on itself.
+            and xs == tuple(range(xs[0], xs[0] + len(xs)))
+            and xs[0] > max(map(max, parts))
+            and units.keys().isdisjoint(xs)
+            and all(
+                len({*part}) <= 2 or units.get(part[0]) == part or _fixed(program, part)
+                for part in parts
+            )
+        )
+
+    for row in program.series if wide else ():
+        k = 0
+        while k < len(row):
+            parts = (tuple(row[k : k + n]) for n in (8, 4) if k + n <= len(row))
+            unit = next(filter(fits, parts), ())
+            units.update(dict.fromkeys(unit, unit))
+            k += len(unit) or 1
+    return {x: units.get(x, (x,)) for x in sorted(needed)}
+
+
+def _reads(program: ScalarProgram, units: dict[int, Unit]) -> dict[Unit, list[Unit]]:
+    """Units that each unit reads."""
+    return {
+        unit: [units[y] for x in unit for y in operands(program.instructions[x]) if y in units]
+        for unit in units.values()
+    }
+
+
+def _depth_first(reads: dict[Unit, list[Unit]], results: Sequence[Unit]) -> list[Unit]:
+    """Units that the results need, each soon after its operands.
 
     In this order, few values have to be kept at a time.
     """
-    order: list[int] = []
-    done = [x[0] in ("constant", "input") for x in program.instructions]
-    for results in program.results.values():
-        for result in results:
-            stack = [(result, False)]
-            while stack:
-                x, ready = stack.pop()
-                if done[x]:
-                    continue
-                if ready:
-                    done[x] = True
-                    order.append(x)
-                    continue
-                stack.append((x, True))
-                parts = operands(program.instructions[x])
-                stack.extend((y, False) for y in reversed(parts) if not done[y])
-    return order
+    order: dict[Unit, None] = {}
+    stack = [(unit, False) for unit in reversed(results)]
+    while stack:
+        unit, ready = stack.pop()
+        if ready:
+            order[unit] = None
+        elif unit not in order:
+            stack.append((unit, True))
+            stack.extend((x, False) for x in reversed(reads[unit]))
+    return list(order)
 
 
 def _allocate(
-    program: ScalarProgram, chunks: Sequence[Sequence[int]]
-) -> tuple[dict[int, int], int]:
-    """Slot of each value that a later function reads, and the number of slots."""
-    last: dict[int, int] = {}
-    made: dict[int, int] = {}
-    for k, chunk in enumerate(chunks):
-        for v in chunk:
-            made[v] = k
-            for x in operands(program.instructions[v]):
-                if x in made and made[x] < k:
-                    last[x] = k
-    for rows in program.results.values():
-        last.update((x, len(chunks)) for x in rows if x in made)
-    ends: dict[int, list[int]] = {}
-    for x, k in last.items():
-        ends.setdefault(k, []).append(x)
-    slot: dict[int, int] = {}
-    free: list[int] = []
+    chunks: Sequence[Sequence[Unit]], reads: dict[Unit, list[Unit]], results: Sequence[Unit]
+) -> tuple[dict[Unit, int], int]:
+    """First slot of each unit that a later function reads, and the number of slots."""
+    place = {unit: k for k, chunk in enumerate(chunks) for unit in chunk}
+    last = {x: k for unit, k in place.items() for x in reads[unit] if place[x] < k}
+    last.update(dict.fromkeys(results, len(chunks)))
+    slot: dict[Unit, int] = {}
+    free: dict[int, list[int]] = {1: [], 4: [], 8: []}
     slots = 0
     for k, chunk in enumerate(chunks):
-        for v in chunk:
-            if v in last:
-                if not free:
-                    heapq.heappush(free, slots)
-                    slots += 1
-                slot[v] = heapq.heappop(free)
-        for x in ends.get(k, ()):
-            heapq.heappush(free, slot[x])
+        for unit in (x for x in chunk if x in last):
+            if not free[len(unit)]:
+                free[len(unit)], slots = [slots], slots + len(unit)
+            slot[unit] = free[len(unit)].pop()
+        for unit in (x for x, end in last.items() if end == k):
+            free[len(unit)].append(slot[unit])
     return slot, slots
 
 

@@ -38,10 +38,6 @@ BOOLEAN = frozenset({"gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"})
 choices are truth values."""
 
 
-# Complements of comparisons, also true if a number is NaN.
-_COMPLEMENTS = {"gt": "not gt", "lt": "not lt", "ge": "not ge", "le": "not le", "eq": "ne"}
-
-
 @final
 class ScalarProgram:
     """Straight-line program of one step.
@@ -50,6 +46,7 @@ class ScalarProgram:
         instructions: The instructions, each after its operands.
         boolean: True for each instruction that results in a truth value.
         results: Value number of each row, for each vector that the step writes.
+        series: Value numbers along the last axis of each tensor that was calculated.
     """
 
     def __init__(self, dtype: torch.dtype):
@@ -57,6 +54,7 @@ class ScalarProgram:
         self.instructions: list[Instruction] = []
         self.boolean: list[bool] = []
         self.results: dict[str, list[int]] = {}
+        self.series: list[list[int]] = []
         self.number = np.dtype(str(dtype).removeprefix("torch.")).type
         self._known: dict[Instruction, int] = {}
 
@@ -90,13 +88,6 @@ class ScalarProgram:
             operands = tuple(map(self.as_number, operands))
         if all(self.instructions[x][0] == "constant" for x in operands):
             return self._folded(name, operands)
-        if name == "not" and (
-            complement := _COMPLEMENTS.get(self.instructions[operands[0]][0])
-        ):
-            return self._add((complement, *self.instructions[operands[0]][1:]), boolean=True)
-        for one in operands if name == "mul" else operands[1:] if name == "div" else ():
-            if self.instructions[one] == ("constant", "1.0"):
-                return operands[1] if one == operands[0] else operands[0]
         return self._add((name, *operands), name in BOOLEAN)
 
     def as_number(self, x: int) -> int:
@@ -296,7 +287,11 @@ class _Unroller:
         tensors = torch.broadcast_tensors(*map(self._tensor, args))
         rows = zip(*(x.flatten().tolist() for x in tensors), strict=True)
         kept = [self.result.emit(name, *row) for row in rows]
-        return torch.tensor(kept, dtype=torch.int64).reshape(tensors[0].shape)
+        values = torch.tensor(kept, dtype=torch.int64).reshape(tensors[0].shape)
+        self.result.series += (
+            values.reshape(-1, *(values.shape[-1:] or (1,))).tolist() if kept else []
+        )
+        return values
 
     def _tensor(self, x: Any) -> Tensor:
         if isinstance(x, Tensor):
@@ -311,18 +306,17 @@ class _Unroller:
         axes = [axis % x.ndim for axis in ([axes] if isinstance(axes, int) else axes)]
         others = [axis for axis in range(x.ndim) if axis not in axes]
         shape = [x.shape[axis] for axis in others]
-        rows = x.permute(*others, *axes).reshape(math.prod(shape), -1).tolist()
-        kept = [self._joined(name, row or [self.result.constant(first)]) for row in rows]
+        rows = x.permute(*axes, *others).flatten(0, len(axes) - 1) if axes else x[None]
+        if not len(rows):
+            rows = self._tensor(first).expand(1, *shape)
+        # Pair the halves: processors do independent operations at the same time.
+        while (count := len(rows)) > 1:
+            half = 1 << (count - 1).bit_length() - 1
+            paired = self._each(name, rows[: count - half], rows[half:])
+            rows = torch.cat([paired, rows[count - half : half]])
         if keepdim:
             shape = [1 if axis in axes else x.shape[axis] for axis in range(x.ndim)]
-        return torch.tensor(kept, dtype=torch.int64).reshape(shape)
-
-    def _joined(self, name: str, row: list[int]) -> int:
-        """Reduce a row pairwise: processors do independent operations at the same time."""
-        while len(row) > 1:
-            pairs = zip(row[::2], row[1::2], strict=False)
-            row = [self.result.emit(name, a, b) for a, b in pairs] + row[len(row) & ~1 :]
-        return row[0]
+        return rows.reshape(shape)
 
     # Operations of PyTorch by name, with PyTorch's arguments.
 
