@@ -214,12 +214,18 @@ class PackedStep(nn.Module):
     ) -> None:
         """Take one step."""
         layouts = self.layouts
-        read = iter(layouts.state.unpack(state) + layouts.observation.unpack(observation))
+        read = layouts.state.unpack(state) + layouts.observation.unpack(observation)
+        results, count = self.stepped(read), len(layouts.command.fields)
+        command.copy_(layouts.command.pack(results[:count]))
+        state.copy_(layouts.state.pack(results[count:]))
+
+    def stepped(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Tensors of command and next state, from those of state and observation."""
+        read = iter(tensors)
         leaves = [next(read) if x is None else x for x in self._constants]
-        before, now = _pytree.tree_unflatten(leaves, self._structure)
-        result, after = self.controller.step(before, now)
-        command.copy_(layouts.command.pack(tensors_of(result)))
-        state.copy_(layouts.state.pack(tensors_of(after)))
+        return tensors_of(
+            self.controller.step(*_pytree.tree_unflatten(leaves, self._structure))
+        )
 
 
 def tensors_of(tree: object) -> list[Tensor]:

@@ -136,13 +136,23 @@ class EagerRunner(StepRunner):
     def __init__(self, controller: Steppable, observation: StepObservation):
         """Prepare the step; later observations must have the same fields as `observation`."""
         self._packed = PackedStep(controller, observation)
-        super().__init__(self._run_eagerly, self._packed.layouts, self._packed.first_state)
+        layouts = self._packed.layouts
+        super().__init__(self._run_eagerly, layouts, self._packed.first_state)
+        # Fields of the state are written while others are still read: read from a copy.
+        self._before = self._vectors.state.clone()
+        parts = zip((layouts.state, *layouts), (self._before, *self._vectors), strict=True)
+        self._views = [layout.views(vector) for layout, vector in parts]
+        self._dtypes = [x.dtype for x in layouts.state.fields + layouts.observation.fields]
         self.observe(observation)
         self.start(self.observation["joint_position"])
 
     @torch.inference_mode()
     def _run_eagerly(self, vectors: list[torch.Tensor]) -> None:
-        self._packed(*vectors)
+        self._before.copy_(vectors[0])
+        before, state, observation, command = self._views
+        read = zip(before + observation, self._dtypes, strict=True)
+        results = self._packed.stepped([x.to(dtype) for x, dtype in read])
+        torch._foreach_copy_(command + state, results)
 
 
 def open_step(
