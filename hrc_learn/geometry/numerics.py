@@ -9,8 +9,6 @@ argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
 from collections.abc import Iterable, Sequence
-from functools import reduce
-from operator import add
 from typing import Any
 
 import numpy as np
@@ -239,23 +237,8 @@ def matmul(
 
 def inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
     """Frobenius norm of A^-1, for a symmetric positive definite A."""
-    if not torch.compiler.is_compiling():
-        factor, _ = torch.linalg.cholesky_ex(A)
-        return torch.linalg.matrix_norm(torch.cholesky_inverse(factor))
-    # From the entries of A^-1 = M^T D^-1 M with M = L^-1.
-    L, inverse_d = _factors(A)
-    n = len(inverse_d)
-    M: list[list[Tensor]] = [[] for _ in range(n)]
-    for i in range(n):
-        for j in range(i):
-            M[i].append(-reduce(add, [L[i][j], *(L[i][k] * M[k][j] for k in range(j + 1, i))]))
-        M[i].append(torch.ones_like(inverse_d[i]))
-    square = []
-    for i in range(n):
-        for j in range(i + 1):
-            entry = reduce(add, [M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
-            square.append(entry * entry * (1 if i == j else 2))
-    return reduce(add, square).sqrt()
+    unit = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
+    return torch.linalg.vector_norm(solve_positive(A, unit.expand_as(A)), dim=(-2, -1))
 
 
 def solve_positive(
