@@ -43,7 +43,7 @@ def export_step(
     processors like the one that built it. Next to it are `step.h`, a header for C and C++, and
     `step.json`, a description for other languages. The name of their folder is a hash of
     torch's version, of the processor, of the parts of this library that a step uses
-    (`_SOURCES`), of all settings and weights of the controller, and of the example: names,
+    (`_PARTS`), of all settings and weights of the controller, and of the example: names,
     shapes and dtypes of its fields, and its constants. A controller that holds functions, or
     objects of classes outside this library, is hashed by its traced step instead. Tracing takes
     seconds.
@@ -154,15 +154,7 @@ def _hash_of_trace(step: PackedStep, program: torch.export.ExportedProgram) -> s
 # Parts of this library that a compiled step depends on. All their modules are hashed, so that
 # equal hashes mean equal compiled code.
 _ROOT = Path(__file__).parents[1]
-_SOURCES = (
-    "pytree.py",
-    "geometry",
-    "kinematics",
-    "regions",
-    "jacobian",
-    "controller",
-    "deploy",
-)
+_PARTS = ("pytree.py", "geometry", "kinematics", "regions", "jacobian", "controller", "deploy")
 # Types whose `repr` represents their whole value.
 _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device)
 
@@ -172,7 +164,7 @@ class UnknownCodeError(TypeError):
 
 
 def content_hash(*objects: Any) -> str:
-    """Hash of all values in some objects, and of the sources in `_SOURCES`.
+    """Hash of all values in some objects, and of the sources in `_PARTS`.
 
     Args:
         objects: Modules, dataclasses and their contents.
@@ -236,7 +228,7 @@ def _parts(x: Any) -> Iterable[Any]:
 @cache
 def _source_hash() -> bytes:
     digest = hashlib.sha256()
-    for name in _SOURCES:
+    for name in _PARTS:
         for path in sorted([_ROOT / name, *(_ROOT / name).rglob("*.py")]):
             if path.is_file():
                 digest.update(str(path.relative_to(_ROOT)).encode() + path.read_bytes())

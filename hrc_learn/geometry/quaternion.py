@@ -24,34 +24,19 @@ from hrc_learn.geometry.numerics import (
 
 # Matrix P with p * q = P q: for each entry, the index of the component of p, and its sign.
 _PRODUCT_INDEX = Constant(torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0]))
-_PRODUCT_SIGN = Constant(
-    torch.tensor(
-        [[1, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]], dtype=torch.float64
-    )
-)
+_SIGNS = [[1, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]]
+_PRODUCT_SIGN = Constant(torch.tensor(_SIGNS, dtype=torch.float64))
 _CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
 # The sum of the signs with these weights has the sign of the first non-zero component.
 _LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
-# Each entry of 4 q q^T - I is a sum of three entries of R (row-major) with these signs.
-_OUTER_INDEX = Constant(
-    torch.tensor(
-        [
-            [0, 7, 2, 3, 7, 0, 1, 2, 2, 1, 0, 5, 3, 2, 5, 0],
-            [4, 5, 6, 1, 5, 4, 3, 6, 6, 3, 4, 7, 1, 6, 7, 4],
-            [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8],
-        ]
-    )
-)
-_OUTER_SIGN = Constant(
-    torch.tensor(
-        [
-            [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, -1, 1, 1, 1, 1, -1],
-            [1, -1, -1, -1, -1, -1, 1, 1, -1, 1, 1, 1, -1, 1, 1, -1],
-            [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
-        ],
-        dtype=torch.float64,
-    )
-)
+# Each entry of 4 q q^T - I is a sum of three entries of R with these signs, numbered row by row
+# from 1.
+_OUTER = torch.tensor([
+    [1, 8, 3, 4, 8, 1, 2, 3, 3, 2, -1, 6, 4, 3, 6, -1],
+    [5, -6, -7, -2, -6, -5, 4, 7, -7, 4, 5, 8, -2, 7, 8, -5],
+    [9, 0, 0, 0, 0, -9, 0, 0, 0, 0, -9, 0, 0, 0, 0, 9],
+])  # fmt: skip
+_OUTER_INDEX, _OUTER_SIGN = Constant(_OUTER.abs() - 1), Constant(_OUTER.sign().double())
 _OUTER_OFFSET = Constant(torch.eye(4, dtype=torch.float64))
 # Below this angle [rad] an axis of rotation is rounding noise.
 _AXIS_THRESHOLD = 1e-6

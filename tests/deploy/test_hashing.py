@@ -113,7 +113,7 @@ def test_half_precision_is_hashed_by_its_bits():
 def test_a_change_of_any_source_that_a_step_is_made_from_changes_the_hash(
     tmp_path, monkeypatch
 ):
-    for name in export._SOURCES:
+    for name in export._PARTS:
         source = export._ROOT / name
         assert source.exists(), f"{name} has moved: its changes would go unnoticed"
         copy = shutil.copytree if source.is_dir() else shutil.copy
