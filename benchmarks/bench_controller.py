@@ -51,7 +51,7 @@ from hrc_learn.kinematics import panda
 BATCHES = (1024, 8192)
 NEURONS = (25, 64)
 TARGETS = {
-    "exported_alone_us": 20.0,
+    "exported_alone_us": 10.0,
     "exported_alone_p99_us": 60.0,
     "exported_over_eager": 0.1,
     "exported_over_mink": 0.25,
