@@ -80,6 +80,7 @@
     // In viser's settings: the address it has connected to, its logo, and nodes of the scene.
     for (const input of document.querySelectorAll("#root input[value^=ws]")) name(input, "Server");
     for (const image of document.querySelectorAll("#root img:not([alt])")) image.alt = "";
+    for (const dialog of document.querySelectorAll("[role=dialog]")) name(dialog, "Commands");
     for (const opener of document.querySelectorAll("#root div[aria-haspopup=dialog]")) {
       opener.setAttribute("role", "button");
       name(opener, "Properties");
