@@ -185,6 +185,13 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
 
 
 @pytest.mark.usefixtures("usual_steps")
+def test_what_is_near_and_does_not_come_nearer_hinders_nobody():
+    human, wishes = Pusher(SIDEWAYS, 0.0, 1.0), panda.ready.numpy()[None].repeat(6, axis=0)
+    _, joints, _ = followed(wishes, human, clearance=lambda q: q.new_full(q.shape[:-1], 0.01))
+    assert elbow(joints)[:, 1].diff().abs().min() > 1e-5
+    assert human.reasons() == [set()] * 6
+
+
 def test_where_an_arm_aside_cannot_go_on_it_waits_and_then_does_everything_that_was_asked():
     wishes, blocked = line(seconds=3.0, still=4.5), {}
     widths = np.arange(len(wishes), dtype=float)
