@@ -169,6 +169,13 @@ def test_the_plan_keeps_the_demonstrated_arm_angle(plans, demos):
     assert float((elbow[-1] - shown[-1])[:2].norm()) < 0.12
 
 
+def test_a_plan_begins_at_rest_wherever_the_elbow_is(skill):
+    aside = HOME + torch.tensor([0.4, 0.0, -0.4, 0.0, 0.0, 0.0, 0.0])
+    plan = skill.plan(aside, WORKPLACE.shelf("middle"), space="pose", dt=0.05, speed=3.0)
+    np.testing.assert_allclose(plan.path[0], aside, atol=1e-9)
+    assert np.abs(np.diff(plan.path[:3], axis=0)).max() < 0.006
+
+
 def test_check_plan_names_what_would_be_hit(plans, world):
     plan = plans("joint", "middle")
     sweep = np.linspace(HOME.numpy(), HOME.numpy() - 1.9 * np.eye(7)[0], 200)
