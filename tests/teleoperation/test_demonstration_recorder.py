@@ -253,18 +253,18 @@ def test_lost_frames_are_told_and_saving_again_insists(folder, kept, share):
     assert recorder.status.saved == 1
 
 
-@pytest.mark.parametrize(("late", "good"), [(19, True), (21, False)])
+@pytest.mark.parametrize(("late", "good"), [(18, True), (19, False)])
 def test_a_loop_that_stutters_is_told(folder, late, good):
     now = [0.0]
     writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
     with DemonstrationRecorder(writer, lambda: "show it", lambda: now[0]) as recorder:
         recorder.handle("start")
-        for k in range(101):
+        for k in range(95):  # a fifth of the steps between them may be late
             recorder.add(frame(k))
             now[0] += (2.1 if k < late else 0.9) / FPS
         recorder.handle("save")
         assert recorder.status.state == ("ready" if good else "stopped")
-        assert good or f"late at {late} of 101 frames" in recorder.status.note
+        assert good or f"late at {late} of 95 frames" in recorder.status.note
     assert recorder.status.saved == 1  # what is open is kept in any case
 
 
