@@ -371,6 +371,12 @@ def test_what_no_action_has_is_no_joint_of_the_arm(suffix):
     assert f"mystery{suffix}): no joint of the arm, no action has it" in notes
 
 
+def test_actions_that_move_tool_and_gripper_name_no_joints():
+    tool = ["ee.x", "ee.y", "ee.z"]
+    joints, _ = mapped(["a.pos", "b.pos", *tool, "gripper.pos"], [*tool, "gripper.pos"])
+    assert joints == ("a", "b")
+
+
 @pytest.mark.parametrize("name", ["object.u", "object_v.pos", "lift_mm", "pixel_3", "base_x"])
 def test_names_of_no_joint(name):
     joints, _ = mapped(["a.pos" if "pos" in name else "a", name], ["ee.x", "ee.y", "ee.z"])

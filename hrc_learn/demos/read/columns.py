@@ -263,8 +263,9 @@ class _Conventions:
             for feature in features.values()
             if feature.key in _ACTION_KEYS
             for name in feature.names or ()
+            if (meant := naming.meaning_of_component(name)) is None or "joint" in meant.role
         }
-        """Joints that an action names."""
+        """Joints that an action names, without the gripper and the pose of the tool."""
         whole: dict[str, ColumnSelection] = {}
         by_component: dict[str, ColumnSelection] = {}
         # A state of joints comes before a state that may hold anything.
