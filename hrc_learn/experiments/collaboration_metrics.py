@@ -8,18 +8,9 @@ from typing import get_args
 
 import numpy as np
 
+from hrc_learn.experiments import run_measures as measures
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
 from hrc_learn.experiments.metric_table import Metric, median, never, p95, success_rate
-from hrc_learn.experiments.run_measures import (
-    Deviation,
-    grasp_offset,
-    limit_violations,
-    place_angle,
-    place_pitch_and_yaw,
-    spans,
-    unwanted_contacts,
-    worker_distance,
-)
 from hrc_learn.experiments.surroundings import NearWorker, worker_contacts
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.sim import Touch
@@ -108,7 +99,7 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
     # Five joints set the pitch of the tool; its yaw follows from where it is.
     Metric("place pitch", lambda run: _off_by_five_joints(run, 0), "deg", at_most=3.0),
     Metric("place yaw", lambda run: _off_by_five_joints(run, 1), "deg", at_most=3.0),
-    never("joint limit violations", lambda run: limit_violations(run.cell)),
+    never("joint limit violations", lambda run: measures.limit_violations(run.cell)),
     _touches("cabinet", "contacts with the cabinet"),
     _touches("table", "contacts with the table"),
     _touches("arm itself", "contacts of the arm with itself"),
@@ -255,7 +246,7 @@ def _too_hard(run: CollaborationRun) -> int | None:
 
 def _min_distance(run: CollaborationRun) -> float | None:
     """True smallest distance of the worker from robot and load [mm]; None without a worker."""
-    distance = worker_distance(run.motion, len(run.cell.log))
+    distance = measures.worker_distance(run.motion, len(run.cell.log))
     return 1e3 * float(distance.min()) if len(distance) else None
 
 
@@ -277,13 +268,15 @@ def _worst(run: CollaborationRun, name: str) -> float | None:
     return max((float(getattr(job, name)) for job in grasped), default=None)
 
 
-def _pushed(run: CollaborationRun, of: Callable[[Deviation], np.ndarray]) -> float | None:
+def _pushed(
+    run: CollaborationRun, of: Callable[[measures.Deviation], np.ndarray]
+) -> float | None:
     """Largest deviation in a run in which a person pushed the elbow; None without a push."""
     log = run.cell.log
     if not (log["nullspace_input"] != 0).any():
         return None
     # NaN before the first push and after the last.
-    deviation = Deviation.of(log, run.motion, run.world)
+    deviation = measures.Deviation.of(log, run.motion, run.world)
     return float(np.nan_to_num(of(deviation)).max())
 
 
@@ -292,10 +285,12 @@ def _grasp_offsets(run: CollaborationRun) -> list[float]:
     log, offsets = run.cell.log, []
     for pick in run.picks:
         begin, end = pick.span
-        descents = [t for t, _ in spans(log, "grasp") if begin <= t < end]
+        descents = [t for t, _ in measures.spans(log, "grasp") if begin <= t < end]
         if pick.release is not None and descents:
             # The last attempt: earlier ones missed the object or lost it.
-            offset = grasp_offset(log, run.motion, run.world, pick.item.name, descents[-1])
+            offset = measures.grasp_offset(
+                log, run.motion, run.world, pick.item.name, descents[-1]
+            )
             offsets.append(1e3 * offset)
     return offsets
 
@@ -309,7 +304,7 @@ def _placed(run: CollaborationRun) -> tuple[float | None, float | None]:
         pose = run.world.object_pose(pick.item.name)
         errors.append(np.linalg.norm(pose[:2, 3] - pick.goal.position[:2].numpy()))
         # Relative to the true shelf: errors of the base do not count.
-        angles.append(place_angle(pose, pick.goal.orientation))
+        angles.append(measures.place_angle(pose, pick.goal.orientation))
     if not errors:
         return None, None
     return 1e3 * float(max(errors)), float(np.rad2deg(max(angles)))
@@ -320,7 +315,9 @@ def _off_by_five_joints(run: CollaborationRun, which: int) -> float | None:
     if run.workplace.robot.task != "nearest pose":
         return None
     angles = [
-        place_pitch_and_yaw(run.world.object_pose(pick.item.name), pick.goal.orientation)[which]
+        measures.place_pitch_and_yaw(
+            run.world.object_pose(pick.item.name), pick.goal.orientation
+        )[which]
         for pick in run.picks
         if pick.release is not None
     ]
@@ -338,8 +335,8 @@ def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
     released = {
         pick.item.name: start
         for pick in run.picks
-        for start, _ in spans(run.cell.log, RELEASE)
+        for start, _ in measures.spans(run.cell.log, RELEASE)
         # A person may stop the arm while it lowers an object.
         if pick.release is not None and pick.span[0] <= start < pick.span[1]
     }
-    return unwanted_contacts(run.world, run.cell.log, released)
+    return measures.unwanted_contacts(run.world, run.cell.log, released)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.experiments import run_measures as measures
 from hrc_learn.experiments.experiment import RepeatedRun, Study
 from hrc_learn.experiments.grasping_trial import (
     GraspingRun,
@@ -19,13 +20,6 @@ from hrc_learn.experiments.grasping_trial import (
     simulate_grasp,
 )
 from hrc_learn.experiments.metric_table import Metric, median, never, p95, success_rate
-from hrc_learn.experiments.run_measures import (
-    grasp_offset,
-    limit_violations,
-    spans,
-    true_tool,
-    unwanted_contacts,
-)
 from hrc_learn.experiments.run_recorder import record, region_of_vision
 from hrc_learn.experiments.run_report import SUMMARIES, run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
@@ -63,23 +57,23 @@ def descent(run: GraspingRun) -> tuple[float, float]:
         actual and the demonstrated direction of the end effector [deg].
     """
     log = run.cell.log
-    starts = [begin for begin, _ in spans(log, "grasp")]
+    starts = [begin for begin, _ in measures.spans(log, "grasp")]
     if not starts:
         return math.nan, math.nan
     last = int(np.searchsorted(log["time"], starts[-1])) - 1
-    tool = true_tool(run.motion, run.world, len(log))[last]
+    tool = measures.true_tool(run.motion, run.world, len(log))[last]
     actual, demonstrated = (
         quaternion.to_matrix(q)[:, 2]
         for q in (tool.orientation, run.scene.workplace.hover().orientation)
     )
     normal = torch.linalg.cross(actual, demonstrated)
     angle = float(torch.atan2(normal.norm(), actual @ demonstrated))
-    offset = grasp_offset(log, run.motion, run.world, run.item.name, starts[-1])
+    offset = measures.grasp_offset(log, run.motion, run.world, run.item.name, starts[-1])
     return 1e3 * offset, math.degrees(angle)
 
 
 def _contacts(run: GraspingRun) -> tuple[Touch, ...]:
-    return sum(unwanted_contacts(run.world, run.cell.log).values(), ())
+    return sum(measures.unwanted_contacts(run.world, run.cell.log).values(), ())
 
 
 def lift(run: GraspingRun) -> float:
@@ -98,7 +92,7 @@ def jacobian_errors(run: GraspingRun) -> tuple[float, float]:
     if not len(guided):
         return math.nan, math.nan
     ends = guided[[0, -1]]
-    tool = true_tool(run.motion, run.world, len(log))[torch.from_numpy(ends)]
+    tool = measures.true_tool(run.motion, run.world, len(log))[torch.from_numpy(ends)]
     marker = tool.apply(torch.from_numpy(run.world.hand_marker_offset())).numpy()
     true = run.world.config.camera.image_jacobian(marker)[..., :3]
     error = np.linalg.norm(log["image_jacobian"][ends, :, :3] - true, axis=(1, 2))
@@ -147,7 +141,7 @@ def grasping_metrics() -> list[Metric[GraspingRun]]:
         ),
         never(
             "joint limit violations",
-            lambda run: limit_violations(run.cell),
+            lambda run: measures.limit_violations(run.cell),
             claim="the joint-space region prevents them",
         ),
         never(

@@ -9,17 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.demos.quality.ranking import log_dimensionless_jerk
+from hrc_learn.experiments import run_measures as measures
 from hrc_learn.experiments.metric_table import Metric, never, p95, success_rate
 from hrc_learn.experiments.placing_trial import (
     SPACES,
     PlacingScene,
     SimulatedPlacing,
     demonstrated_path,
-)
-from hrc_learn.experiments.run_measures import (
-    limit_violations,
-    place_angle,
-    place_pitch_and_yaw,
 )
 from hrc_learn.experiments.run_recorder import demonstrated_joints
 from hrc_learn.experiments.trials import Trial
@@ -66,7 +62,7 @@ class PlacingOutcome:
         # The load crosses the front edge of the boards before the end effector does.
         edge = workplace.scene.cabinet.front + workplace.scene.objects[0].half_size[2]
         error = run.object_pose[:3, 3] - run.goal.position.numpy()
-        turns = place_pitch_and_yaw(run.object_pose, run.goal.orientation)
+        turns = measures.place_pitch_and_yaw(run.object_pose, run.goal.orientation)
         speed = np.abs(run.cell.log["joint_velocity"]) / run.cell.chain.limits.velocity.numpy()
         done, demonstrated = (
             log_dimensionless_jerk(time, path)
@@ -75,9 +71,9 @@ class PlacingOutcome:
         return cls(
             deviation=approach_deviation(run.path, run.goal.position.numpy(), shown, edge),
             place_error=float(np.linalg.norm(error[:2])),
-            place_tilt=place_angle(run.object_pose, run.goal.orientation),
+            place_tilt=measures.place_angle(run.object_pose, run.goal.orientation),
             place_turns=turns if workplace.robot.task == "nearest pose" else None,
-            violations=limit_violations(run.cell),
+            violations=measures.limit_violations(run.cell),
             contacts=run.contacts,
             peak_speed=float(speed.max()),
             jerk=math.exp(done - demonstrated),

@@ -20,26 +20,8 @@ from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.demos.videos import CameraImages
 from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.log import JointRanges
-from hrc_learn.viz import palette
+from hrc_learn.viz import palette, rerun_stream
 from hrc_learn.viz.panels import Plot, Tab, limit_curves, several, slug
-from hrc_learn.viz.rerun_stream import (
-    POSE_RATE,
-    TIMELINE,
-    begin,
-    dashboard,
-    frame_view,
-    markdown_table,
-    rrd_file,
-    samples,
-    seconds,
-    send_curves,
-    send_dot,
-    send_poses,
-    send_shapes,
-    send_strips,
-    send_summary,
-    tab_view,
-)
 
 _CODECS = {
     "av1": rr.VideoCodec.AV1,
@@ -79,7 +61,7 @@ def record_demonstrations(path: str | os.PathLike[str], shown: ShownDataset) -> 
     Returns:
         Duration of all demonstrations together [s].
     """
-    with rrd_file(path, shown.title, demonstration_layout(shown)) as stream:
+    with rerun_stream.rrd_file(path, shown.title, demonstration_layout(shown)) as stream:
         return sum(demo.duration for demo in send_demonstrations(stream, shown))
 
 
@@ -94,7 +76,7 @@ def demonstration_layout(shown: ShownDataset) -> rrb.Blueprint:
             name = f"{arm.arm.name} and the paths of its tool (dots: current position)"
             q = torch.from_numpy(arm.positions(first.joint_position))
             points = np.concatenate([path, arm.arm.joint_origins(q).flatten(0, 1).numpy()])
-        eye = frame_view(points, direction=(0.85, 0.5, 0.4), nearest=0.3)
+        eye = rerun_stream.frame_view(points, direction=(0.85, 0.5, 0.4), nearest=0.3)
         left.append(rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
     if shown.cameras:
         views = [
@@ -104,10 +86,10 @@ def demonstration_layout(shown: ShownDataset) -> rrb.Blueprint:
         left.append(rrb.Grid(contents=views, grid_columns=min(3, len(views))))
     task = rrb.TextDocumentView(origin="/task", name="Task")
     episodes = rrb.TextDocumentView(origin="/summary", name="Episodes")
-    tabs = [tab_view(_episode_tab(shown, first)), episodes]
+    tabs = [rerun_stream.tab_view(_episode_tab(shown, first)), episodes]
     right = rrb.Vertical(rrb.Tabs(contents=tabs, active_tab=0), task, row_shares=(9, 1))
     # Without arm, path and cameras, the curves fill the whole screen.
-    return dashboard(left, [right], row_shares=(3, 2), column_shares=(1, 1))
+    return rerun_stream.dashboard(left, [right], row_shares=(3, 2), column_shares=(1, 1))
 
 
 def send_demonstrations(
@@ -119,21 +101,21 @@ def send_demonstrations(
         stream: Stream to a file or viewer that has the layout of `demonstration_layout`.
         shown: The demonstrations.
     """
-    begin(stream, shown.title)
+    rerun_stream.begin(stream, shown.title)
     rows = []
     for k, demo in enumerate(shown.demos):
-        timelines = [f"episode {demo.episode}", *[TIMELINE] * (k == 0)]
+        timelines = [f"episode {demo.episode}", *[rerun_stream.TIMELINE] * (k == 0)]
         _send_arm(stream, shown, demo, timelines, first=k == 0)
         _send_images(stream, shown.images(demo), timelines)
         for plot in _episode_tab(shown, demo).plots:
             for curves in plot.curves:
-                send_curves(stream, demo.time, curves, timelines)
+                rerun_stream.send_curves(stream, demo.time, curves, timelines)
         task = rr.TextDocument.columns(text=[f"Episode {demo.episode}: {demo.task}"])
-        stream.send_columns("task", seconds(demo.time[:1], timelines), task)
+        stream.send_columns("task", rerun_stream.seconds(demo.time[:1], timelines), task)
         path = _send_path(stream, shown, demo, k)
         rows.append((demo.episode, demo.task, f"{demo.duration:.2f}", len(demo), path))
         yield demo
-    send_summary(stream, _summary(shown, rows))
+    rerun_stream.send_summary(stream, _summary(shown, rows))
 
 
 def tool_path(shown: ShownDataset, demo: Demonstration) -> Float[np.ndarray, "time 3"] | None:
@@ -153,20 +135,23 @@ def _send_arm(
 ) -> None:
     if shown.arm is None or demo.joint_position is None:
         return
-    q, at = shown.arm.positions(demo.joint_position), samples(demo.time, POSE_RATE)
+    q, at = (
+        shown.arm.positions(demo.joint_position),
+        rerun_stream.samples(demo.time, rerun_stream.POSE_RATE),
+    )
     opening = shown.arm.opening(demo)
     opened = None if opening is None else opening[at]
     for body in arm_bodies(shown.arm.arm, q[at], opened):
         if first:
-            send_shapes(stream, body)
-        send_poses(stream, demo.time[at], body, np.arange(len(at)), timelines)
+            rerun_stream.send_shapes(stream, body)
+        rerun_stream.send_poses(stream, demo.time[at], body, np.arange(len(at)), timelines)
 
 
 def _send_images(
     stream: rr.RecordingStream, images: Mapping[str, CameraImages], timelines: Sequence[str]
 ) -> None:
     for name, camera in images.items():
-        path, index = f"cameras/{slug(name)}", seconds(camera.time, timelines)
+        path, index = f"cameras/{slug(name)}", rerun_stream.seconds(camera.time, timelines)
         if camera.codec in _CODECS:
             stream.log(path, rr.VideoStream(codec=_CODECS[camera.codec]), static=True)
             columns = rr.VideoStream.columns(sample=camera.samples)
@@ -215,8 +200,8 @@ def _send_path(
     if path is None:
         return ""
     colour = palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
-    send_strips(stream, f"world/paths/{demo.episode}", [path], colour, 0.003)
-    send_dot(stream, str(demo.episode), demo.time, path, colour)
+    rerun_stream.send_strips(stream, f"world/paths/{demo.episode}", [path], colour, 0.003)
+    rerun_stream.send_dot(stream, str(demo.episode), demo.time, path, colour)
     return f"{np.linalg.norm(np.diff(path, axis=0), axis=1).sum():.2f}"
 
 
@@ -226,5 +211,13 @@ def _summary(shown: ShownDataset, rows: Iterable[Sequence[object]]) -> str:
     choose = "Choose the timeline of an episode in the time panel, at the bottom."
     notes = [f"- {note}" for note in shown.notes]
     return "\n".join(
-        [f"# {shown.title}", "", choose, "", *markdown_table(heads, rows), "", *notes]
+        [
+            f"# {shown.title}",
+            "",
+            choose,
+            "",
+            *rerun_stream.markdown_table(heads, rows),
+            "",
+            *notes,
+        ]
     )

@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments import collaboration_experiment, collaboration_metrics
+from hrc_learn.experiments import (
+    collaboration_experiment,
+    collaboration_metrics,
+    run_measures,
+)
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
 from hrc_learn.experiments.collaboration_trial import (
     DRAGS_NEAR_WORKER,
@@ -91,28 +95,24 @@ def run(monkeypatch):
         log.append(time=0.1 * k, nullspace_input=np.zeros(7), pace=[1.0, 0.5, 0.0, 0.75][k])
     offsets = {("a", 4.0): 0.002, ("b", 12.0): 0.003}
     monkeypatch.setattr(
-        collaboration_metrics,
+        run_measures,
         "grasp_offset",
         lambda log, motion, world, name, time: offsets[name, time],
     )
     angles = {"a": 0.01, "b": 0.02, "c": 9.0}
+    monkeypatch.setattr(run_measures, "place_angle", lambda pose, goal: angles[pose.name])
     monkeypatch.setattr(
-        collaboration_metrics, "place_angle", lambda pose, goal: angles[pose.name]
-    )
-    monkeypatch.setattr(
-        collaboration_metrics,
+        run_measures,
         "place_pitch_and_yaw",
         lambda pose, goal: (angles[pose.name], 2 * angles[pose.name]),
     )
     monkeypatch.setattr(
-        collaboration_metrics,
+        run_measures,
         "unwanted_contacts",
         lambda world, log, released: world.contacts(released),
     )
-    monkeypatch.setattr(collaboration_metrics, "limit_violations", lambda cell: 0)
-    monkeypatch.setattr(
-        collaboration_metrics, "worker_distance", lambda motion, steps: motion[:steps]
-    )
+    monkeypatch.setattr(run_measures, "limit_violations", lambda cell: 0)
+    monkeypatch.setattr(run_measures, "worker_distance", lambda motion, steps: motion[:steps])
     monkeypatch.setattr(
         collaboration_metrics, "worker_contacts", lambda world, log, motion: ("x", "y")
     )
@@ -292,7 +292,7 @@ class Pushes:
 
 
 def test_scripted_pushes_are_measured_by_their_largest_deviation(run, monkeypatch):
-    monkeypatch.setattr(collaboration_metrics, "Deviation", Pushes)
+    monkeypatch.setattr(run_measures, "Deviation", Pushes)
     log = StepLog()
     for event in run.cell.log.events:
         log.event(event.time, event.text)

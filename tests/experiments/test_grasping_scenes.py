@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments import grasping_experiment, grasping_trial
+from hrc_learn.experiments import grasping_experiment, grasping_trial, run_measures
 from hrc_learn.experiments.grasping_experiment import (
     TRIAL_METRICS,
     GraspingExperiment,
@@ -180,7 +180,7 @@ def measures(monkeypatch):
 
 def measured(monkeypatch, **values):
     run: Any = run_at(**values)
-    monkeypatch.setattr(grasping_experiment, "limit_violations", lambda cell: run.violations)
+    monkeypatch.setattr(run_measures, "limit_violations", lambda cell: run.violations)
     with shapes_unchecked():
         return evaluate(grasping_metrics(), run)
 
