@@ -39,6 +39,8 @@ _TOOL = ("position", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw")
 _LEFT_OUT = ("feature", "feature_visible", "human_effort", "joint_effort", "time")
 # A column with at most this many distinct values is a switch, which is not interpolated.
 _LEVELS = 5
+# Deviation of recorded tool positions from the joints that passes as noise [m].
+_APART = 5e-3
 
 type Place = tuple[str, int]
 """Place of one number in a frame: name of a feature, and index within this feature."""
@@ -73,9 +75,8 @@ class MultipliedColumns:
         """
         self._source, self._taught, self._robot = source, taught, robot
         self._same = robot.name == taught.arm.name
-        self._made = taught
-        if not self._same:
-            self._made = DatasetArm(robot, tuple(range(robot.joints)), taught.joints)
+        made = DatasetArm(robot, tuple(range(robot.joints)), taught.joints)
+        self._made = taught if self._same else made
         selections = source.columns.selections
         self._places = {role: [*selections[role].columns] for role in selections}
         for role in filter(self._places.__contains__, _JOINTS):
@@ -104,6 +105,7 @@ class MultipliedColumns:
             if key.startswith("action") and name in shown
         ]
         self._refuse_changes()
+        self._tool = self._recorded_tool()
         names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
         if not self._same:
             self._rename(names)
@@ -113,6 +115,24 @@ class MultipliedColumns:
             shape = list(feature.shape) if width == feature.width else [width]
             content = {"dtype": feature.dtype, "shape": shape, "names": feature.names and named}
             self.features[key] = content
+
+    def _recorded_tool(self) -> Float[torch.Tensor, "3"]:
+        """Origin of the recorded tool in the frame of the arm's tool [m]."""
+        if not {"position", "joint_position"} <= self._places.keys():
+            return torch.zeros(3).double()
+        demos: Any = [*self._source]
+        q = np.concatenate([self._taught.positions(demo.joint_position) for demo in demos])
+        tool = self._taught.arm.forward(torch.from_numpy(q))
+        away = torch.from_numpy(np.concatenate([d.position for d in demos])) - tool.position
+        away = quaternion.rotate(quaternion.conjugate(tool.orientation), away)
+        found = away.median(0).values
+        if (apart := float((away - found).norm(dim=-1).median())) > _APART:
+            arm, root = self._taught.arm.name, self._source.folder.root
+            raise ValueError(
+                f"{root}: the recorded tool is {1000 * apart:.0f} mm from where the joints of "
+                f"{arm} move it: give both in its base frame (hrc check finds wrong zeros)"
+            )
+        return found if found.norm() > _APART else torch.zeros_like(found)
 
     def _refuse_changes(self) -> None:
         """Check that actions named as the tool's position hold positions, no changes of it."""
@@ -220,6 +240,8 @@ class MultipliedColumns:
             objects: Pose of each object over time: position [m] and quaternion (w, x, y, z).
         """
         tool = self._robot.forward(torch.from_numpy(joints))
+        place = tool.position + quaternion.rotate(tool.orientation, self._tool)
+        tool = Pose(place, tool.orientation)
         made = {key: self._along(main, key, phase) for key in self._old}
         new = {role: self._pose_columns(role, tool, main) for role in _TOOL}
         if gripper is not None:

@@ -129,6 +129,37 @@ def test_the_demonstrated_motion_gives_the_columns_of_the_demonstration(case, ep
     assert "time" not in case.columns.features
 
 
+def tooled(folder, place):
+    """Columns of two demonstrations whose recorder has another tool, at `place` of the hand."""
+    with DatasetWriter(folder, FPS, "panda", panda.joint_names) as writer:
+        for episode in range(2):
+            q = joints(episode)
+            T = panda.forward(torch.from_numpy(q)).matrix().numpy()
+            writer.start_episode("go")
+            for k in range(FRAMES):
+                position = T[k, :3, :3] @ place(k) + T[k, :3, 3]
+                writer.add_frame(joint_position=q[k], command_position=q[k], position=position)
+            writer.save_episode()
+    source = open_demos(folder)
+    return MultipliedColumns(source, arm_of_dataset(source), panda, {})
+
+
+def test_the_tool_of_the_recorder_is_kept(tmp_path):
+    columns = tooled(tmp_path / "demos", lambda _: np.array([0.02, -0.01, 0.12]))
+    phase = np.arange(FRAMES, dtype=float)
+    made = columns.values(0, phase, joints(1), joints(1), None, {})
+    names = columns.features["observation.state"]["names"]
+    state = made["observation.state"][:, [names.index(f"ee.{axis}") for axis in "xyz"]]
+    tool = panda.forward(torch.from_numpy(joints(1))).matrix().numpy()
+    expected = tool[:, :3, :3] @ [0.02, -0.01, 0.12] + tool[:, :3, 3]
+    np.testing.assert_allclose(state, expected, atol=1e-6)
+
+
+def test_tool_positions_that_no_tool_of_the_arm_has_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"mm from where the joints of panda move it"):
+        tooled(tmp_path / "demos", lambda k: np.array([0.02 * k, 0.0, 0.0]))
+
+
 def test_objects_stand_where_their_columns_say(case):
     found = case.columns.objects
     assert found.keys() == {"block", "lid", "cup"}
