@@ -3,7 +3,7 @@
 import itertools
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -21,17 +21,11 @@ from hrc_learn.demos.issues import aligned
 from hrc_learn.experiments.motion_judge import Judge, JudgeConfig, Replay, Trial, judging
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import ArmChoice
+from hrc_learn.learning import multiply_motions as motions
 from hrc_learn.learning.multiply_dataset import MultipliedColumns, MultipliedWriter, pose_of
-from hrc_learn.learning.multiply_motions import (
-    Draws,
-    MotionSource,
-    NewMotion,
-    Segmentation,
-    find_segments,
-)
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.store import read_json, write_json
-from hrc_learn.teleoperation.scenarios import SHELVES, make_scenario
+from hrc_learn.teleoperation.scenarios import SCENARIOS, SHELVES, make_scenario
 
 # Number of motions that are made at once.
 _CHUNK = 50
@@ -159,23 +153,21 @@ class Multiplication:
         tool = [taught.arm.forward(q) for q in joints]
         if Path(self.config.segments).is_file():
             file = Path(self.config.segments)
-            self.segmentation = read_json(file, Segmentation, "correct it")
+            self.segmentation = read_json(file, motions.Segmentation, "correct it")
         else:
-            self.segmentation = find_segments(self.demos, objects, tool)
-        in_cell = self.judge.scene in ("grasping", "placing")
+            self.segmentation = motions.find_segments(self.demos, objects, tool)
         if not same:
-            shift = self.config.shift or (
-                _between_cells(taught.arm, self) if in_cell else (0, 0, 0)
-            )
-            moved = torch.tensor(shift, dtype=torch.float64)
-            tool = [Pose(pose.position + moved, pose.orientation) for pose in tool]
-            objects = {n: Pose(p.position + moved, p.orientation) for n, p in objects.items()}
+            moved = _between_cells(taught.arm, self)
+            tool, objects = [*map(moved, tool)], {n: moved(p) for n, p in objects.items()}
         self.objects, obstacles = objects, None
-        if in_cell:
+        if self.judge.scene in SCENARIOS:
             boxes = Workplace.of(self.robot).scene.boxes()
             obstacles = torch.tensor([[*b.centre, *b.half_size] for b in boxes]).double()
-        near = joints if same else self.robot.inverse(tool[0][0], near=self.robot.ready)
-        self.motions = MotionSource.fit(
+        near: Any = joints
+        if not same:
+            usual = self.robot.inverse(tool[0][0], near=self.robot.ready)
+            near = torch.cat([usual[None], self.robot.postures(tool[0][0])])
+        self.motions = motions.MotionSource.fit(
             self.demos, tool, objects, self.segmentation, self.robot, near, obstacles
         )
 
@@ -197,10 +189,8 @@ class Multiplication:
         made_by |= asdict(replace(settings, judge=replace(settings.judge, processes=1)))
         writer = MultipliedWriter(folder, self.kind, self.columns, self.source, made_by)
         widths = [float(demo.gripper.max()) for demo in self.demos if demo.gripper is not None]
-        physics = nullcontext()
-        if self.judge.scene:
-            widest = max(widths, default=1.0)
-            physics = judging(self.judge, self.choice, self.source.fps, widest)
+        given = self.judge, self.choice, self.source.fps, max(widths, default=1.0)
+        physics = judging(*given) if self.judge.scene else nullcontext()
         with writer.claimed(), physics as judge, Progress(transient=True) as progress:
             bar, done = progress.add_task("Multiplying", total=wanted), len(writer.provenance)
             first = 1 + writer.provenance[-1]["attempt"] if done else 0
@@ -254,7 +244,7 @@ class Multiplication:
             )
             yield attempt, (values, demo.task, origin)
 
-    def draw(self, attempts: range) -> Draws:
+    def draw(self, attempts: range) -> motions.Draws:
         """Random choices; each attempt has a generator of its own."""
         config, n, rows = self.config, len(self.demos), []
         for attempt in attempts:
@@ -267,8 +257,7 @@ class Multiplication:
                 ranges = self.settings.objects.get(name, ObjectConfig())
                 low, high = pose.position.amin(0), pose.position.amax(0)
                 for axis, given in enumerate((ranges.x, ranges.y, ranges.z)):
-                    if given is not None:
-                        low[axis], high[axis] = given
+                    low[axis], high[axis] = given or (low[axis], high[axis])
                 place = low + (high - low) * torch.from_numpy(rng.random(3))
                 turn = torch.tensor([0.0, 0.0, rng.uniform(*ranges.yaw)]).double()
                 turned = quaternion.multiply(quaternion.exp(turn), pose.orientation[main])
@@ -276,7 +265,7 @@ class Multiplication:
             start = config.start * rng.uniform(-1, 1, 3)
             rows.append((scene, weights, rng.uniform(*config.speed), start))
         scenes, weights, speed, start = zip(*rows, strict=True)
-        return Draws(
+        return motions.Draws(
             scene={
                 name: Pose.stack([scene[name] for scene in scenes]) for name in self.objects
             },
@@ -285,7 +274,7 @@ class Multiplication:
             start=torch.from_numpy(np.stack(start)),
         )
 
-    def trial(self, draws: Draws, made: NewMotion, k: int) -> Trial:
+    def trial(self, draws: motions.Draws, made: motions.NewMotion, k: int) -> Trial:
         return Trial(
             joints=made.joints.numpy(),
             gripper=self.columns.gripper(made.source, made.phase.numpy()),
@@ -324,11 +313,18 @@ def _judge(config: JudgeConfig, task: str) -> JudgeConfig:
     return config
 
 
-def _between_cells(taught: Any, job: Multiplication) -> Any:
-    """Displacement of a task from the demonstrated work cell to that of another arm [m]."""
-    old, new = Workplace.of(taught), Workplace.of(job.robot)
-    if job.judge.scene == "placing":
-        shelf = job.judge.shelf
-        return (new.shelf(shelf).position - old.shelf(shelf).position).tolist()
-    x, y, _ = (new.hover().position - old.hover().position).tolist()
-    return x, y, 0.0
+def _between_cells(taught: Any, job: Multiplication) -> Callable[[Pose], Pose]:
+    """Function that moves poses from the demonstrated scene to that of another arm.
+
+    Between work cells, distances are scaled with the hand, as the objects are.
+    """
+    size, shift = 1.0, torch.tensor(job.config.shift or (0.0, 0.0, 0.0)).double()
+    if job.judge.scene in SCENARIOS and not job.config.shift:
+        cells = [Workplace.of(arm) for arm in (taught, job.robot)]
+        size = cells[1].robot.hand_size / cells[0].robot.hand_size
+        if job.judge.scene == "placing":
+            ends = [cell.shelf(job.judge.shelf).position for cell in cells]
+        else:
+            ends = [cell.hover().position * shift.new_tensor([1, 1, 0]) for cell in cells]
+        shift = ends[1] - size * ends[0]
+    return lambda pose: Pose(size * pose.position + shift, pose.orientation)

@@ -47,13 +47,16 @@ _PER_FUNCTION, _FEWEST, _MOST = 3, 8, 50
 _COMPARED, _USUALLY_FREE = 50, 0.6
 # Iterations of inverse kinematics from the initial posture to the first pose of a path.
 _FIRST = 12
-# Largest error of inverse kinematics: 1 mm or 1 mrad.
-_REACHED = 1e-3
+# `_REACHED`: largest error of inverse kinematics, 1 mm or 1 mrad. `_TURNED`: largest rotation
+# from the wanted orientation [rad] for an arm of fewer than six joints.
+_REACHED, _TURNED = 1e-3, 0.3
 # `_USABLE`: largest speed of a motion, relative to the fastest speed within the arm's limits.
 # `_SLOWER`: largest number of times that a motion beyond the limits is slowed down.
-_USABLE, _SLOWER = 0.975, 3
+_USABLE, _SLOWER = 0.975, 5
 # Largest factor by which one attempt slows a motion down.
 _JUMP = 3.0
+# `_ENDING`: see `MotionSource.ending`. `_AT_REST`: fraction of the largest speed that is rest.
+_ENDING, _AT_REST = 0.25, 0.05
 # Stride of the frames that are checked for collisions.
 _CHECKED = 3
 
@@ -275,6 +278,16 @@ def _turned(frame: Pose, twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
     return quaternion.rotate(frame.orientation[:, None], parts).flatten(-2)
 
 
+def _stopped(s: Float[Tensor, "B T"], part: float) -> Float[Tensor, "B T"]:
+    """Progress of a motion of unit duration that comes to rest in its last part.
+
+    That part takes twice its time: with u from 0 to 1, its progress is 2 u - 2 u^3 + u^4, whose
+    acceleration is zero at both ends.
+    """
+    u = ((s - 1 + part) / (2 * part)).clamp(0, 1)
+    return torch.where(u > 0, 1 - part + part * (2 * u - 2 * u**3 + u**4), s)
+
+
 @torch.no_grad()
 def _free_fraction(dmp: PoseDMP) -> float:
     """Fraction of a segment after which the demonstrations agree in its frame.
@@ -304,6 +317,8 @@ class MotionSource:
     segments: tuple[_Segment, ...] = field(repr=False)
     obstacles: Float[Tensor, "boxes 6"]
     """Boxes to avoid: centre and half edges [m]."""
+    ending: float = 0.0
+    """Last fraction of the last segment in which a motion comes to rest; 0: it ends at rest."""
 
     @classmethod
     def fit(
@@ -313,7 +328,7 @@ class MotionSource:
         objects: Mapping[str, Pose],
         segmentation: Segmentation,
         robot: Arm,
-        near: Sequence[Float[Tensor, "frames joints"]] | Float[Tensor, " joints"],
+        near: Sequence[Float[Tensor, "frames joints"]] | Float[Tensor, "postures joints"],
         obstacles: Float[Tensor, "boxes 6"] | None = None,
     ) -> MotionSource:
         """Fit the primitives.
@@ -325,8 +340,8 @@ class MotionSource:
             segmentation: Segments and their frames.
             robot: Arm of the new motions.
             near: Joint positions along each demonstration [rad] if `robot` was demonstrated:
-                the new motions keep the demonstrated posture. Else joint positions near the
-                first pose [rad].
+                the new motions keep the demonstrated posture. Else postures at the first pose
+                [rad]: the first one is taken from which the arm follows a demonstration freely.
             obstacles: Boxes to avoid: centre and half edges [m].
 
         Raises:
@@ -355,14 +370,25 @@ class MotionSource:
             segments.append(
                 _Segment(frame=frame, dmp=with_common_reference(dmp), first=first, last=last)
             )
-        posture = near.expand(len(demos), -1) if fixed else torch.stack([q[0] for q in near])
+        # A recording that was cut off ends while the tool moves.
+        speeds = [pose.position.diff(dim=0).norm(dim=-1) for pose in tool]
+        cut_off = any(bool(v[-2:].min() > _AT_REST * v.max()) for v in speeds)
+        obstacles = torch.zeros(0, 6).double() if obstacles is None else obstacles
+        if fixed:
+            q, error = _followed(robot, tool[0][:, None], near)
+            hits = _collisions(robot, obstacles, q.transpose(0, 1))
+            faults = [*zip((error > _REACHED).sum(0).tolist(), map(bool, hits), strict=True)]
+            posture = near[faults.index(min(faults))].expand(len(demos), -1)
+        else:
+            posture = torch.stack([q[0] for q in near])
         return cls(
             robot=robot,
             fps=float(demos[0].fps),
             start=Pose.stack([pose[0] for pose in tool]),
             near=posture,
             segments=tuple(segments),
-            obstacles=torch.zeros(0, 6).double() if obstacles is None else obstacles,
+            obstacles=obstacles,
+            ending=_ENDING if cut_off else 0.0,
         )
 
     @torch.no_grad()
@@ -379,7 +405,7 @@ class MotionSource:
             factor = (factor / _USABLE).clamp(max=_JUMP)
             # Such a motion is slowed down and retried only once.
             again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
-            where = self._collisions(q[~again])
+            where = _collisions(self.robot, self.obstacles, q[~again])
             for k in (~again).nonzero()[:, 0].tolist():
                 hit, reason = where.pop(0), ""
                 if missed[k] > 0:
@@ -410,6 +436,7 @@ class MotionSource:
         )
         mixed = [segment.mixed(draws.weights, draws.speed) for segment in self.segments]
         total = torch.stack([dmp.duration for dmp in mixed]).sum(0)
+        total = total + self.ending * mixed[-1].duration
         length = (total * self.fps - 1e-9).ceil().long() + 1
         ticks = torch.arange(int(length.max()), dtype=torch.float64) / self.fps
         begin, twist = torch.zeros_like(total), torch.zeros(len(total), 6).double()
@@ -419,7 +446,10 @@ class MotionSource:
             frame, tau = frame_of(draws.scene, segment.frame, start), dmp.duration[:, None]
             velocity = _turned(frame.inverse(), twist)
             ends |= {"start": frame.inverse() @ start, "start_velocity": velocity}
-            clock = torch.minimum((ticks - begin[:, None]).clamp(min=0), tau)
+            clock = (ticks - begin[:, None]).clamp(min=0)
+            if dmp is mixed[-1] and self.ending:
+                clock = tau * _stopped(clock / tau, self.ending)
+            clock = torch.minimum(clock, tau)
             path, last = dmp.rollout(clock, **ends), dmp.rollout(tau, **ends)
             poses, (first, span) = frame[:, None] @ path.pose, segment.span(main)
             new = [poses.position, poses.orientation, path.body, first + span * clock / tau]
@@ -451,7 +481,7 @@ class MotionSource:
             wish, start = poses.body[:, order].transpose(0, 1), poses.body[:, 0]
         path = Pose(path.position.transpose(0, 1), path.orientation.transpose(0, 1))
         q, error = (
-            x[_FIRST:].transpose(0, 1) for x in follow_poses(self.robot, path, start, wish)
+            x[_FIRST:].transpose(0, 1) for x in _followed(self.robot, path, start, wish)
         )
         inside = torch.arange(q.shape[1]) < poses.length[:, None]
         last = q[torch.arange(len(q)), poses.length - 1]
@@ -459,14 +489,31 @@ class MotionSource:
         q = torch.where(inside[..., None], q, last[:, None])
         return q, torch.where(worst > _REACHED, worst, 0.0)
 
-    def _collisions(self, q: Float[Tensor, "B T joints"]) -> list[str]:
-        """For each motion, its collision with the arm itself or a box in words; empty: none."""
-        q, (centre, half) = q[:, ::_CHECKED], self.obstacles.split(3, dim=-1)
-        frames = self.robot.link_frames(q)
-        hit = (self.robot.whole.self_distance(q, frames) < 0).any(-1)
-        reasons = ["collides with the arm itself" if each else "" for each in hit.tolist()]
-        if len(centre) and len(q):
-            near = self.robot.body.box_distance(q, centre, half, frames).amin(-1) < 0
-            for k in near.nonzero()[:, 0].tolist():
-                reasons[k] = reasons[k] or "collides with an obstacle"
-        return reasons
+
+def _followed(
+    robot: Arm, path: Pose, start: Float[Tensor, "*rows joints"], wish: Tensor | None = None
+) -> tuple[Float[Tensor, "T *rows joints"], Float[Tensor, "T *rows"]]:
+    """Joint positions along poses [rad], and errors [m or rad]; as `follow_poses` otherwise.
+
+    Fewer than six joints reach the positions, with orientations up to `_TURNED` away.
+    """
+    q, error = follow_poses(robot, path, start, wish)
+    if robot.joints < 6:
+        left = robot.forward(q).twist_to(path).unflatten(-1, (2, 3)).norm(dim=-1)
+        error = torch.where(left[..., 1] < _TURNED, left[..., 0], left[..., 1])
+    return q, error
+
+
+def _collisions(
+    robot: Arm, obstacles: Float[Tensor, "boxes 6"], q: Float[Tensor, "B T joints"]
+) -> list[str]:
+    """For each motion, its collision with the arm itself or a box in words; empty: none."""
+    q, (centre, half) = q[:, ::_CHECKED], obstacles.split(3, dim=-1)
+    frames = robot.link_frames(q)
+    hit = (robot.whole.self_distance(q, frames) < 0).any(-1)
+    reasons = ["collides with the arm itself" if each else "" for each in hit.tolist()]
+    if len(centre) and len(q):
+        near = robot.body.box_distance(q, centre, half, frames).amin(-1) < 0
+        for k in near.nonzero()[:, 0].tolist():
+            reasons[k] = reasons[k] or "collides with an obstacle"
+    return reasons

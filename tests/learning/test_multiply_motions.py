@@ -8,7 +8,7 @@ import torch
 from multiply_samples import BLOCKS, END, FPS, GRASP, block, demonstrations
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import ArmChoice, arm, panda
 from hrc_learn.learning.multiply_motions import (
     Draws,
     MotionSource,
@@ -152,6 +152,61 @@ def test_obstacles_are_found(demos, tool, objects, segments):
     source = MotionSource.fit(demos, tool, objects, segments, panda, joints, wall)
     found = {motion.reason for motion in source.motions(draws(BLOCKS))}
     assert found == {"collides with an obstacle"}
+
+
+def test_demonstrations_cut_off_while_moving_end_at_rest(demos, tool, objects):
+    """A sudden stop would be beyond the limits of acceleration at any speed."""
+    last = 52  # while the block is lifted
+    short = [
+        replace(
+            demo,
+            **{name: getattr(demo, name)[:last] for name in ("time", "joint_position")},
+            gripper=demo.gripper[:last],
+            command_position=None,
+        )
+        for demo in demos
+    ]
+    tool = [pose[:last] for pose in tool]
+    joints = [torch.from_numpy(demo.joint_position) for demo in short]
+    segments = find_segments(short, objects, tool)
+    source = MotionSource.fit(short, tool, objects, segments, panda, joints)
+    for made, pose, demo in zip(source.motions(draws(BLOCKS)), tool, short, strict=True):
+        assert made.reason == ""
+        speed = made.joints.diff(dim=0).abs().amax(-1)
+        assert np.abs(np.diff(demo.joint_position, axis=0))[-1].max() > 0.2 * speed.max()
+        assert speed[-1] < 0.03 * speed.max()
+        reached = panda.forward(made.joints[-1]).position
+        torch.testing.assert_close(reached, pose[-1].position, rtol=0, atol=2e-3)
+
+
+def test_another_arm_starts_in_a_posture_that_follows_the_demonstrations(
+    demos, tool, objects, segments
+):
+    """From the first posture, with a wall beside the elbow, the arm would collide."""
+    ur5e = arm("ur5e")
+    postures = ur5e.postures(tool[0][0])
+    free = MotionSource.fit(demos, tool, objects, segments, ur5e, postures)
+    elbow = ur5e.joint_origins(free.near[0])[2]
+    wall = torch.cat([elbow, torch.full((3,), 0.05).double()])[None]
+    source = MotionSource.fit(demos, tool, objects, segments, ur5e, postures, wall)
+    assert not torch.equal(source.near, free.near)
+    assert {motion.reason for motion in source.motions(draws(BLOCKS))} == {""}
+
+
+def test_five_joints_reach_the_positions(demos, tool, objects, segments):
+    so101 = ArmChoice("so101").work_arm()
+    moved = torch.tensor([0.0, 0.0, -0.08]).double()
+    tool = [Pose(0.4 * pose.position + moved, pose.orientation) for pose in tool]
+    objects = {n: Pose(0.4 * p.position + moved, p.orientation) for n, p in objects.items()}
+    postures = so101.postures(tool[0][0])
+    source = MotionSource.fit(demos, tool, objects, segments, so101, postures)
+    given = draws(BLOCKS)
+    given = replace(given, scene=objects)
+    for made, pose in zip(source.motions(given), tool, strict=True):
+        assert made.reason == ""
+        grasp = int(torch.where(made.phase >= GRASP)[0][0])
+        reached = so101.forward(made.joints[grasp]).position
+        torch.testing.assert_close(reached, pose[GRASP].position, rtol=0, atol=2e-3)
 
 
 def test_gradients_flow_to_the_scene(source):
