@@ -13,7 +13,7 @@ contacts of both fingers.
 
 import json
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -23,7 +23,7 @@ import torch
 
 from hrc_learn import cli
 from hrc_learn.cli.arguments import Multiply
-from hrc_learn.cli.multiply_command import Multiplication, Settings
+from hrc_learn.cli.multiply_command import Multiplication, ObjectConfig, Settings
 from hrc_learn.experiments.motion_judge import JudgeConfig, Trial, judging
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics.inverse import follow_poses
@@ -47,15 +47,26 @@ class Args:
     """Motions of each method, or episodes to replay."""
     replay: Path | None = None
     """Dataset whose actions are replayed instead."""
+    robot: str = ""
+    """Arm of the motions. Default: that of the demonstrations."""
+    wide: float = 0.0
+    """Widening of the ranges of the object's position, as a fraction of them, on each side."""
+    yaw: float = 0.0
+    """Largest rotation of the object about the vertical [rad]."""
     json: Path | None = None
     """File for the figures."""
 
 
 def main(args: Args) -> None:
     job = Multiplication(
-        Multiply(dataset=args.dataset, episodes=args.attempts, out=Path("unused")),
+        Multiply(
+            dataset=args.dataset, episodes=args.attempts, out=Path("unused"), robot=args.robot
+        ),
         Settings(judge=JudgeConfig(processes=1)),
     )
+    if args.wide or args.yaw:
+        objects = {name: harder(pose, args) for name, pose in job.objects.items()}
+        job.settings = replace(job.settings, objects=objects)
     if args.replay is not None:
         figures = replayed(job, args.replay, args.attempts)
     else:
@@ -63,6 +74,14 @@ def main(args: Args) -> None:
     for name, value in figures.items():
         print(f"{name:32} {value:10.4g}")
     cli.write_values(args.json, figures)
+
+
+def harder(shown: Pose, args: Args) -> ObjectConfig:
+    """Scenes of a wider distribution than that of the demonstrations."""
+    low, high = shown.position.amin(0), shown.position.amax(0)
+    more = args.wide * (high - low)
+    (x, y, _), (X, Y, _) = (low - more).tolist(), (high + more).tolist()
+    return ObjectConfig(x=(x, X), y=(y, Y), yaw=(-args.yaw, args.yaw))
 
 
 def compared(job: Multiplication, attempts: int) -> dict[str, float]:
@@ -149,7 +168,7 @@ def replayed(job: Multiplication, dataset: Path, most: int) -> dict[str, float]:
     episode = rows.column("episode_index").to_numpy()
     actions = np.stack(rows.column("action").to_numpy())
     chosen = np.unique(np.linspace(0, len(origins) - 1, most).astype(int))
-    done = 0
+    size, placing, done = job.robot.hand_size, job.judge.scene == "placing", 0
     for k in chosen.tolist():
         own = actions[episode == k]
         joints = [name.removesuffix(".pos") for name in names[:-1]]
@@ -159,10 +178,13 @@ def replayed(job: Multiplication, dataset: Path, most: int) -> dict[str, float]:
         mujoco.mj_resetData(model, data)
         data.qpos[[model.joint(name).qposadr[0] for name in joints]] = own[0, :-1]
         data.qpos[[model.joint(f"finger_{side}").qposadr[0] for side in ("left", "right")]] = (
-            0.04
+            0.04 * size
         )
-        pose = next(iter(origins[k]["scene"].values()))
+        pose = np.array([*origins[k]["scene"].values()])[0]
         data.joint(item).qpos[:] = pose
+        if placing:
+            scene.hold(item, own[0, :-1])
+            data.qpos[:] = scene.data.qpos
         before = own[0, :-1]
         for action in own:
             for step in range(steps):
@@ -178,7 +200,9 @@ def replayed(job: Multiplication, dataset: Path, most: int) -> dict[str, float]:
             if model.geom(item).id in pair
         }
         pads = {"finger_left_pad", "finger_right_pad"} <= held
-        done += bool(pads and data.body(item).xpos[2] - pose[2] > LIFTED)
+        lifted = data.body(item).xpos[2] - pose[2] > LIFTED * size
+        rests = f"board_{job.judge.shelf}" in held and not pads
+        done += bool(rests if placing else pads and lifted)
     return {"replayed": len(chosen), "replay_success_rate": done / len(chosen)}
 
 
