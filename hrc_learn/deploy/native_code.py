@@ -46,7 +46,7 @@ ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.
 
 The function takes a step for the first `count` arms; `count` is a multiple of `lanes`.
-Successive rows of a vector are `stride` numbers apart in memory."""
+Successive rows of a vector are `stride` numbers apart in memory. With one lane, both are 1."""
 
 
 @final

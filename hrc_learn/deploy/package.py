@@ -352,11 +352,10 @@ def c_header(metadata: Mapping[str, str]) -> str:
             f"static const {dtype} first_{name}[] = {{{_c_numbers(metadata[key])}}};"
             for name, key in (("state", _STATE), ("observation", _OBSERVATION))
         ),
-        "#ifdef __cplusplus",
-        'extern "C"',
-        "#endif",
+        '#ifdef __cplusplus\nextern "C"\n#endif',
         "/* Takes a step: reads the observation, writes the command and the next state. Rows",
-        "   are `stride` numbers apart; `count` arms, a multiple of STEP_ARMS_AT_ONCE. */",
+        "   are `stride` numbers apart; `count` arms, a multiple of STEP_ARMS_AT_ONCE. If",
+        "   that is 1, so are `stride` and `count`. */",
         f"void control_step({dtype} *state, const {dtype} *observation, {dtype} *command,",
         f"                  {dtype} *workspace, long long stride, long long count);",
         "",
