@@ -85,7 +85,7 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
     kind = source.folder.robot_type
     arm = ArmChoice(robot).arm() if robot else arm_of_robot(kind)
     if "joint_position" not in source.units:
-        raise DatasetError("the dataset has no joint positions")
+        raise DatasetError(f"{source.folder.root}: no column of joint positions (JOINT.pos)")
     if arm is None:
         text = f"robot type {kind!r} is no registered and installed arm"
         raise DatasetError(f"{text}; --robot NAME|FILE names one")
