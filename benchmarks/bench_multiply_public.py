@@ -179,6 +179,7 @@ def rigid(
         at = np.asarray(demo.extra["observation.environment_state"])[:, :3]
         moved = np.linalg.norm(at - at[0], axis=1) > MOVED
         cuts = (cuts[0], int(moved.argmax()), cuts[2])
+    assert demo.position is not None
     made = [np.append(demo.position[0] + draws.start[k].numpy(), shown[0, 3])]
     for number, frame in enumerate(job.segmentation.frames):
         part = shown[cuts[number] : cuts[number + 1] + 1].copy()

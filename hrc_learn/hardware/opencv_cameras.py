@@ -339,7 +339,8 @@ def measure_delay(
             f"the camera saw marker {marker} in {len(taken)} different images, and at least "
             f"{_FEWEST} are needed: move the arm into the view, and light it."
         )
-    return fit_delay(*map(np.array, (times, positions, taken, pixels)), _LONGEST)
+    shown = np.array(taken), np.array(pixels)
+    return fit_delay(np.array(times), np.array(positions), *shown, _LONGEST)
 
 
 def fit_delay(
