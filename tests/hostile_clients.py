@@ -130,7 +130,7 @@ DRAG = {
 }
 
 
-async def refused(connection, codes=(401, 403, 404, 429, 503)) -> None:
+async def refused(connection, codes=(400, 401, 403, 404, 429, 503)) -> None:
     """A socket that is not to open does not."""
     try:
         async with connection:

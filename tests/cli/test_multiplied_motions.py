@@ -25,7 +25,7 @@ from hrc_learn.cli.multiply_command import (
 from hrc_learn.experiments.motion_judge import JudgeConfig, Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.registry import arm
+from hrc_learn.kinematics.registry import ArmChoice, arm
 from hrc_learn.sim.workplace import Workplace
 
 
@@ -207,9 +207,12 @@ def test_the_judge_is_the_scenario_that_the_task_names(scene, task, judged):
 
 
 @pytest.mark.parametrize("scene", ["placing", "grasping"])
-def test_a_task_moves_with_the_shelf_or_the_table_of_the_work_cell(scene):
+@pytest.mark.parametrize("hand", [1.0, 0.5])
+def test_a_task_moves_with_the_shelf_or_the_table_of_the_work_cell(scene, hand):
+    """Its ends do; distances from them are scaled with the hand."""
     old, new = Workplace.of(arm("panda")), Workplace.of(arm("fr3"))
     other: Any = SimpleNamespace(
+        robot=SimpleNamespace(hand_size=hand * old.robot.hand_size),
         shelf=lambda name: Pose(new.shelf(name).position + 0.25, new.home().orientation),
         hover=lambda: Pose(new.hover().position + 0.5, new.home().orientation),
     )
@@ -217,13 +220,19 @@ def test_a_task_moves_with_the_shelf_or_the_table_of_the_work_cell(scene):
         cells = {"old": old, "new": other}
         patch.setattr(multiply_command, "Workplace", SimpleNamespace(of=cells.__getitem__))
         judge = JudgeConfig(scene=scene, shelf="upper")
-        shift = _between_cells("old", SimpleNamespace(robot="new", judge=judge))
+        job: Any = SimpleNamespace(robot="new", judge=judge, config=MultiplyConfig())
+        moved = _between_cells("old", job)
     if scene == "placing":
-        expected = new.shelf("upper").position + 0.25 - old.shelf("upper").position
-        assert shift == pytest.approx(expected.tolist())
+        there, expected = old.shelf("upper"), new.shelf("upper").position + 0.25
     else:
-        x, y, _ = (new.hover().position + 0.5 - old.hover().position).tolist()
-        assert shift == pytest.approx((x, y, 0.0))
+        there, expected = old.hover(), new.hover().position + 0.5
+        # The table is as high as before.
+        there = Pose(there.position * torch.tensor([1, 1, 0]), there.orientation)
+        expected = expected * torch.tensor([1, 1, 0])
+    assert moved(there).position.tolist() == pytest.approx(expected.tolist())
+    beside = moved(Pose(there.position + 0.1, there.orientation)).position
+    assert (beside - expected).tolist() == pytest.approx(3 * [0.1 * hand])
+    assert torch.equal(moved(there).orientation, there.orientation)
 
 
 class Writer:
@@ -262,10 +271,12 @@ def work(monkeypatch, outcomes, wanted, before=()):
     job: Any = SimpleNamespace(
         args=SimpleNamespace(episodes=wanted, folder=Path("out"), dataset=Path("set")),
         settings=Settings(),
+        config=MultiplyConfig(),
+        choice=ArmChoice("panda"),
         robot=SimpleNamespace(name="panda"),
         kind="panda",
         columns=None,
-        source=None,
+        source=SimpleNamespace(fps=20.0),
         demos=[],
         judge=JudgeConfig(),
         _attempts=attempts,

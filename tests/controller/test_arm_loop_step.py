@@ -184,7 +184,7 @@ def test_each_limitation_of_a_push_is_a_fraction_of_what_was_left():
     assert float(task.kept) == pytest.approx(inside)
     assert 0 < float(speed.kept) < 1
     assert float(singular.kept) == float(limit.kept) == 1.0
-    bounds = law._law.task_margin.velocity_bounds(Q)
+    bounds = law.path_law.task_margin.velocity_bounds(Q)
     wanted = (push @ UNIT) * UNIT
     ratio = torch.where(wanted > 0, bounds[1], bounds[0]) / wanted
     assert int(limit.joint) == int(ratio.argmin())

@@ -216,7 +216,7 @@ def test_a_pose_without_names_is_asked_about(recorded, tmp_path):
 def test_another_rate_is_refused_and_the_same_rate_keeps_the_changes(recorded, tmp_path):
     root = write(tmp_path / "set", recorded("measured"))
     with pytest.raises(
-        DatasetError, match="changes per step, which would be wrong at another rate"
+        DatasetError, match="changes per step, which would be wrong at another frame rate"
     ):
         repair_dataset(root, tmp_path / "out", RepairOptions(fps=50))
     repair_dataset(root, tmp_path / "out", RepairOptions(trim=False))

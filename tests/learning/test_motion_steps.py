@@ -25,9 +25,9 @@ from hrc_learn.learning.motion_playing import (
 )
 from hrc_learn.learning.multiply_motions import (
     Draws,
-    MotionSource,
     Segmentation,
     _best_frame,
+    _collisions,
     _switches,
     _turned,
     find_segments,
@@ -278,15 +278,8 @@ def test_a_part_of_the_draws_is_those_motions():
     np.testing.assert_array_equal(part.scene["cup"].position, places(0).position[[2, 0]])
 
 
-def source(obstacles):
-    return MotionSource(
-        robot=panda,
-        fps=20.0,
-        start=places(0),
-        near=panda.ready.expand(4, 7),
-        segments=(),
-        obstacles=torch.tensor(obstacles).double().view(-1, 6),
-    )
+def collisions(boxes, q):
+    return _collisions(panda, torch.tensor(boxes).double().view(-1, 6), q)
 
 
 def test_collisions_are_of_the_arm_itself_before_those_with_boxes():
@@ -295,9 +288,9 @@ def test_collisions_are_of_the_arm_itself_before_those_with_boxes():
     folded = ready.clone()
     folded[:, 3], folded[:, 5] = -3.0, 0.0
     both = torch.stack([ready, folded])
-    assert source([])._collisions(both) == ["", "collides with the arm itself"]
+    assert collisions([], both) == ["", "collides with the arm itself"]
     far, near = [5.0, 0, 0, 0.1, 0.1, 0.1], [*elbow, 0.02, 0.02, 0.02]
-    assert source([far])._collisions(ready[None]) == [""]
-    found = source([far, near])._collisions(both)
+    assert collisions([far], ready[None]) == [""]
+    found = collisions([far, near], both)
     assert found == ["collides with an obstacle", "collides with the arm itself"]
-    assert source([near])._collisions(both[:0]) == []
+    assert collisions([near], both[:0]) == []

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from urllib.parse import urlsplit
 
 import pytest
 import rerun as rr
@@ -24,10 +25,10 @@ def without_viewer(monkeypatch):
 
 def open_socket(url, *, secret=None, origin=None, host=None):
     address, _, token = url.partition("/#token=")
-    where = f"{address.replace('http', 'ws')}/session/{'d' * 24}"
+    there = urlsplit(address)
+    where = f"ws://{host or there.netloc}/session/{'d' * 24}"
     offered = ["hrc", f"secret.{secret or token}"]
-    headers = {"Host": host} if host else {}
-    options = {"max_size": None, "proxy": None, "additional_headers": headers}
+    options = {"max_size": None, "proxy": None, "host": there.hostname, "port": there.port}
     return connect(where, subprotocols=offered, origin=origin or address, **options)
 
 
