@@ -4,6 +4,7 @@ from hrc_learn.kinematics.arm import Arm as Arm
 from hrc_learn.kinematics.arm import ArmShape as ArmShape
 from hrc_learn.kinematics.arm import FingerJoint as FingerJoint
 from hrc_learn.kinematics.arm import UnreachableError as UnreachableError
+from hrc_learn.kinematics.arm import comfortable_posture as comfortable_posture
 from hrc_learn.kinematics.chain import SerialChain as SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm as CapsuleArm
 from hrc_learn.kinematics.collision import GraspedBox as GraspedBox

@@ -313,9 +313,7 @@ class Arm(SerialChain):
     def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
         """Distinct joint positions for one pose, the most comfortable first [rad].
 
-        Comfortable postures are far from singularities and from joint limits. An arm that
-        servoes around a pose hardly changes its posture: the one on arrival decides whether the
-        arm meets a limit there.
+        Comfortable postures are far from singularities and from joint limits.
 
         Args:
             pose: Pose of the tool centre point, without batch dimensions.
@@ -454,6 +452,22 @@ def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:
         (link, *np.multiply(size, (start, end)).tolist(), size * radius)
         for start, end, radius in _HAND
     )
+
+
+def comfortable_posture(arm: Arm, pose: Pose) -> Float[Tensor, " joints"]:
+    """Inverse-kinematics solution furthest from singularities and joint limits [rad].
+
+    An arm that servoes around a pose hardly changes its posture. The posture on arrival
+    therefore decides whether the arm meets a limit there.
+
+    Args:
+        arm: The arm.
+        pose: Pose of the tool centre point, without batch dimensions.
+
+    Raises:
+        UnreachableError: No joint positions within the limits reach the pose.
+    """
+    return arm.postures(pose)[0]
 
 
 def _repeated(pose: Pose, shape: Sequence[int]) -> Pose:

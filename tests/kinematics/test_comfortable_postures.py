@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import UnreachableError, panda
+from hrc_learn.kinematics import UnreachableError, comfortable_posture, panda
 
 
 def test_a_comfortable_posture_reaches_the_pose_far_from_trouble():
@@ -10,7 +10,7 @@ def test_a_comfortable_posture_reaches_the_pose_far_from_trouble():
         torch.tensor([0.3, 0.4, 0.3], dtype=torch.float64),
         quaternion.normalize(torch.tensor([0.0, 1.0, 0.2, 0.0], dtype=torch.float64)),
     )
-    q = panda.postures(pose)[0]
+    q = comfortable_posture(panda, pose)
     reached = panda.forward(q)
     assert (reached.position - pose.position).norm() < 1e-9
     assert quaternion.angle(reached.orientation, pose.orientation) < 1e-9
@@ -36,4 +36,4 @@ def test_a_pose_out_of_reach_is_refused():
         torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64),
     )
     with pytest.raises(UnreachableError, match="move the pose"):
-        panda.postures(far)
+        comfortable_posture(panda, far)
