@@ -194,7 +194,7 @@ def _hashed(x: Any, seen: dict[int, Any]) -> Iterator[bytes]:
     yield f"{kind.__module__}.{kind.__qualname__}\n".encode()
     if isinstance(x, Tensor):
         yield f"{x.dtype} {tuple(x.shape)} {x.device}\n".encode()
-        yield x.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes()
+        yield x.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
     elif isinstance(x, _PLAIN):
         yield f"{x!r}\n".encode()
     elif id(x) in seen:

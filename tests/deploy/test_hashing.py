@@ -135,3 +135,13 @@ def fresh_hash() -> str:
         return content_hash()
     finally:
         export._source_hash.cache_clear()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_values_count_and_not_how_they_lie_in_memory(dtype):
+    """The position of a pose, for example, is a column of a matrix."""
+    rows = torch.arange(12).reshape(3, 4).to(dtype)
+    assert not rows[:, 3].is_contiguous()
+    assert content_hash(rows[:, 3]) == content_hash(rows[:, 3].clone())
+    assert content_hash(rows[:, 0]) != content_hash(rows[:, 1])
+    assert content_hash(rows.T) != content_hash(rows.reshape(4, 3))
