@@ -245,5 +245,5 @@ def test_a_page_shows_the_real_panda_where_it_is(franka, served):
 def test_the_expert_knows_no_real_panda(franka, tmp_path):
     expert = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
     expert.connect()
-    with pytest.raises(ValueError, match="of a mujoco_arm only, not of franka_panda"):
+    with pytest.raises(ValueError, match="of mujoco_arm, not of franka_panda"):
         expert.get_action()

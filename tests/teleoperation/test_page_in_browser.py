@@ -117,7 +117,7 @@ def test_every_control_has_a_name_for_screen_readers(browser):
       (control) => control.checkVisibility() && !control.closest("[inert]")
         && !control.innerText && !control.ariaLabel && !control.labels?.length
     ).map((control) => control.outerHTML)"""
-    assert browser.tab.get_by_role("slider", name="Strength [%]").count() == 1
+    browser.tab.get_by_role("slider", name="Strength [%]").wait_for()  # named when it is drawn
     assert browser.tab.evaluate(nameless) == []
 
 
