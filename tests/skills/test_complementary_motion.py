@@ -192,6 +192,7 @@ def test_what_is_near_and_does_not_come_nearer_hinders_nobody():
     assert human.reasons() == [set()] * 6
 
 
+@pytest.mark.usefixtures("usual_steps")
 def test_where_an_arm_aside_cannot_go_on_it_waits_and_then_does_everything_that_was_asked():
     wishes, blocked = line(seconds=3.0, still=4.5), {}
     widths = np.arange(len(wishes), dtype=float)
