@@ -163,6 +163,7 @@ def test_the_unit_of_positions_by_kinematics(model, tmp_path, unit, per_metre):
     root, episodes = write(tmp_path / "set", model, np.rad2deg, per_metre=per_metre)
     source = open_demos(root, refuse_doubt=True)
     assert (source.units["position"].unit, source.units["joint_position"].unit) == (unit, "deg")
+    assert source.units["joint_position"].units == ()  # all columns have the same
     np.testing.assert_allclose(source[1].position, tool(model, episodes[1]), atol=1e-6)
 
 

@@ -83,6 +83,15 @@ class SlowCamera:
         return np.zeros((2, 2, 3), np.uint8)
 
 
+def test_an_image_is_kept_now_and_then():
+    arm = ObedientArm(panda.ready.numpy())
+    cell = cell_with(arm, config=WorkCellConfig(keep_image_every=3))
+    cell._markers._sensor = SlowCamera(arm)
+    cell.hold_pose(10 * cell.config.dt)
+    steps = [round(kept.time / cell.config.dt) for kept in cell.images]
+    assert steps == [3, 6, 9]
+
+
 def test_an_image_counts_for_when_it_was_taken_and_once(cell):
     arm = cell._arm
     cell._markers._sensor, cell.tracked_markers = SlowCamera(arm), (7,)
