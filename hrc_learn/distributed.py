@@ -63,6 +63,7 @@ def processes() -> Iterator[int]:
     dist.init_process_group("gloo")
     try:
         yield rank()
+        dist.barrier()  # gloo may abort where another process has already left
     finally:
         dist.destroy_process_group()
 
