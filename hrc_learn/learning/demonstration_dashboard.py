@@ -135,10 +135,8 @@ def _send_arm(
 ) -> None:
     if shown.arm is None or demo.joint_position is None:
         return
-    q, at = (
-        shown.arm.positions(demo.joint_position),
-        rerun_stream.samples(demo.time, rerun_stream.POSE_RATE),
-    )
+    q = shown.arm.positions(demo.joint_position)
+    at = rerun_stream.samples(demo.time, rerun_stream.POSE_RATE)
     opening = shown.arm.opening(demo)
     opened = None if opening is None else opening[at]
     for body in arm_bodies(shown.arm.arm, q[at], opened):

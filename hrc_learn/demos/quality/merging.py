@@ -261,9 +261,8 @@ class _Merge:
         for key, feature in features.items():
             others = [source.folder.info["features"].get(key, {}) for source in self.sources]
             if any(other.get("info") != feature.get("info") for other in others):
-                feature.pop(
-                    "info", None
-                )  # describes the videos; LeRobot reads it from the files
+                # It describes the videos; LeRobot reads it from the files.
+                feature.pop("info", None)
         old = own.sidecar
         columns = {role: c for role, c in old.columns.items() if c.key in features}
         parts = tuple(part for part in old.contract.components if part.key in features)
