@@ -1,8 +1,8 @@
 """Command lines of all commands.
 
 A command line is a frozen dataclass: each field is an option, and its docstring is the help.
-This module imports only the standard library, so a mistyped option is reported at once. Choices therefore
-repeat definitions of other modules; tests compare the two.
+This module imports only the standard library, so a mistyped option is reported at once. Choices
+therefore repeat definitions of other modules; tests compare the two.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

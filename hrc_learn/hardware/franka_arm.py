@@ -248,7 +248,7 @@ class FrankaArm(Connected):
                 "has stopped the arm: make sure that it is at rest, and connect again."
             )
         return (
-            f"the loop has read no state for {age:.2f} s: something holds its process up, so "
+            f"the loop has read no state for {age:.2f} s: something delays its process, so "
             "the control box stops the arm."
         )
 

@@ -135,10 +135,10 @@ class FrankyConfig:
 class FrankaConfig(FrankyConfig):
     """Settings of an arm's 1 kHz loop.
 
-    If an answer is late, the loop cannot know in which cycle the control box uses it. In a
-    wrong cycle, the acceleration changes in addition by up to its own value. With `dynamics` of
-    0.3, an FR3 still allows this: 3 rad/s^2 within 1 ms are a jerk of 3000 rad/s^3; with the
-    planned 1500 rad/s^3, the sum is 4500 rad/s^3, below the limit of 5000.
+    If an answer is late, the loop cannot know in which cycle the control box uses it. An answer
+    used in a wrong cycle adds a change of acceleration of up to the present acceleration. With
+    `dynamics` of 0.3, this stays within the jerk limit of an FR3, 5000 rad/s^3: a change of
+    3 rad/s^2 within 1 ms is a jerk of 3000 rad/s^3, and 1500 rad/s^3 are planned.
 
     Without real-time scheduling, some answers are late; the control box tolerates up to 20
     missing answers in a row. With `realtime=False`, too, the loop sets real-time priority if it

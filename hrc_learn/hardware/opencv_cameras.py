@@ -380,8 +380,8 @@ def fit_delay(
         )
     if not 0 < k < len(delays) - 1:
         raise CameraError(
-            f"the delay is not between 0 and {longest:g} s: look for a longer one, or see "
-            "whether the arm's clock is that of its readings."
+            f"the delay is not between 0 and {longest:g} s: search for a longer delay, or "
+            "check that the times of arm and images come from the same clock."
         )
     # Minimum of a parabola through the smallest residual and its neighbours.
     bend = rest[k - 1] - 2 * rest[k] + rest[k + 1]

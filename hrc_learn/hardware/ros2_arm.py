@@ -28,10 +28,10 @@ from hrc_learn.watchdog import Watchdog
 
 _CLOCK_RESET = 1.0
 """Backward step of the time stamps [s] above which the clock must have been reset. After a
-smaller step, the message was only reordered, unless no newer one comes for `silence`."""
+smaller step, the message was only reordered, unless no newer message comes for `silence`."""
 _DRIFT = 5e-4
 """Fastest drift of the robot's clock against this machine's [s/s]: NTP slews a clock by 500 ppm
-at most. What grows faster is a delay of the messages."""
+at most. A difference that grows faster is a delay of the messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Ros2Config:
     joint_states: str = "/joint_states"
     """Topic of the joint states. Joints are found by name."""
     base: str = "base_link"
-    """Frame of goals and markers of `hrc serve --ros2`; empty: goals of any frame are taken."""
+    """Frame of goals and markers of `hrc serve --ros2`; empty: all frames are accepted."""
     command: str = "/forward_velocity_controller/commands"
     """Topic of the commands to the controller."""
     interface: Literal["velocity", "position", "trajectory"] = "velocity"
@@ -56,8 +56,9 @@ class Ros2Config:
     lag: float = 0.35
     """Largest distance of commanded positions from the measured ones [rad]."""
     wrench: str = ""
-    """Topic of a force and torque sensor (WrenchStamped): what acts on the end effector, at its
-    point and along its axes, or along those of `base`. Empty: no sensor."""
+    """Topic of a force and torque sensor (WrenchStamped); empty: no sensor. The wrench acts on
+    the end effector at the tool centre point, along the axes of the end effector or, if its
+    frame is `base`, of the base."""
     gripper: str = ""
     """Topic of a gripper's position controller (Float64MultiArray); empty: no gripper."""
     gripper_joint: str = ""
@@ -124,8 +125,9 @@ class Ros2Arm(Connected):
         self._wrench = "", np.zeros((2, 3))
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
-        # Times of the last command and of the last change of the goal, and for how long from
-        # then on the goal moves on at the velocity, and brakes [s].
+        # Times of the last command and of the last change of the goal [s].
+        # After this change, the goal moves at the velocity for `_hold`, then brakes for
+        # `_brake` [s].
         self._commanded_at, self._moved_at = -math.inf, 0.0
         self._hold = self._brake = 0.0
         self._closed = False
@@ -309,8 +311,9 @@ class Ros2Arm(Connected):
         step, rest = self._hold, self.config.timeout
         end = goal + 0.5 * rest * velocity
         message: Any = JointTrajectory(joint_names=list(self._names))
-        # By the robot's clock, which differs from this machine's in a simulation, or without
-        # NTP. States without stamps tell nothing of it: zero begins at once.
+        # The stamp is a time of the robot's clock, which differs from this machine's clock in a
+        # simulation, or without NTP. If states have no stamps, this clock is unknown: a stamp
+        # of zero starts the trajectory immediately.
         if self._offset:
             message.header.stamp = Time(seconds=time.monotonic() - self._offset).to_msg()
         for at, position, speed in (step, goal, velocity), (step + rest, end, 0 * velocity):

@@ -81,7 +81,8 @@ class ControllerNode:
         self.session = Ros2Session("hrc_learn", LifecycleNode)
         self.node: Any = self.session.node
         self.latencies, self.commands = deque[float](maxlen=100_000), 0
-        self._seeing = threading.Lock()  # a step and a feature exclude each other
+        # Held during a control step, and while a feature is stored.
+        self._seeing = threading.Lock()
         self._arm: Ros2Arm | None = None
         self._runner: StepRunner
         self._active, self.stopped = threading.Event(), ""

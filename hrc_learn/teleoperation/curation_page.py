@@ -36,7 +36,8 @@ _BLOCK = 32
 _TALLEST = 360
 """Images are scaled down to this height [px]."""
 _MOST_LINES = 12
-"""Largest number of components of a column of unknown meaning; a larger one is not drawn."""
+"""Largest number of components of a column of unknown meaning; a column with more components
+is not drawn."""
 _MOST_POINTS = 2000
 """Largest number of points of a curve. A longer curve is reduced to the extremes of its
 sections."""

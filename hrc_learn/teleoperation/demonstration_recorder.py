@@ -23,7 +23,7 @@ from hrc_learn.skills.step_report import contact_force
 from hrc_learn.teleoperation.hand_guiding import Frame
 
 STILL = 0.005
-"""Motion of a joint [rad] or the gripper [m] up to which the demonstration has not begun."""
+"""Motion of a joint [rad] or the gripper [m] above which the demonstration has begun."""
 _REST = (0.3, 0.7)
 """Rest kept before and after the motion [s]: movement primitives smooth motions, and need time
 to reach the goal."""
@@ -191,7 +191,7 @@ that a briefly busy machine raises no warning.
 """
 _SLOWEST = 0.8
 """Pace of a simulated arm below which a demonstration is doubted. At this pace, the motion in
-the dataset is a quarter faster than demonstrated; even faster ones would meet limits."""
+the dataset is a quarter faster than demonstrated; even faster motions would reach limits."""
 _DRAFT_EVERY = 2.0
 """Shortest period of drafts of the open demonstration [s]."""
 

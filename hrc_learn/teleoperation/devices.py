@@ -79,8 +79,8 @@ _CURVE = 2.0
 def deflection(stick: Float[np.ndarray, " axes"]) -> Float[np.ndarray, " axes"]:
     """Effect of a stick: a vector of length 0 to 1 in the direction of the stick.
 
-    It is zero in the dead zone and rises from its edge without a jump. The zone is a ball:
-    separate zones of the axes would bend slow motions towards the axes.
+    It is zero in the dead zone and rises continuously from the edge of the zone. The zone is a
+    ball: separate zones for each axis would bend slow motions towards the axes.
 
     Args:
         stick: Deflection of the stick, each axis -1 to 1.
@@ -130,7 +130,7 @@ class Gamepad(Human):
         Raises:
             ValueError: There is no gamepad.
         """
-        # There is no window, so events must come even without a focused one.
+        # There is no window, so events must come even without a focused window.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -142,7 +142,7 @@ class Gamepad(Human):
         found = [k for k in range(library.get_count()) if library.is_controller(k)]
         if not found:
             raise ValueError(
-                "SDL finds no gamepad: plug one in, and see that this user may read /dev/input."
+                "SDL finds no gamepad: plug one in. This user must be able to read /dev/input."
             )
         return cls(chain, library.Controller(found[0]), pygame.event.pump)
 
@@ -196,8 +196,8 @@ DIRECTIONS = MappingProxyType(
 
 _FIRST, _REPEATED, _TAP = 0.7, 0.3, 0.4
 """`_FIRST`: time for which a first press counts [s]; keyboards begin to repeat a held key after
-0.25 to 0.66 s. `_REPEATED`: time for which a repeat counts [s]. `_TAP`: fraction of the speed
-until the key repeats, at which a tap moves the end effector by 7 cm."""
+0.25 to 0.66 s. `_REPEATED`: time for which a repeat counts [s]. `_TAP`: fraction of the largest
+speed before the key repeats; at this speed, a tap moves the end effector by 7 cm."""
 
 
 class KeyboardState:
@@ -322,7 +322,7 @@ _HAPTIC_CONTACT = 0.1
 _HAPTIC_MAX_FORCE = 6.0
 """Largest force on the hand [N]; an Omega can hold 12."""
 _HAPTIC_PERIOD = 0.001
-"""Period of the force [s]."""
+"""Period of updates of the force [s]."""
 _HAPTIC_STALE = 0.1
 """Time without feedback from the control loop after which the force vanishes [s]."""
 _HAPTIC_CLUTCH = 0

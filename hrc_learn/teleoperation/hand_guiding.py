@@ -5,7 +5,7 @@ This is the mixed interface of the paper, with gizmos (handles that a person dra
 and end effector. In the paper, the displacement of a joint's gizmo commands a proportional
 velocity, which the pseudo-inverse of the joint's Jacobian maps to the joints (section VII;
 "pinv" here). By default, the displacement is a force here, which the transpose maps to the
-joints. The gizmo of the end effector guides the end effector.
+joints. The gizmo of the end effector requests a velocity of the end effector.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,9 +27,9 @@ from hrc_learn.skills.step_report import PersonFeedback, filter_hindrance
 
 ForceMapping = Literal["transpose", "pinv"]
 DEFAULT_MAPPING: ForceMapping = "transpose"
-"""Default mapping of a pull: a force. Compared with it, and after projection into the null
-space, the paper's pseudo-inverse moves the elbow a quarter to a third as fast, and in 6 to 23 %
-of all directions against the pull (benchmarks/bench_pull_mapping.py).
+"""Default mapping of a pull: a force. After projection into the null space, the paper's
+pseudo-inverse moves the elbow about a third as fast as this force; for 6 to 23 % of the pull
+directions, it moves the elbow against the pull (benchmarks/bench_pull_mapping.py).
 """
 
 
@@ -274,7 +274,7 @@ class HandGuidedArm:
         human: Human,
         config: HandGuidingConfig | None = None,
     ):
-        """Connect to the arm at rest.
+        """Connect to the arm, which must be at rest.
 
         Args:
             chain: Kinematics of the arm.

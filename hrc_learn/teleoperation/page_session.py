@@ -42,7 +42,7 @@ _LOOK = 0.05
 _LEFT_FOR = 5.0
 # Points of a drawn path, enough to look smooth.
 _WAY_POINTS = 24
-# Time for which a remark of the task is shown [s]: two lines are read in half of it.
+# Time for which a remark of the task is shown [s]: two lines can be read in half of this time.
 _REMARK_STAYS = 6.0
 _INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
 

@@ -37,7 +37,7 @@ from hrc_learn.teleoperation.page_scene import ViserServer
 
 _STATUS_EVERY = 0.1  # period of the status [s]
 _SCENE_EVERY = {"leads": 1 / 60, "watches": 1 / 20}
-"""Period of scenes for the controlling client, and for each of many that watch [s]."""
+"""Period of scenes for the controlling client, and for each watching client [s]."""
 _SECRET_HEADER = "X-Page-Secret"
 
 _MOST_IDLE = 10.0

@@ -110,8 +110,8 @@ FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.1
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
 _MARK: Any = "target"
-# Largest and smallest half sizes of a region [m]: sliders end at the reach of the arm, and even
-# a point needs a margin.
+# Largest and smallest half sizes of a region [m]: the largest is the reach of the arm, the
+# smallest leaves a margin around a point.
 _LARGEST, _SMALLEST = 0.5, 0.02
 # Height of a target above the clicked surface: a little more than an object's height [m].
 _LIFTED = 0.08

@@ -154,7 +154,7 @@ def test_a_loop_that_is_held_up_is_told_of_and_goes_on(arm):
     try:
         wait_until(lambda: not reads(arm))
         with pytest.raises(
-            DriverError, match=r"no state for .* s: something holds its process"
+            DriverError, match=r"no state for .* s: something delays its process"
         ):
             arm.read()
     finally:

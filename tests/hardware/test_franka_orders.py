@@ -336,7 +336,7 @@ def test_a_reading_may_be_as_old_as_its_limit(loop, lockstep, longest):
     loop.now = longest
     arm.read()
     loop.now = math.nextafter(longest, 3)
-    with pytest.raises(DriverError, match="something holds its process up"):
+    with pytest.raises(DriverError, match="something delays its process"):
         arm.read()
 
 

@@ -131,7 +131,7 @@ def test_a_stalled_loop_is_stopped_by_the_control_box_and_can_be_recovered(serve
         os.kill(loop_of(arm), signal.SIGSTOP)
         stalled = time.monotonic()
         time.sleep(0.5)
-        with pytest.raises(DriverError, match="holds its process up"):
+        with pytest.raises(DriverError, match="something delays its process"):
             arm.read()
         assert Trace.read(trace).rest_after(stalled) <= AT_REST
         os.kill(loop_of(arm), signal.SIGCONT)

@@ -1,5 +1,5 @@
 "use strict";
-// The page of `hrc curate`: what the server ranked is looked at, played and decided on here.
+// The page of `hrc curate`, on which a person views, plays and judges the ranked episodes.
 
 const SERIES = ["#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#9AA0A6", "#8c564b"];
 const AHEAD = 3; // blocks of images fetched before they are shown
@@ -7,14 +7,14 @@ const KEPT = 12; // blocks of each camera that are kept
 const byId = (id) => document.getElementById(id);
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
 
-let overview = null; // what /data/overview says
+let overview = null; // content of /data/overview
 let order = []; // episodes in the order of the list
 let current = null; // the episode shown
 let curves = null; // its curves
 let usual = null; // the curves of the most usual episode
 let frame = 0;
 let playing = false;
-let marks = { start: 0, stop: 0 }; // of the cut, not decided yet
+let marks = { start: 0, stop: 0 }; // first and last frame of a cut that is not yet decided
 let blocks = new Map(); // "camera:number" -> promise of images
 
 async function ask(path) {
@@ -24,7 +24,7 @@ async function ask(path) {
 }
 const get = async (path) => (await ask(path)).json();
 
-// One message to the program, and the state that it answers with.
+// Send one message to the program, and return the state in its answer.
 const tell = (message) =>
   new Promise((resolve, reject) => {
     const { url, protocols } = hrcDoor.socket("session");
@@ -90,7 +90,7 @@ function list() {
       element("span", { className: `badge ${said}`, textContent: said }),
       element("span", {
         className: "why",
-        textContent: said_of(e) + (e.reasons.join("; ") || "nothing speaks against it"),
+        textContent: said_of(e) + (e.reasons.join("; ") || "no reason for doubt"),
       }),
     );
     const item = element("li", {}, button);
@@ -172,7 +172,7 @@ async function choose(episode) {
   marks = decided?.verdict === "cut" ? { start: decided.start, stop: decided.stop } : motion;
   byId("title").textContent = `Episode ${episode.episode}`;
   byId("task").textContent = `${episode.task} (${episode.length} frames)`;
-  const reasons = episode.reasons.length ? episode.reasons : ["Nothing speaks against it."];
+  const reasons = episode.reasons.length ? episode.reasons : ["No reason for doubt."];
   byId("reasons").className = episode.reasons.length ? "" : "none";
   byId("reasons").replaceChildren(
     ...reasons.map((text) => element("li", { textContent: text })),
@@ -343,7 +343,7 @@ function drawChart(canvas) {
   pen.fillText(low.toPrecision(3), 3, h - 3);
 }
 
-// Playing: by the clock, and no faster than images arrive.
+// Playing: at the rate of the clock, and no faster than images arrive.
 
 function seek(to) {
   frame = Math.min(Math.max(to, 0), current.length - 1);
@@ -371,7 +371,7 @@ async function play() {
     frame = next;
     const before = performance.now();
     await show();
-    // What was waited for is no time of the demonstration.
+    // Time spent waiting for images is not part of the demonstration.
     if (performance.now() - before > 200) [began, from] = [performance.now(), frame];
   }
   playing = false;

@@ -1,5 +1,5 @@
 "use strict";
-// Shows what the program sends in Rerun's viewer: each message is a piece of a recording.
+// Shows the messages of the program in Rerun's viewer. Each message is a part of a recording.
 (async () => {
   const words = document.getElementById("words");
   try {

@@ -19,7 +19,7 @@ from hrc_learn.store import cache_home
 _FIRST_PORTS = range(8080, 8180)  # tried in turn if no port is given
 _NO_ADDRESS = {errno.EADDRNOTAVAIL, socket.EAI_NONAME, socket.EAI_AGAIN, socket.EAI_FAIL}
 _VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
-_LEAST = 7 * 24 * 3600  # least remaining validity of our own certificate to be used again [s]
+_LEAST = 7 * 24 * 3600  # remaining validity below which our own certificate is replaced [s]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -215,7 +215,7 @@ class Gate:
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket through."""
         try:
-            # websockets fails by itself at letters that ASCII lacks.
+            # websockets itself would fail on characters that are not ASCII.
             if not all(value.isascii() for _, value in request.headers.raw_items()):
                 raise RefusedError(400, "Headers are ASCII text.")
             if not self._admission.is_ours(_header(request, "Host")):
@@ -226,7 +226,7 @@ class Gate:
             content = await self._content(request)
         except RefusedError as error:
             return _response(error.code, Content(body=f"{error}\n".encode(), kind=_PLAIN))
-        except Exception as error:  # a fault of ours ends this request only
+        except Exception as error:  # an error of this program ends this request only
             _logger.exception("%s failed", request.path)
             words = f"{type(error).__name__}: {error}\n"
             return _response(500, Content(body=words.encode(), kind=_PLAIN))
@@ -285,7 +285,7 @@ class Gate:
             pass
         except MessageError as error:
             await connection.close(_TOO_MUCH, str(error)[:120])
-        except Exception:  # a fault of ours ends this client only
+        except Exception:  # an error of this program ends this client only
             _logger.exception("a client of %s failed", route)
             await connection.close(_FAILED, "the program failed on a message")
         finally:
@@ -322,7 +322,7 @@ def _path(request: Request) -> str:
 
 
 def _header(request: Request, name: str) -> str:
-    """Value of a header that a request may give once; empty where it is absent."""
+    """Value of a header that a request may contain once; empty if the header is absent."""
     values = request.headers.get_all(name)
     if len(values) > 1:
         raise RefusedError(400, f"The request has more than one header {name}.")
@@ -345,7 +345,7 @@ def _secret(request: Request) -> str:
 def _quiet_logger() -> logging.Logger:
     """Drop log lines about refused clients, which could otherwise flood the terminal.
 
-    websockets calls it an internal error when a client closes before it has the answer.
+    websockets logs an internal error if a client closes its connection before the answer.
     """
     noise = ("opening handshake", "unexpected internal error")
     logger = logging.getLogger("hrc_learn.gate.sockets")

@@ -1,7 +1,7 @@
 // Holds the socket of the session apart from the page, whose own thread may be busy drawing.
 "use strict";
 let socket, alive = Date.now();
-const BEAT = 40; // [ms]: three are missed before the arm is asked for no motion
+const BEAT = 40; // period [ms]: after three missed beats, no motion is requested of the arm
 
 self.onmessage = ({ data }) => {
   if (data.alive) alive = Date.now();

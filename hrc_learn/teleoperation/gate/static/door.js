@@ -1,4 +1,4 @@
-// Keeps the secret of the address for this tab, and shows it to our own server only.
+// Keeps the secret of the address for this tab, and sends it to our own server only.
 //
 // The secret comes in the fragment of the address, which browsers send to no server. Session
 // storage belongs to one origin, with its port, and to one tab.
@@ -31,7 +31,7 @@
   };
   window.hrcDoor = { draw, socket };
 
-  // A missing or outdated secret: say so instead of a page that stays empty.
+  // If the secret is missing or outdated, show the reason instead of an empty page.
   plain("/admitted", { headers: { Authorization: `Bearer ${secret}` } }).then(async (answer) => {
     if (answer.ok) return;
     const words = document.createElement("p");

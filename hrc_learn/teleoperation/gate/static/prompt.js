@@ -1,10 +1,10 @@
-// Lets a drag be followed promptly where drawing takes its time. Runs before viser's client.
+// Makes the arm follow a drag promptly even if drawing is slow. Runs before viser's client.
 (() => {
   "use strict";
-  const INTERVAL = 45; // from one frame to the next request: three of a screen with 60 a second [ms]
+  const INTERVAL = 45; // time from one frame to the next request [ms]: three frames at 60 Hz
 
-  // Browsers tell of a pointer's motion once a frame: what drags is told to viser's client as
-  // it moves.
+  // Browsers report a pointer's motion once per frame. Here, the motion of a dragging pointer is
+  // passed to viser's client immediately.
   addEventListener("pointerrawupdate", (event) => {
     if (event.buttons) dispatchEvent(new PointerEvent("pointermove", event));
   });
@@ -18,13 +18,13 @@
   };
   if (!drawsInSoftware()) return;
 
-  // Smooth edges would cost half of the frames, and nobody reads the picture back.
+  // Antialiasing would halve the frame rate, and no program reads the picture back.
   const getContext = HTMLCanvasElement.prototype.getContext;
   HTMLCanvasElement.prototype.getContext = function (kind, wishes) {
     return getContext.call(this, kind, { ...wishes, antialias: false, preserveDrawingBuffer: false });
   };
 
-  // Frames drawn one right after the other leave no time to hear of the pointer in between.
+  // Frames drawn immediately after each other leave no time for the events of the pointer.
   const request = window.requestAnimationFrame.bind(window);
   const asked = new Map();
   let count = 0, waiting = false, next = 0;

@@ -1,8 +1,8 @@
-// The page's tie to the program: signs of life, who leads, and what there is to say. It also
+// Connects the page to the program: signs of life, control of the arm, and messages. It also
 // names the controls that viser's client leaves without a name.
 //
-// Runs before viser's client. Signs of life come from a worker, which goes on while the page
-// draws, and tell for how long the page itself has not reacted.
+// Runs before viser's client. A worker sends the signs of life, even while the page draws. Each
+// sign of life contains the time for which the page itself has not responded.
 (() => {
   "use strict";
   const client = hrcDoor.draw();
@@ -43,12 +43,12 @@
     role = status.role;
     bar.className = role;
     if (role === "watches") {
-      if (!status.may_lead) show("You watch: this link is for watching only.");
-      else if (status.asked) show("You watch. Who leads has been asked; give it ten seconds.");
-      else if (status.taken) show("You watch: somebody else leads.", "Ask to lead", "ask");
+      if (!status.may_lead) show("You are watching: this link is for watching only.");
+      else if (status.asked) show("You are watching. You have asked to lead; the answer may take ten seconds.");
+      else if (status.taken) show("You are watching: another person leads.", "Ask to lead", "ask");
       else show("Nobody leads.", "Lead", "ask");
     } else if (status.asked) {
-      show("Somebody else asks to lead.", "Hand over", "hand_over");
+      show("Another person asks to lead.", "Hand over", "hand_over");
     } else {
       bar.className = status.words ? "warns" : "leads";
       show(status.words);
@@ -89,7 +89,7 @@
   };
   addEventListener("DOMContentLoaded", () => setInterval(nameControls, 500));
 
-  // Where this device has cameras or displays for it, the arm can stand in the room.
+  // On a device that supports AR, the arm can be shown in the room.
   const offerRoom = async () => {
     const able = await navigator.xr?.isSessionSupported("immersive-ar").catch(() => false);
     if (!able || !(await fetch("/xr")).ok) return;
@@ -105,7 +105,7 @@
     if (data.type === "state") state(data);
     else if (data.type === "end") over(data.words);
     else if (data.type === "closed" && !ended) {
-      over(data.words || "The program does not answer any more. Reload to look for it again.");
+      over(data.words || "The program does not answer any more. Reload the page to connect again.");
     }
   };
 })();

@@ -1,4 +1,4 @@
-// The arm and its workplace, drawn from the glTF file of the server: over the real one, as a
+// The arm and its workplace, drawn from the glTF file of the server: over the real arm, as a
 // small twin, or as the ghost of a demonstration.
 
 import {
@@ -29,14 +29,14 @@ export interface Met {
   joint: number | null;
   /** Index of the body. */
   body: number;
-  /** Between hand and surface, or along the ray [m], as the person sees it. */
+  /** Distance between hand and surface, or along the ray, at the scale shown to the person [m]. */
   distance: number;
 }
 
 export interface Look {
-  /** As in the paper: a close arm is held where it is, a remote one from afar. */
+  /** As in the paper: an arm within reach is held directly, a remote arm from a distance. */
   manipulation: "close" | "remote" | "ghost";
-  /** Whether all of the workplace is drawn, rather than the arm alone. */
+  /** True if the whole workplace is drawn, false if only the arm is. */
   furniture: boolean;
   opacity: number;
   tint?: string;
@@ -87,7 +87,7 @@ export class ArmView {
     }
   }
 
-  /** How large a metre of the arm appears [m]. */
+  /** Length at which one metre of the arm appears [m]. */
   get scale(): number {
     return this.group.matrix.getMaxScaleOnAxis();
   }
@@ -108,7 +108,7 @@ export class ArmView {
   }
 
   orientationToBase(orientation: Quaternion): Quaternion {
-    // Rotations of a scaled matrix: three divides the scale out only when it decomposes.
+    // Rotation of a scaled matrix: three removes the scale only when it decomposes the matrix.
     const base = new Quaternion();
     this.group.matrixWorld.decompose(new Vector3(), base, new Vector3());
     return base.invert().multiply(orientation);
@@ -188,7 +188,7 @@ export class ArmView {
     return best;
   }
 
-  /** A mesh of its own, in the colours of this view; geometry is shared. */
+  /** Copy of a mesh in the colours of this view; the copies use the same geometry. */
   private copied(mesh: Mesh): Mesh {
     const material = (mesh.material as MeshStandardMaterial).clone();
     const { opacity, tint } = this.look;
@@ -257,7 +257,7 @@ export const CORNERS: Triple[] = [-1, 1].flatMap((x) =>
   [-1, 1].flatMap((y) => [-1, 1].map((z): Triple => [x, y, z])),
 );
 
-/** From the points held to the hands, in the colour of how far the arm follows. */
+/** Arrows from the held points to the hands; the colour shows how far the arm follows. */
 class Arrows {
   readonly group = new Group();
   private material = new MeshBasicMaterial();

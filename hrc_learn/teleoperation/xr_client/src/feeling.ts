@@ -1,10 +1,10 @@
-// What comes back: pulses of controllers, and words beside the arm.
+// Feedback: pulses of controllers, and text next to the arm.
 
 import { CanvasTexture, Sprite, SpriteMaterial, SRGBColorSpace } from "three";
 
-/** Time from one pulse to the next, and length of a pulse [ms]; as a gamepad's (RumbleConfig). */
+/** Time from one pulse to the next, and length of a pulse [ms]; the same as for a gamepad. */
 const [EVERY, PULSE] = [250, 120];
-/** Strength below which there is no pulse, of 1. */
+/** Strength below which there is no pulse, as a fraction of full strength. */
 const LEAST = 0.1;
 
 interface Actuator {
@@ -12,13 +12,14 @@ interface Actuator {
   playEffect?(kind: "dual-rumble", effect: object): Promise<unknown>;
 }
 
-/** Shakes all controllers in pulses, as strongly as what is met or not followed. */
+/** Pulses of all controllers, whose strength shows contact or input that the arm does not follow. */
 export class Pulses {
   private next = 0;
 
   /**
-   * @param sources Of the session; hands have no motors.
-   * @param strengths Of the slow and of the quick motor, 0 to 1; a single motor takes the larger.
+   * @param sources Input sources of the session; hands have no motors.
+   * @param strengths Strengths of the slow and the quick motor, 0 to 1. A single motor uses the
+   *   larger one.
    */
   play(sources: Iterable<XRInputSource>, [slow, quick]: [number, number], now: number): void {
     const strength = Math.max(slow, quick);
@@ -38,14 +39,14 @@ export class Pulses {
   }
 }
 
-/** Words in the room that face the person. */
+/** Text in the room that faces the person. */
 export class Label {
   readonly sprite: Sprite;
   private canvas = document.createElement("canvas");
   private texture: CanvasTexture;
   private shown = "";
 
-  /** @param height Of a line [m]. */
+  /** @param height Height of a line [m]. */
   constructor(private height: number) {
     this.texture = new CanvasTexture(this.canvas);
     this.sprite = new Sprite(new SpriteMaterial({ depthTest: false }));
@@ -74,7 +75,7 @@ export class Label {
     paper.font = font;
     paper.fillStyle = "#f4f6f8";
     lines.forEach((line, i) => paper.fillText(line, 22, 40 * i + 36));
-    // A texture keeps the size it was first drawn with.
+    // A texture keeps the size with which it was first drawn.
     this.texture.dispose();
     this.texture = new CanvasTexture(this.canvas);
     this.texture.colorSpace = SRGBColorSpace;

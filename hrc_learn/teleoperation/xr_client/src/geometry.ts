@@ -3,7 +3,7 @@
 import { Matrix4, Quaternion, Vector3 } from "three";
 
 export type Triple = [number, number, number];
-/** Unit quaternion (w, x, y, z), as everywhere on the wire. */
+/** Unit quaternion (w, x, y, z), as in all messages. */
 export type Quadruple = [number, number, number, number];
 
 export const triple = (v: Vector3): Triple => [v.x, v.y, v.z];
@@ -18,7 +18,7 @@ export function pointToSegment(point: Vector3, start: Vector3, end: Vector3): nu
 }
 
 /**
- * Where a ray comes nearest to a segment: the distance along the ray, and that between the two.
+ * Closest approach of a ray to a segment: distance along the ray, and distance between the two.
  * C. Ericson, Real-Time Collision Detection (2005), section 5.1.9, with one end left open.
  */
 export function rayToSegment(
@@ -44,21 +44,21 @@ export function rayToSegment(
   return { along: s, distance: near.distanceTo(start.clone().addScaledVector(d, t)) };
 }
 
-/** Where the arm's base stands in the room: upright, as rooms and tables are. */
+/** Pose of the arm's base in the room, with a vertical axis. */
 export interface Placement {
-  /** Of the base's origin, in the reference space of the session [m]. */
+  /** Position of the base's origin, in the reference space of the session [m]. */
   position: Triple;
-  /** About the vertical [rad]. */
+  /** Rotation about the vertical [rad]. */
   yaw: number;
-  /** Size of the arm, of its own. */
+  /** Size of the arm, as a fraction of its true size. */
   scale: number;
 }
 
 const UP = new Vector3(0, 1, 0);
-// Frames of arms have z up, those of WebXR y.
+// In the frames of arms, z points up; in those of WebXR, y points up.
 const STAND = new Quaternion().setFromAxisAngle(new Vector3(1, 0, 0), -Math.PI / 2);
 
-/** From the base frame to the reference space. */
+/** Transform from the base frame to the reference space. */
 export function placementMatrix({ position, yaw, scale }: Placement): Matrix4 {
   const turn = new Quaternion().setFromAxisAngle(UP, yaw).multiply(STAND);
   const size = new Vector3(scale, scale, scale);
@@ -68,8 +68,9 @@ export function placementMatrix({ position, yaw, scale }: Placement): Matrix4 {
 /**
  * The upright placement that brings known points of the base frame nearest to touched ones.
  *
- * Gravity is known better than three fingertips are, so one angle and the position are fitted:
- * in closed form, by least squares. `error` is the root mean square of what is left [m].
+ * The headset measures gravity more accurately than fingertips, so only one angle and the
+ * position are fitted, by least squares in closed form. `error` is the root mean square
+ * residual [m].
  */
 export function fitPlacement(
   known: Triple[],
@@ -102,7 +103,7 @@ export function yawOf(orientation: Quaternion): number {
   return Math.atan2(-x.z, x.x);
 }
 
-/** A turn made smaller: the same axis, a share of the angle. */
+/** A smaller rotation: the same axis, a fraction of the angle. */
 export function partOf(turn: Quaternion, share: number): Quaternion {
   return new Quaternion().slerp(turn.w < 0 ? new Quaternion(-turn.x, -turn.y, -turn.z, -turn.w) : turn, share);
 }

@@ -1,8 +1,8 @@
-// The last demonstration, played again by a ghost of the arm.
+// The last demonstration, replayed by a translucent arm (the ghost).
 
 import type { SceneState } from "./protocol";
 
-/** Longest that is kept [s]: of the seen motion, at 60 poses a second some 20 MB. */
+/** Longest motion that is kept [s]: about 20 MB at 60 poses per second. */
 const LONGEST = 300;
 
 export class Tape {
@@ -19,7 +19,7 @@ export class Tape {
     return this.played !== null;
   }
 
-  /** Note what is seen while a demonstration is recorded; a new one begins anew. */
+  /** Store the shown poses while a demonstration is recorded; a new one replaces the last. */
   note(scene: SceneState, recording: boolean, now: number): void {
     if (recording && !this.recording) this.frames = [];
     this.recording = recording;
@@ -33,7 +33,7 @@ export class Tape {
     this.played = this.played === null && !this.empty ? now : null;
   }
 
-  /** Where the bodies were at this time of the replay; null: it is over. */
+  /** Poses of the bodies at this time of the replay; null: the replay is over. */
   bodies(now: number): number[][] | null {
     if (this.played === null) return null;
     const time = this.frames[0]!.time + now - this.played;

@@ -1,5 +1,5 @@
-// What hands do to the arm: hold a link or the end effector of either arm, lead the end effector
-// from anywhere, draw the region, mark the target, touch the points that place the arm.
+// Actions of hands: hold a link or the end effector of either arm, guide the end effector from
+// a distance, draw the region, mark the target, touch the points that place the arm.
 
 import { Matrix4, Plane, Vector3 } from "three";
 import { CORNERS, type ArmView, type Met } from "./arm_view";
@@ -7,27 +7,27 @@ import { partOf, quadruple, triple, type Triple } from "./geometry";
 import type { Pointer } from "./inputs";
 import { within, type Grip, type HandName, type Region } from "./protocol";
 
-/** What goes on from a pinch until it opens. */
+/** An action that lasts from a pinch until it opens. */
 export interface Drag {
   move(pointer: Pointer): void;
   end(): void;
 }
 
-/** Takes a pinch, or leaves it to the next tool. */
+/** Handles a pinch, or leaves it to the next tool. */
 export interface Tool {
   begin(pointer: Pointer): Drag | null;
 }
 
-/** Within this a hand holds what it is at, as the person sees it [m]: a finger's breadth of
- * surface and the error of hand tracking. */
+/** Distance within which a hand holds a body, at the scale shown to the person [m]: a finger's
+ * breadth and the error of hand tracking. */
 const NEAR = 0.05;
-/** Within this a ray meets what it passes [m]: half a finger. */
+/** Distance within which a ray meets a body [m]: half the breadth of a finger. */
 const SLACK = 0.01;
 
 export interface Settings {
-  /** Motion of the end effector for that of a hand which leads it from anywhere. */
+  /** Motion of the end effector per motion of a hand that guides it from a distance. */
   gain: number;
-  /** Whether the hand that leads the end effector turns it too, over the coarse rule. */
+  /** True if the hand that guides the end effector adds its rotation to the coarse rule. */
   turns: boolean;
 }
 
@@ -44,9 +44,9 @@ export class Holding implements Tool {
   readonly targets = new Map<HandName, Target>();
 
   /**
-   * @param views The arm over the real one first.
-   * @param tool Where the end effector is, in the base frame; null before it is known.
-   * @param forward Where the camera looks, for fingers on a screen.
+   * @param views Views of the arm; the view over the real arm is the first.
+   * @param tool Position of the end effector, in the base frame; null before it is known.
+   * @param forward Direction of the camera, for fingers on a screen.
    */
   constructor(
     private views: () => ArmView[],
@@ -101,7 +101,7 @@ export class Holding implements Tool {
     const share = how === "clutch" ? Math.min(this.settings.gain, 1) : 1;
     const move = (now: Pointer) => {
       const aimed = triple(follow(now));
-      if (!within(aimed)) return; // beyond that the gate takes it for no hand of ours
+      if (!within(aimed)) return; // beyond this range, the gate refuses the message
       const turn = now.orientation.clone().multiply(turned.clone().invert());
       this.grips.set(pointer.hand, {
         hand: pointer.hand,
@@ -121,13 +121,13 @@ export class Holding implements Tool {
     };
   }
 
-  /** From afar, what is held sits on the ray as on a rod. */
+  /** From a distance, the held body moves with the ray as if fixed to a rod. */
   private rod(pointer: Pointer, hit: Vector3): (now: Pointer) => Vector3 {
     const held = hit.clone().applyMatrix4(new Matrix4().copy(pointer.aim).invert());
     return ({ aim }) => held.clone().applyMatrix4(aim);
   }
 
-  /** On a screen, it moves in the plane that faces the camera. */
+  /** On a screen, the held body moves in the plane that faces the camera. */
   private pane(hit: Vector3): (now: Pointer) => Vector3 {
     const plane = new Plane().setFromNormalAndCoplanarPoint(this.forward(), hit);
     let last = hit.clone();
@@ -141,7 +141,7 @@ export class Holding implements Tool {
 /** Half sizes that a region may have [m], as on the page. */
 const SMALLEST = 0.02;
 const LARGEST = 0.5;
-/** Within this of a corner a pinch sizes the region [m]. */
+/** Distance from a corner within which a pinch resizes the region [m]. */
 const CORNER = 0.04;
 /** Height of a region drawn on a screen, where a finger has no depth [m]. */
 const HEIGHT = 0.2;
@@ -156,9 +156,9 @@ export function boxBetween(a: Vector3, b: Vector3): Region {
   };
 }
 
-/** Draws the region, moves it and sizes it: near a corner, inside, elsewhere. */
+/** Resizes the region near a corner, moves it inside, and draws a new region elsewhere. */
 export class Drawing implements Tool {
-  /** As it is being drawn; null: nobody draws. */
+  /** Region that is being drawn; null: no region is being drawn. */
   region: Region | null = null;
 
   constructor(
@@ -190,7 +190,7 @@ export class Drawing implements Tool {
   private point(pointer: Pointer, view: ArmView | undefined): Vector3 | null {
     if (!view) return null;
     if (pointer.position) return view.toBase(pointer.position);
-    // On a screen, the point of the table that it shows.
+    // On a screen, the point of the table under the pointer.
     const up = new Vector3(0, 0, 1).transformDirection(view.group.matrixWorld);
     const table = new Plane().setFromNormalAndCoplanarPoint(up, view.toWorld([0, 0, 0]));
     const hit = pointer.ray.intersectPlane(table, new Vector3());
@@ -251,13 +251,13 @@ export class Touching implements Tool {
     private done: (touched: Vector3[]) => void,
   ) {}
 
-  /** How many have been touched. */
+  /** Number of points touched so far. */
   get so_far(): number {
     return this.touched.length;
   }
 
   begin(pointer: Pointer): Drag | null {
-    // A fingertip says best where a point is; a controller has none.
+    // A fingertip locates a point most accurately; a controller has none.
     const point = pointer.position;
     if (!point) return null;
     this.touched.push(point.clone());
@@ -269,7 +269,7 @@ export class Touching implements Tool {
   }
 }
 
-/** Takes the twin by its foot and stands it elsewhere. */
+/** Moves the twin, held at its base, to another place. */
 export class MovingTwin implements Tool {
   constructor(
     private twin: () => ArmView | null,
@@ -286,7 +286,7 @@ export class MovingTwin implements Tool {
   }
 }
 
-/** Of two arms, the one at which a hand is, by the measure of each. */
+/** The nearer of two arms to a hand, with the distances at the scale of each arm. */
 function nearestView(views: ArmView[], pointer: Pointer): ArmView | undefined {
   const { position } = pointer;
   if (!position) return views[0];

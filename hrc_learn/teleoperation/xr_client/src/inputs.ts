@@ -6,10 +6,10 @@ import type { HandName } from "./protocol";
 export interface Pointer {
   hand: HandName;
   pinched: boolean;
-  /** Between thumb and index finger, or of the controller; null: it is on a screen. */
+  /** Point between thumb and index finger, or of the controller; null: a pointer on a screen. */
   position: Vector3 | null;
   orientation: Quaternion;
-  /** Tip of the index finger, where there is one. */
+  /** Tip of the index finger, if there is one. */
   tip: Vector3 | null;
   ray: Ray;
   /** Frame of the ray. */
@@ -29,9 +29,9 @@ export class XrInputs {
     });
   }
 
-  /** As they are now; what is not tracked is not there, and so holds nothing. */
+  /** The present pointers; a hand that is not tracked is left out, and so holds nothing. */
   read(frame: XRFrame, space: XRReferenceSpace): Pointer[] {
-    // While a menu of the headset is open, hands are not ours.
+    // While a menu of the headset is open, hands belong to the menu.
     if (frame.session.visibilityState !== "visible") return [];
     const pointers = new Map<HandName, Pointer>();
     for (const source of frame.session.inputSources) {

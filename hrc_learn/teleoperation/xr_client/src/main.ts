@@ -1,4 +1,4 @@
-// The client: draws what `hrc page` tells, and tells it what hands do.
+// The client: draws the state that `hrc page` sends, and sends the actions of hands.
 
 import {
   Color,
@@ -29,9 +29,9 @@ import { Connection, within, type Description, type HandName, type TrackedHand }
 
 /** Gains of the clutch, from coarse to fine. */
 const GAINS = [1, 0.5, 0.25, 2];
-/** Poses of hands that hold nothing are told this often [ms]: as often as frames are recorded. */
+/** Period of sending poses of hands that hold nothing [ms]: the period of recorded frames. */
 const HANDS_EVERY = 20;
-/** Touched points may miss by this [m]: beyond, one of them was another point. */
+/** Largest error of touched points [m]: above it, a wrong point was touched. */
 const MISSED = 0.03;
 const GREY = "#9AA0A6";
 const VERMILION = "#D55E00";
@@ -68,7 +68,7 @@ class Client {
   private inputs: XrInputs | null = null;
   private frame: XRFrame | null = null;
   private backdrop: Object3D;
-  private ready = false; // hands take hold only of what the person sees
+  private ready = false; // hands hold only bodies that the person sees
 
   private holding: Holding;
   private drawing: Drawing;
@@ -153,7 +153,7 @@ class Client {
     this.renderer.setAnimationLoop((time, frame) => this.draw(time, frame ?? null));
   }
 
-  /** Enter AR, or VR where a headset has no cameras. */
+  /** Enter AR, or VR if the headset has no cameras. */
   private async enter(mode: XRSessionMode): Promise<void> {
     const overlay = document.getElementById("overlay")!;
     const session = await navigator.xr!.requestSession(mode, {
@@ -220,7 +220,7 @@ class Client {
     this.renderer.render(this.scene, this.camera);
   }
 
-  /** Where the person stands is known with the first frame of a session. */
+  /** The first frame of a session gives the position of the person. */
   private begin(frame: XRFrame, space: XRReferenceSpace): void {
     const pose = this.ready ? null : frame.getViewerPose(space);
     if (!pose) return;
@@ -230,12 +230,12 @@ class Client {
     this.ready = true;
   }
 
-  /** Begin, continue and end what each hand does, and tell it. */
+  /** Begin, continue and end the action of each hand, and send it. */
   private act(pointers: Pointer[], time: number): void {
     for (const pointer of pointers) {
       const before = this.drags.get(pointer.hand);
       if (pointer.pinched && !before) {
-        // A pinch that no tool takes is a pinch all the same: it takes nothing that it meets later.
+        // A pinch that no tool handles still counts as a pinch: it holds no body that it meets later.
         let drag: Drag | null = null;
         for (const tool of this.tools[this.mode]) if ((drag ??= tool.begin(pointer))) break;
         this.drags.set(pointer.hand, { drag, last: pointer });
@@ -313,7 +313,7 @@ class Client {
       for (const mode of modes) add(mode.label, () => void this.enter(mode.mode));
     }
     if (status.role === "watches") {
-      const words = status.taken ? "You watch: somebody else leads." : "Nobody leads.";
+      const words = status.taken ? "You are watching: another person leads." : "No person leads.";
       const lead = () => connection.send({ type: "lead", wish: "ask" });
       add("Ask to lead", lead, { disabled: status.asked });
       return { words, colour: GREY, buttons };
@@ -370,7 +370,7 @@ class Client {
     if (this.description.guides) lines.push(task.trim() ? `Task: ${task}` : "The task has no name yet.");
     const tool = {
       lead: "",
-      region: "Pinch and draw the region; inside it moves, at a corner it is sized.",
+      region: "Pinch and draw the region. Pinch inside to move it, at a corner to resize it.",
       target: "Pinch where the target is.",
       place: this.pointToTouch(),
     }[this.mode];
@@ -395,7 +395,7 @@ class Client {
     this.arm.opacity = this.solid ? 1 : 0.35;
   }
 
-  /** Where fingertips are, and what they hold or would hold. */
+  /** Positions of fingertips, and the bodies that they hold or would hold. */
   private cues(pointers: Pointer[]): void {
     const seen = new Set<HandName>();
     const lit = new Map<ArmView, number>();
@@ -432,7 +432,7 @@ class Client {
     return cue;
   }
 
-  /** What the arm tells: pulses, and words above the end effector. */
+  /** Feedback of the arm: pulses, and text above the end effector. */
   private feel(time: number): void {
     const { status, scene } = this.connection;
     if (!status || !scene) return;
@@ -449,7 +449,7 @@ class Client {
     view.group.matrixWorldNeedsUpdate = true;
   }
 
-  /** Look at the workplace where there is no headset. */
+  /** Show the workplace without a headset. */
   private frameWorkplace(): void {
     this.stand(this.arm, placementMatrix(this.placing.arm));
     this.arm.group.updateMatrixWorld(true);

@@ -1,4 +1,4 @@
-// All that can be asked for by a button, once as HTML and once as a panel in the room.
+// All buttons, once as HTML and once as a panel in the room.
 
 import {
   CanvasTexture,
@@ -22,7 +22,7 @@ export interface Button {
 
 export interface MenuState {
   words: string;
-  /** Of the words. */
+  /** Colour of the text. */
   colour: string;
   buttons: Button[];
 }
@@ -38,7 +38,7 @@ export class HtmlMenu {
     task: HTMLInputElement | null,
   ) {
     if (task) list.before(task);
-    // A touch on a button is no touch on what lies behind it.
+    // A touch on a button must not also act on the scene behind it.
     overlay.addEventListener("beforexrselect", (event) => event.preventDefault());
   }
 
@@ -61,16 +61,16 @@ export class HtmlMenu {
 }
 
 const [WIDTH, HEIGHT] = [512, 744];
-/** Width of the panel [m]: read at arm's length. */
+/** Width of the panel [m], readable at arm's length. */
 const SIZE = 0.34;
 const [TOP, ROW, COLUMNS, GAP] = [232, 56, 2, 8];
-/** From this on a panel is out of reach of a ray [m]. */
+/** Distance beyond which a ray does not reach a panel [m]. */
 const FURTHEST = 3;
-/** A fingertip presses within this of the panel [m]. */
+/** Distance from the panel within which a fingertip presses [m]. */
 const DEPTH = 0.015;
 
-/** A panel in the room. Pressed by a ray and a pinch, or by the tip of a finger; carried by its
- * upper part. */
+/** A panel in the room. A ray and a pinch, or a fingertip, press its buttons; its upper part is
+ * the handle for moving it. */
 export class Panel implements Tool {
   readonly mesh: Mesh<PlaneGeometry, MeshBasicMaterial>;
   private canvas = document.createElement("canvas");
@@ -91,7 +91,7 @@ export class Panel implements Tool {
     this.mesh.visible = false;
   }
 
-  /** Stand it before a person, at their left. */
+  /** Place the panel in front of a person, on the left. */
   stand(head: Object3D["matrixWorld"]): void {
     const eye = new Vector3().setFromMatrixPosition(head);
     const level = new Vector3(0, 0, -1).transformDirection(head).setY(0).normalize();
@@ -136,7 +136,7 @@ export class Panel implements Tool {
     }
   }
 
-  /** The place of the panel that a ray meets, in pixels. */
+  /** Point of the panel that a ray meets, in pixels. */
   meet(ray: Ray): { x: number; y: number } | null {
     if (!this.mesh.visible) return null;
     const local = ray.clone().applyMatrix4(this.mesh.matrixWorld.clone().invert());

@@ -1,5 +1,5 @@
-// Where the arm and its twin stand in the room, kept between sessions and held in place by
-// anchors of the headset where it has them.
+// Placements of the arm and its twin in the room. They are kept between sessions, by anchors if
+// the headset supports them.
 
 import { Matrix4, Quaternion, Vector3 } from "three";
 import { triple, yawOf, type Placement, type Triple } from "./geometry";
@@ -7,19 +7,19 @@ import { triple, yawOf, type Placement, type Triple } from "./geometry";
 interface Stored {
   arm: Placement | null;
   twin: Placement | null;
-  /** Of an anchor that the headset remembers. */
+  /** Name of an anchor that the headset remembers. */
   anchor: string | null;
 }
 
 const KEY = "hrc-placing";
 const TWIN_SCALE = 0.3;
-/** Height of the base above the floor where nobody has placed it [m]: a table's. */
+/** Height of the base above the floor until a person has placed it [m]: that of a table. */
 const TABLE = 0.72;
 
 export class Placing {
   arm: Placement;
   twin: Placement;
-  /** Whether the arm was placed by a person, now or in an earlier session. */
+  /** True if a person has placed the arm, now or in an earlier session. */
   placed: boolean;
   private anchor: XRAnchor | null = null;
   private stored: Stored;
@@ -31,7 +31,7 @@ export class Placing {
     this.twin = this.stored.twin ?? { position: [0.35, 1, -0.5], yaw: -Math.PI / 2, scale: TWIN_SCALE };
   }
 
-  /** At the begin of a session: what nobody has placed stands before the person. */
+  /** Begin a session: an arm that no person has placed appears in front of the person. */
   async begin(session: XRSession, head: Matrix4): Promise<void> {
     const eye = new Vector3().setFromMatrixPosition(head);
     const turn = yawOf(new Quaternion().setFromRotationMatrix(head));
@@ -49,12 +49,12 @@ export class Placing {
       try {
         this.anchor = await session.restorePersistentAnchor(this.stored.anchor);
       } catch {
-        this.stored.anchor = null; // the headset has forgotten it: the place itself is kept
+        this.stored.anchor = null; // the headset has forgotten the anchor: the stored pose is kept
       }
     }
   }
 
-  /** Follow the anchor: headsets correct their map of a room, and what is anchored with it. */
+  /** Follow the anchor, which moves when the headset corrects its map of the room. */
   follow(frame: XRFrame, space: XRReferenceSpace): void {
     const pose = this.anchor && frame.getPose(this.anchor.anchorSpace, space);
     if (!pose) return;
@@ -64,7 +64,7 @@ export class Placing {
     this.arm = { ...this.arm, position, yaw: yawOf(turn) };
   }
 
-  /** Stand the arm somewhere, and remember it. */
+  /** Place the arm, and store the placement. */
   place(arm: Placement, frame: XRFrame | null, space: XRReferenceSpace | null): void {
     this.arm = arm;
     this.placed = true;
@@ -96,7 +96,7 @@ export class Placing {
         this.write();
       }
     } catch {
-      // A headset without anchors: the place holds as well as its tracking does.
+      // Without anchors, the placement is as accurate as the tracking of the headset.
     }
   }
 

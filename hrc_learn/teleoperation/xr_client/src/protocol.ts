@@ -1,5 +1,5 @@
-// What is said between this client and `hrc page`, as gate/messages.py checks it, and the
-// connection that carries it.
+// Messages between this client and `hrc page`, which gate/messages.py checks, and their
+// connection.
 
 import type { Quadruple, Triple } from "./geometry";
 
@@ -8,16 +8,16 @@ export interface Region {
   half_size: Triple;
 }
 
-/** Of what does not change while a page is served. */
+/** Data that stays constant while a page is served. */
 export interface Description {
   bodies: {
     name: string;
-    /** Joint that moves the link, from 1; null: the end effector; nothing: it is not held. */
+    /** Joint that moves the link, from 1; null: the end effector; "nothing": cannot be held. */
     joint: number | null | "nothing";
-    /** Ends and radius of each [m]. */
+    /** Both end points and the radius of each capsule [m]. */
     capsules: [number, number, number, number, number, number, number][];
   }[];
-  /** Of the workplace, that a person touches to place the arm [m]. */
+  /** Points of the workplace that a person touches to place the arm [m]. */
   touch_points: Triple[];
   guides: boolean;
   draws: boolean;
@@ -26,7 +26,7 @@ export interface Description {
   opening: number;
 }
 
-/** As often as it changes. */
+/** State of the scene, sent whenever it changes. */
 export interface SceneState {
   /** Position [m] and orientation (wxyz) of each body. */
   bodies: number[][];
@@ -40,7 +40,7 @@ export interface SceneState {
   plan: Triple[];
 }
 
-/** Ten times a second. */
+/** Status of the session, sent ten times a second. */
 export interface Status {
   role: "leads" | "watches";
   taken: boolean;
@@ -85,18 +85,18 @@ export type Message =
   | { type: "target"; point: Triple | null }
   | { type: "hands"; grips: Grip[]; tracked: TrackedHand[]; sent: number };
 
-/** Furthest that a point may lie from the arm, along each axis [m]: REACH of the gate, less a bit. */
+/** Largest coordinate of a point along each axis [m]: slightly less than REACH of the gate. */
 const REACH = 9.9;
 export const within = (point: Triple): boolean => point.every((x) => Math.abs(x) <= REACH);
 
-/** Of door.js, which the page loads first: it keeps the secret and adds it to each `fetch`. */
+/** Interface of door.js, loaded first: it keeps the secret and adds it to each `fetch`. */
 declare const hrcDoor: { socket(route: string): { url: string; protocols: string[] } };
 
-/** The socket, held by a worker that goes on giving signs of life while this page draws. */
+/** The socket, in a worker that sends signs of life even while this page draws. */
 export class Connection {
   status: Status | null = null;
   scene: SceneState | null = null;
-  /** Why it is over; empty while it is not. */
+  /** Reason why the connection has ended; empty while it is open. */
   over = "";
   private worker = new Worker("/static/beat.js");
   private greeted = false;
@@ -107,7 +107,7 @@ export class Connection {
     setInterval(() => this.alive(), 50);
   }
 
-  /** The page reacts; called by each frame as well, as headsets slow timers down. */
+  /** Report that the page responds; each frame calls this too, since headsets slow timers down. */
   alive(): void {
     this.worker.postMessage({ alive: true });
   }
@@ -125,11 +125,11 @@ export class Connection {
     if (data.type === "state") {
       this.status = data.status ?? this.status;
       this.scene = data.scene ?? this.scene;
-      // The worker drops what is said before the socket is open.
+      // The worker drops messages that are sent before the socket is open.
       if (!this.greeted) this.send({ type: "hello", wants: "scene" });
       this.greeted = true;
     } else if (!this.over) {
-      this.over = data.words || "The program does not answer any more. Reload to look for it again.";
+      this.over = data.words || "The program does not answer any more. Reload the page to connect again.";
     }
   }
 }
