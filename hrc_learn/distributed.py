@@ -63,7 +63,7 @@ def processes() -> Iterator[int]:
     dist.init_process_group("gloo")
     try:
         yield rank()
-        dist.barrier()  # gloo may abort where another process has already left
+        dist.barrier()  # gloo may abort this process if another one has left the group
     finally:
         dist.destroy_process_group()
 

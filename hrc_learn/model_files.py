@@ -55,7 +55,7 @@ class SavedModel:
             found = self.get(field, type(wanted))
             if found != wanted:
                 raise ValueError(
-                    f"{self.folder / CONFIG}: {field} is {found!r}, this reads {wanted!r}"
+                    f"{self.folder / CONFIG}: {field} is {found!r}, expected {wanted!r}"
                 )
         store.require_unchanged(self.folder)
         self.tensors = self._read_tensors()

@@ -176,11 +176,12 @@ Hindrance = Literal[
 ]
 """Reason why an arm does not follow a person's guidance.
 
-"joint_limit": a joint is near its limit. "singularity", "obstacle": there is one ahead.
-"speed": the speed limit of hand guiding. "task": the end effector of the task would have to
-move. "narrow_path": the path allows no null-space motion. "too_far": the arm could not return
-from the posture. "task_waits": the task waits until the arm is back. "person": a person is near
-the arm. "stopped": the safety filter brakes.
+"joint_limit": a joint is near its limit. "singularity": a singularity lies ahead. "obstacle":
+an obstacle lies ahead. "speed": the requested motion exceeds the speed limit of hand guiding.
+"task": the requested motion would move the end effector away from its task. "narrow_path": the
+path allows no null-space motion. "too_far": the arm could not return from the requested
+posture. "task_waits": the task waits until the arm has returned. "person": a person is near the
+arm. "stopped": the safety filter brakes.
 """
 HINDRANCES: tuple[Hindrance, ...] = get_args(Hindrance)
 """All hindrances, in the order of the log's column "hindered"."""

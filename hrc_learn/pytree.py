@@ -10,7 +10,7 @@ from torch.utils import _pytree
 
 
 def static(default: Any) -> Any:
-    """Field of a pytree dataclass that belongs to the structure and is no leaf.
+    """Field of a pytree dataclass that belongs to the structure and is not a leaf.
 
     Use it for gains and names: `vmap` then maps the tensors only, and `torch.compile` and
     `torch.export` treat the field's value as a constant.

@@ -83,8 +83,8 @@ class Watchdog:
         """Set up the watchdog; silence counts from the first `feed`, or from entering `with`.
 
         Args:
-            timeout: Longest silence [s]. A longer one is noticed at most a quarter of this time
-                late.
+            timeout: Longest silence [s]. A longer silence is detected with a delay of at most a
+                quarter of this time.
             stop: Brings the arm to rest. Called once for every silence, and again if it fails.
             clock: Current time [s].
 
@@ -166,6 +166,6 @@ class Watchdog:
             bring_to_rest(self._stop, _LONGEST_PAUSE)
 
     def _watch(self) -> None:
-        # A silence is noticed at most a quarter of the timeout late.
+        # A silence is detected with a delay of at most a quarter of the timeout.
         while not self._done.wait(self._timeout / 4):
             self.check()

@@ -30,7 +30,7 @@ type Scalars = ArrayLike
 type Times = Real[Tensor, "... _T"] | Real[np.ndarray, "... _T"] | Nested
 """Times [s], (T,) for the whole batch or (*batch, T)."""
 type Points = ArrayLike
-"""Samples over time, (*batch, T, D); (T,) is taken as D = 1."""
+"""Samples over time, (*batch, T, D); the shape (T,) means D = 1."""
 type Vectors = Real[Tensor, "... _D"] | Real[np.ndarray, "... _D"] | Nested
 """One vector per primitive, (*batch, D)."""
 type Quaternions = Real[Tensor, "... 4"] | Real[np.ndarray, "... 4"] | Nested
@@ -51,7 +51,7 @@ def to_tensor(
         ValueError: Values that are not real numbers, or booleans where `dtype` is floating.
     """
     if isinstance(values, Tensor) and values.dtype == dtype and values.device == device:
-        return values  # the common case, which `as_tensor` recognises more slowly
+        return values  # the common case; `as_tensor` would return the same, but more slowly
     if isinstance(values, np.ndarray):
         if values.dtype.kind not in "biuf":
             raise ValueError(f"expected real numbers, got an array of {values.dtype}")
@@ -66,7 +66,7 @@ def to_tensor(
 
 
 def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Function that runs without `torch.autocast`: half precision visibly distorts paths."""
+    """Decorator that disables `torch.autocast`: half precision visibly distorts paths."""
 
     @wraps(function)
     def exact(*arguments: P.args, **options: P.kwargs) -> R:
@@ -79,7 +79,10 @@ def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
 
 def readable(*tensors: Tensor) -> bool:
-    """True if Python may branch on the values: no tracing, transform or forward derivative."""
+    """True if Python may branch on the values of the tensors.
+
+    It may not during tracing, in a `torch.func` transform or in a forward derivative.
+    """
     if torch.compiler.is_compiling():
         return False
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
@@ -97,9 +100,9 @@ _transform_level = getattr(
     "maybe_current_level",
     lambda: 0,
 )
-"""Nesting level of `torch.func` transforms, None outside of them.
+"""Function that returns the nesting level of `torch.func` transforms, None outside of them.
 
-A PyTorch version without this function counts as always inside a transform.
+Where PyTorch lacks it, the code acts as if it always ran inside a transform.
 """
 
 
@@ -124,19 +127,19 @@ def refuse_nested_forward(s: Tensor) -> None:
     levels = [str(level.key()) for level in retrieve_all_functorch_interpreters()]
     if levels.count("TransformType.Jvp") > 1:
         raise NotImplementedError(
-            "PyTorch loses the outer of two forward derivatives of a motion: use "
-            "jacfwd(jacrev(f)), as torch.func.hessian does"
+            "PyTorch returns zero for the outer of two nested forward derivatives of a motion: "
+            "use jacfwd(jacrev(f)), as torch.func.hessian does"
         )
 
 
 def fits_numpy(detached: Tensor, *others: Any) -> bool:
-    """True if NumPy may compute with the tensors: nothing traces, maps or differentiates them.
+    """True if NumPy may compute with the tensors: without tracing, `vmap` or gradients.
 
-    For a few numbers NumPy takes a third of the time, because dispatch dominates in PyTorch.
+    For a few numbers, NumPy takes a third of the time of PyTorch, where dispatch dominates.
 
     Args:
-        detached: May require gradients, because the caller detaches it.
-        others: Must be plain CPU tensors of the same dtype without gradients.
+        detached: Tensor that may require gradients, because the caller detaches it.
+        others: Tensors that must be plain CPU tensors of the same dtype without gradients.
     """
     if torch.is_grad_enabled() or torch.compiler.is_compiling():
         return False
@@ -255,8 +258,8 @@ def normalised_time(
         broadcast_shapes(time.shape[:-1], duration.shape)
     except (ValueError, RuntimeError):
         raise ValueError(
-            f"time has shape {tuple(time.shape)}, but there are {tuple(duration.shape)} "
-            f"durations: time must be (T,) or {(*duration.shape, time.shape[-1])}"
+            f"time has shape {tuple(time.shape)}, but the durations have shape "
+            f"{tuple(duration.shape)}: time must be (T,) or {(*duration.shape, time.shape[-1])}"
         ) from None
     # If all grids are identical, one response matrix serves the whole batch.
     if readable(time, duration) and not (time.requires_grad or duration.requires_grad):
@@ -265,7 +268,7 @@ def normalised_time(
 
 
 def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[Tensor, "T"]:
-    """Times [s] at interval `dt`, from zero to the first at or past the longest duration.
+    """Times [s] at interval `dt`, from zero to the first one at or after the longest duration.
 
     Raises:
         ValueError: The interval is not positive.
@@ -279,7 +282,7 @@ def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[T
 
 
 def _collapse_identical(values: Tensor, ndim: int) -> Tensor:
-    """First tensor of a batch of `ndim`-dimensional tensors if all are equal, or the batch."""
+    """First of a batch of `ndim`-dimensional tensors if all are equal, otherwise the batch."""
     if values.ndim == ndim or not values.numel():
         return values
     first = values[(0,) * (values.ndim - ndim)]

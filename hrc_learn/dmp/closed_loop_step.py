@@ -166,8 +166,8 @@ def uncoupled_step(
     For so few numbers, dispatch in PyTorch takes far longer than the arithmetic.
 
     Returns:
-        State after the step. None where NumPy does not apply: the motion is differentiated,
-        mapped or traced, is a batch, is not on the CPU or is not in float64.
+        State after the step. None where NumPy cannot compute it: with gradients, `vmap` or
+        tracing, for a batch, or for tensors that are not float64 on the CPU.
     """
     if weights.ndim != 2 or weights.dtype is not torch.float64:
         return None
@@ -214,15 +214,16 @@ def numpy_approach(
 def _filtered(
     goal: Tensor, target: Tensor, ds: Tensor | float, rate: float, spring: SpringDamper
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Filtered goal g after a step, and the states (y - target, y') it causes before and after.
+    """Filtered goal g after a step, and the states (y - target, y') that g causes.
 
+    The first of these states holds before the step, the second after it.
     For a goal that decays to its target, the particular solution is y_p = target +
     k (g - target) with k = alpha beta / (rate^2 - alpha rate + alpha beta).
     """
     denominator = rate**2 - spring.alpha * rate + spring.stiffness
     if not 0 < rate < math.inf or abs(denominator) < RESONANCE * spring.stiffness:
         raise ValueError(
-            f"a goal filter needs a positive rate away from the spring's modes, got {rate}"
+            f"goal_filter must be positive and not near a mode of the spring, got {rate}"
         )
     gain = spring.stiffness / denominator
     lag_before = goal - target

@@ -1,7 +1,7 @@
 """Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
-`step` of a primitive takes the terms as `phase_stopping` or as `coupling`. Each obstacle is
-given by the nearest point on its surface, so the terms need no shapes.
+Terms are passed to `step` of a primitive as `phase_stopping` or as `coupling`. An obstacle is
+described by the nearest point on its surface, so the terms need no shapes.
 
 Errors of force, and of the distance to a second arm, act on the velocity (Gams et al. 2014,
 "Coupling movement primitives: interaction with the environment and bimanual tasks"). The spring
@@ -9,12 +9,12 @@ would oppose a term in the acceleration. A term C in the velocity moves the whol
 
     tau z_dot = alpha (beta (g - y) - z) + f + lead tau C_dot,   tau y_dot = z + C
 
-Here f is the forcing term, z the scaled velocity, and C = tau gain error. If the goal g
-contradicts the wanted force, the spring still pulls to g: at rest, feedback alone leaves the
-fraction 1 / (1 + K gain) of the error, with K = k tau / beta in contact with a stiffness k, and
-K = 2 tau / beta between two arms. If the next repetition applies the feedback of this one as
-feed-forward, the error decreases by this factor again. A coupling is constant over each step,
-which causes an error of first order in the step.
+Here f is the forcing term, z the scaled velocity, and C = tau gain error. If the wanted force
+cannot be reached at the goal g, the spring still pulls towards g. At rest, feedback alone then
+leaves the fraction 1 / (1 + K gain) of the error. K is k tau / beta in contact with a surface
+of stiffness k, and 2 tau / beta between two arms. If the next repetition of the motion applies
+this feedback as feed-forward, the error decreases by the same factor again. A coupling is
+constant over each step, which causes an error of first order in the length of the step.
 
 Two arms keep an offset if the arm at `position` receives minus the error and the other arm plus
 the error, with error = wanted - (other - position). To follow a leader, the follower receives
@@ -109,7 +109,7 @@ def repulsion(
     d = distance.clamp_min(TOUCH)
     # Obstacles farther than `reach` have no effect.
     strength = gain * (1 / d - 1 / reach).clamp_min(0) / d**2
-    # At the point itself no direction leads away, so the term is zero there.
+    # At distance zero, the direction away from the obstacle is undefined: the term is zero.
     return (strength * away / torch.where(distance > 0, distance, 1.0)).sum(-2)
 
 

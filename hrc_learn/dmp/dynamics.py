@@ -129,7 +129,10 @@ def _cached_propagator(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
 
 
 def approach_curve(s: Float[Tensor, "*batch"], fraction: float, order: int) -> Tensor:
-    """m(s) - 1 or its derivative of an order; the minimum-jerk curve m is 1 at `fraction`."""
+    """m(s) - 1, or its derivative of the given order.
+
+    The minimum-jerk curve m rises from 0 at s = 0 to 1 at s = `fraction`.
+    """
     coefficients = (-1.0, 0.0, 0.0, 10.0, -15.0, 6.0)
     for _ in range(order):
         coefficients = tuple(k * c for k, c in enumerate(coefficients))[1:]
@@ -213,8 +216,8 @@ class GaussianBasis:
         """Normalised time after which the forcing is lost in float64 rounding."""
         if self.domain == "phase":
             return self.phase.horizon
-        # At x spacings past the end, the last Gaussian that has a weight is the one without a
-        # weight times exp((1/2 - x) / width^2); exp(-39) = 1e-17.
+        # The ratio of the last Gaussian with a weight to the one without a weight is
+        # exp((1/2 - x) / width^2) at x spacings after the end; exp(-39) = 1e-17.
         end = 1 + (0.5 + 39 * self.width**2) / (self.count - 1)
         return min(end, self.phase.horizon)
 
@@ -273,7 +276,7 @@ class PeriodicBasis:
     horizon = 1.0
     """The period."""
     knot_spacing = 1.0
-    """The period, so that whole pieces of the response's table cover it."""
+    """The period: a whole number of pieces of the response's table then covers one period."""
 
     def __post_init__(self):
         check_positive("width", self.width)
@@ -317,8 +320,9 @@ class SplineBasis:
     without normalisation (de Boor 1978, "A practical guide to splines", chapter IX).
 
     The centres are c_i = (i - 2) h, i = 1 ... N, with the spacing h = 1 / (N - 1). The first
-    lies one spacing before the start, so that the first interval is complete; the last lies
-    one spacing before the end. The forcing term fades from s = 1 - 2 h to 1 + h, then is zero.
+    centre lies one spacing before the start, so that four splines act in the first interval;
+    the last centre lies one spacing before the end. The forcing term fades from s = 1 - 2 h to
+    s = 1 + h and is zero afterwards.
     """
 
     count: int = 50

@@ -141,7 +141,7 @@ def _named(state: Any) -> Tensors:
 def _restored_state(dmp: MotionPrimitive, tensors: Tensors) -> Any:
     """State from its tensors; the inverse of `state_tensors`."""
     columns = DMPState(**{name: tensors[name] for name in STATE})
-    # The frame of orientations, of moving goals, or None for joints.
+    # The frame: the reference of orientations, the velocity of moving goals, None for joints.
     return dmp.state_of(columns, tensors.get("reference", tensors.get("goal_velocity")))
 
 
@@ -176,8 +176,8 @@ def _goals(inputs: Tensors) -> dict[str, Any]:
 def _where_new[S: (OrientationState, PoseState)](new: S, old: S) -> S:
     """The new state for motions whose goal has changed, the old state for the others.
 
-    An orientation that is whole turns away from an unchanged goal would otherwise lose
-    velocity.
+    If the orientation is a whole number of turns away from an unchanged goal, the new state
+    would lack a part of the velocity.
     """
     difference = quaternion.angle(new.reference, old.reference)
     changed = difference > ROUNDINGS * torch.finfo(difference.dtype).eps

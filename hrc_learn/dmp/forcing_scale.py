@@ -132,9 +132,7 @@ class Scaling:
         divisor = "goal - start"
         if self.turns:
             if offset.shape[-1] < 2:
-                raise ValueError(
-                    "scaling 'rotation' needs 2 coordinates or more: one cannot turn"
-                )
+                raise ValueError("scaling 'rotation' needs 2 coordinates or more, got 1")
             offset, size = offset.norm(dim=-1, keepdim=True), size.amax(-1, keepdim=True)
             divisor = "the distance from start to goal"
         singular = offset < MINIMUM_DISPLACEMENT * size
@@ -201,7 +199,7 @@ SCALINGS: dict[str, Callable[[Any, Any, Demonstrated, ModuleType], Any]] = {
 
 
 def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
-    """Scaling named `scaling`, for the first `columns` coordinates; a `Scaling` passes as is.
+    """Scaling named `scaling`, for the first `columns` coordinates; a `Scaling` is returned.
 
     Raises:
         ValueError: Unknown scaling.

@@ -174,7 +174,7 @@ class FramedDMP:
 def _precision(root: Float[Tensor, "F D M columns"]) -> Float[Tensor, "F DM DM"]:
     """Inverse covariance from a square root of the covariance, with `FREEDOM` added."""
     D = root.shape[1]
-    # The D columns of a weight or end have one common unit, which rotations do not change.
+    # One unit for all D columns of a weight, start or goal, because rotations mix columns.
     unit = root.square().sum(-1).mean((0, 1)).sqrt()
     root = (root / unit[:, None]).flatten(1, 2)
     eye = torch.eye(root.shape[1]).to(root)

@@ -21,11 +21,12 @@ from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, gaussian
 from hrc_learn.dmp.samples import padded
 
 DURATIONS = 31
-"""Number of durations compared for each kind, within three standard deviations. They are 0.2
-standard deviations apart; closer ones hardly differ in the likelihood of a few samples."""
+"""Number of durations compared for each kind. Their logarithms lie within three standard
+deviations of the mean, 0.2 standard deviations apart; the likelihoods of closer durations
+hardly differ for a few samples."""
 MINIMUM_SPREAD = 0.05
-"""Smallest standard deviation of the logarithm of durations: a person repeats a motion to about
-five percent at best, and a few demonstrations may agree better by chance."""
+"""Smallest standard deviation of the logarithm of durations. A person repeats a duration to
+about five percent at best; the durations of a few demonstrations may agree better by chance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -30,7 +30,7 @@ from hrc_learn.dmp.trajectory import Trajectory
 
 LIMIT_SAMPLES = 2001
 """Number of times at which limits are checked: 40 for each of 50 basis functions. A peak
-between two of these times is higher by less than 1e-3 of its height."""
+between two of these times exceeds the checked values by less than 0.1 %."""
 TOLERANCE = 1.05
 """Held-out errors up to this multiple of the smallest error count as equal to the smallest."""
 DEFAULT_COUNT = 50
@@ -154,8 +154,8 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
             position: (T, D) or (*B, T, D); D = 1 if its shape is that of `time`. For
                 demonstrations of different lengths, a list of (T_i, D), with a list of (T_i,)
-                as `time`. The floating-point dtype of the positions is that of the primitive;
-                the fit runs in float64.
+                as `time`. The primitive has the floating-point dtype of the positions; the
+                fit runs in float64.
             n_basis: Number N of basis functions, unless `basis` is given. None: 50, and noise
                 is removed from the samples; see `FitOptions.smooth`. If there are at most
                 1.5 N samples, the motion follows piecewise cubics between them.
@@ -247,7 +247,7 @@ class BasisSelection:
     """Held-out error as a function of the number of basis functions."""
 
     count: int
-    """Smallest number whose error is within 5 % of the best."""
+    """Smallest number of basis functions whose error is within 5 % of the smallest error."""
     candidates: tuple[int, ...]
     error: Float[Tensor, "candidates"]
     """RMSE on held-out samples, relative to the largest range, over all demonstrations."""
@@ -369,7 +369,10 @@ def fit_shared(
 def _accumulate(
     demonstrations: Sequence[tuple[Times, Points]], response: Response
 ) -> tuple[Float[Tensor, "1 m m"], Float[Tensor, "4 D"], int]:
-    """Sums over all processes: products, rows (start, goal, range, duration), sample count."""
+    """Sums over all processes: normal products, boundaries, and number of samples.
+
+    The rows of the boundaries are start, goal, range and duration.
+    """
     D, rows, products, sums = 0, 0, None, None
     for i, (time, position) in distributed.local_items(demonstrations):
         samples = _checked(i, time, position, D)
@@ -380,7 +383,7 @@ def _accumulate(
         last = [samples.span[0], samples.duration.expand(D)]
         values = torch.stack([*ends[0], *last]).double()
         sums = values if sums is None else sums + values
-    # A process without demonstrations contributes zeros, for as many coordinates as the others.
+    # A process without demonstrations contributes zeros in the shapes of the other processes.
     D, m = int(max(distributed.gather(torch.tensor(D)))), response.size - 2
     if products is None or sums is None:
         products = torch.zeros(1, m + D, m + D, dtype=torch.float64)
@@ -390,7 +393,7 @@ def _accumulate(
 
 
 def _checked(index: int, time: Times, position: Points, D: int) -> Samples:
-    """Samples of one demonstration; D: number of coordinates of those before it, or 0."""
+    """Samples of one demonstration with D coordinates; 0: with any number of coordinates."""
     try:
         samples = check_samples(time, position)
     except ValueError as error:

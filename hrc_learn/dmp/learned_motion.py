@@ -80,7 +80,7 @@ class Candidate:
 
     @property
     def kind(self) -> Kind:
-        """Kind of the model; all but the line may be shrunk towards the line."""
+        """Kind of the model; every kind but the line may be shrunk towards the line."""
         if self.shrinkage == 0:
             return "line"
         if self.family != "kernel":
@@ -218,7 +218,7 @@ class LearnedMotion:
         """Primitive for a start, goal and duration; by default, the model predicts them.
 
         Args:
-            start: Start of one motion, as `rollout` of the primitives takes it.
+            start: Start of one motion, in the form that `rollout` of the primitives accepts.
             goal: Goal.
             duration: [s].
             context: (C,) if the demonstrations had contexts.
@@ -231,7 +231,7 @@ class LearnedMotion:
         by_frames = self.chosen.family == "frames"
         if context is not None and (by_frames or self.by_ends):
             known = "frames" if by_frames else "start and goal"
-            raise ValueError(f"the motion follows from {known} here: leave out the context")
+            raise ValueError(f"this model predicts from {known}: leave out the context")
         if by_frames:
             assert self.frames is not None
             if frames is None:

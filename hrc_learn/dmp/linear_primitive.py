@@ -188,7 +188,7 @@ class LinearPrimitive(nn.Module):
         """Primitives with other coordinates; gradients flow to the arguments.
 
         Args:
-            coordinates: As returned by `coordinates`; their batch is that of the result.
+            coordinates: As returned by `coordinates`; the result has their batch shape.
             duration: [s]; None keeps the value of this primitive, here and below.
             amplitude: Range of each column.
             timestamps: Normalised times of the default rollout.
@@ -566,7 +566,7 @@ class LinearPrimitive(nn.Module):
 
 
 def check_names(joint_names: Sequence[str] | None, D: int) -> None:
-    """Raise ValueError unless there are D names, or none."""
+    """Raise ValueError if there are names, but not D of them."""
     if joint_names is not None and len(joint_names) != D:
         raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
 

@@ -24,15 +24,17 @@ from hrc_learn.geometry import Pose
 
 EXPLAINED, MAXIMUM_DIRECTIONS = 0.9, 3
 """`EXPLAINED`: fraction of the variance of paths that the principal directions explain.
-`MAXIMUM_DIRECTIONS`: their largest number; with few demonstrations, more reflect chance."""
+`MAXIMUM_DIRECTIONS`: largest number of these directions; with few demonstrations, further
+directions reflect chance."""
 MINIMUM_SPREAD = 0.1
 """Smallest spread within a mode, relative to the total: two demonstrations that agree by chance
 must not form a mode."""
 STRONG_EVIDENCE = 10.0
 """Decrease of the Bayesian information criterion that is very strong evidence for more modes
-(Kass and Raftery 1995, "Bayes factors"). With few demonstrations, chance causes half of it."""
+(Kass and Raftery 1995, "Bayes factors"). With few demonstrations, chance alone may cause half
+this decrease."""
 MAXIMUM_ITERATIONS, SETTLED = 100, 1e-6
-"""Largest number of iterations, and largest change of responsibilities that ends them."""
+"""Largest number of iterations, and change of responsibilities below which iteration ends."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,7 +180,7 @@ def _expectation_maximisation(
         weight = r.sum(0).clamp(min=torch.finfo(z.dtype).tiny)
         means = r.mT @ z / weight[:, None]
         square = (z[:, None] - means).square()
-        # Each mean takes one degree of freedom, which matters for few samples.
+        # Each mean costs one degree of freedom, which matters for few samples.
         spread = (r[..., None] * square).sum((0, 1)) / max(len(z) - K, 1)
         variance = torch.maximum(spread, least)
         log_density = (weight / len(z)).log() - (

@@ -17,7 +17,7 @@ from hrc_learn.dmp.samples import Samples
 MARGIN = 0.1
 """Distance by which motions may exceed the demonstrated range, relative to the range."""
 SHRINKAGE = 0.1
-"""Weight of a separable covariance (time times columns), which few motions determine well."""
+"""Weight of a separable covariance (time times columns), for which a few motions suffice."""
 RIDGE = 1e-3
 """Ridge of the prediction from the start: values from 1e-4 to 1e-2 are equally good."""
 POINTS = (6, 8, 10, 13, 16, 20, 26, 32, 40, 50, 64)
@@ -27,7 +27,8 @@ ROUGHNESS = 1e-8
 SAME_DURATION = 0.01
 """Relative difference of durations up to which they count as equal."""
 LONGEST = 3.0
-"""Bound on the logarithm of a duration relative to the mean: a factor of 20."""
+"""Largest |log(duration / mean duration)|: durations differ from the mean by a factor of up to
+20."""
 TINY = 1e-24
 """Smallest variance, for columns that never move."""
 TURN = 6.0
@@ -39,7 +40,7 @@ DEGREE = 3
 
 
 class MotionComponents(nn.Module):
-    """Linear map from P parameters and a start to motions of D columns.
+    """Map from P parameters and a start to motions of D columns, linear within the limits.
 
     Parameters have unit variance; if all are zero, the motion is the most likely one from that
     start. The map is computed in float64 and differentiable in parameters and start.
@@ -182,7 +183,7 @@ class MotionComponents(nn.Module):
             bend = 1 - torch.arange(self.points).to(free)[:, None] / (self.points - 1)
             free = free + bend**2 * (first - free[..., 0, :])[..., None, :]
         low, high = ((edge - self.centre) / self.scale for edge in (self.low, self.high))
-        # A start beyond the range moves the limits with it.
+        # If the start lies beyond a limit, this limit moves outwards with it.
         margin = MARGIN / (1 + 2 * MARGIN) * (high - low)
         low = torch.minimum(low, first - margin)[..., None, :]
         high = torch.maximum(high, first + margin)[..., None, :]
@@ -222,7 +223,7 @@ class MotionComponents(nn.Module):
         B = spline(samples.s[shared], self.points)
         rough = torch.diff(torch.eye(self.points).to(y), n=2, dim=0)
         normal = (weight * B).mT @ B + ROUGHNESS * rough.mT @ rough
-        # Invalid samples may hold anything.
+        # Masked samples may have any value, even NaN.
         right = (weight * B).mT @ torch.where(samples.mask[..., None], y, 0.0)
         right = (right - normal[..., : self.known] @ fixed)[:, self.known :]
         free = torch.linalg.solve(normal[:, self.known :, self.known :], right)
@@ -236,7 +237,7 @@ class MotionComponents(nn.Module):
         N, _, D = C.shape
         s = torch.linspace(0, 1, 10 * self.points, dtype=C.dtype)
         B = spline(s, self.points)[:, self.known :]
-        # The mean square of a motion is the sum of squares of its free values times `metric`.
+        # The mean square of a motion is the squared norm of (free values @ metric).
         root = torch.linalg.cholesky(B.mT @ B / len(B)).contiguous()
         metric = torch.kron(root, torch.eye(D).to(C))
         if self.varying:

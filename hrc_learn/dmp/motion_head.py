@@ -63,7 +63,7 @@ class MotionHead(nn.Module):
     goal_centre: Tensor | None
     """Centre of the goals, (D,); None: the start."""
     modes: Tensor
-    """Weights of each mode, a column for each whitened parameter, smoothest first, (N, N)."""
+    """Weights of the modes, (N, N): one column for each mode, the smoothest first."""
 
     def __init__(
         self,
@@ -274,7 +274,7 @@ class MotionHead(nn.Module):
                 f"parameters must have shape (..., {self.n_parameters}), got "
                 f"{tuple(parameters.shape)}"
             )
-        # Networks under autocast give half precision, which visibly distorts paths.
+        # Networks under autocast return half precision, which visibly distorts paths.
         if parameters.dtype not in FLOATING:
             parameters = to_tensor(parameters, self.amplitude.dtype, parameters.device)
         finite("parameters", parameters)

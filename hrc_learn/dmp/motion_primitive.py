@@ -1,8 +1,9 @@
 """The interface of all movement primitives, and their common implementation.
 
-A linear primitive moves columns. A kind of primitive maps its values to columns and back:
-joints are columns themselves, an orientation becomes its error to a reference, a pose becomes
-position, orientation error and body, and joints with a moving goal are relative to that goal.
+A linear primitive describes the motion of columns. Each kind of primitive maps its values to
+columns and back: joints are columns themselves, an orientation becomes its error to a
+reference, a pose becomes position, orientation error and body, and joints with a moving goal
+become relative to that goal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -66,8 +67,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     """Arguments of this kind beyond start, goal and start velocity."""
 
     # Columns are relative to a frame, which may differ between motions: the reference of an
-    # orientation error, or the velocity of a moving goal; None if there is no frame. The next
-    # methods suit values that are columns themselves; other kinds override them.
+    # orientation error, or the velocity of a moving goal; None if there is no frame. The
+    # following methods apply to values that are columns themselves; other kinds override them.
 
     def with_motion[S: "MotionPrimitive"](self: S, motion: Any, frame: Any = None) -> S:
         """Primitive of the same kind with another linear primitive.
@@ -92,8 +93,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """Boundary of a motion in columns, and its frame.
 
         Args:
-            given: Start, goal and start velocity from the caller, None for those of the
-                demonstration.
+            given: Start, goal and start velocity from the caller; None for a demonstrated
+                value.
             duration: [s].
             options: Arguments of this kind.
         """
@@ -324,7 +325,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         change. With `within`, the motion outside of this time does not change either. Via
         points refer to the start, goal and duration of this primitive; `with_boundary` sets
         others first. Gradients flow to times, values and velocities. Via points are too close
-        together if the motion would change over 1.5 times as much as the curve through them.
+        together if the motion would change by more than 1.5 times the largest change that the
+        via points require.
 
         Args:
             time: Times of the via points [s], (*batch, n).
@@ -353,7 +355,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         Args:
             time: [s], (*batch, n).
             value: Joints (*batch, n, D); unit quaternions (*batch, n, 4); or a `Pose` of
-                (*batch, n). NaN leaves a coordinate free; in a quaternion, the orientation.
+                (*batch, n). NaN leaves a coordinate free; a quaternion with a NaN leaves the
+                orientation free.
             velocity: Joint velocities (*batch, n, D), angular velocities [rad/s] (*batch, n, 3)
                 or twists (*batch, n, 6). NaN leaves a velocity free.
 

@@ -75,8 +75,8 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
 
     Values are (*batch, D) in the units of the demonstration; velocities are per second.
     `rollout` and `initial_state` meet the `end_velocity` exactly at the end of the duration;
-    without it, the goal does not move. The value of `goal` is where the moving goal is at the
-    end of the duration.
+    without it, the goal does not move. `goal` is the position of the moving goal at the end of
+    the duration.
     """
 
     motion: JointDMP
@@ -106,7 +106,7 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     def with_motion[S: "MovingGoalDMP"](
         self: S, motion: JointDMP, frame: Tensor | None = None
     ) -> S:
-        """Primitive with another motion, whose own end velocity is the default."""
+        """Primitive with another motion; the end velocity of that motion is the default."""
         return type(self)(motion)
 
     def state_of(self, columns: DMPState, frame: Tensor) -> MovingGoalState:

@@ -371,12 +371,14 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
 class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, OrientationState]):
     """Movement primitive of an orientation.
 
-    The error e to a reference, the goal by default, is the state of a linear primitive that is
-    exact at all angles, or of the formulation of Ude et al. 2014. Both signs of a quaternion
-    give the same motion. Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and
-    couplings are angular, in the base frame, (*batch, 3). Motions to a new start or goal rotate
-    in the same direction as the demonstration. The fit report holds residuals of the components
-    of the error [rad], which bound the residual of the angle.
+    The columns are the error e to a reference, which is the goal by default. Forcing term and
+    spring act on e and its derivative, which is exact at all angles, or on the state of Ude et
+    al. 2014 (see `formulation`). Both signs of a quaternion give the same motion.
+
+    Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and couplings are angular,
+    in the base frame, (*batch, 3). Motions to a new start or goal rotate in the same direction
+    as the demonstration. The fit report has residuals of the components of the error [rad],
+    which bound the residual of the angle.
     """
 
     error_columns: ClassVar[slice] = OrientationState.error_columns

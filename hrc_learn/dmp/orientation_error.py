@@ -21,8 +21,9 @@ type Numbers = list[float]
 _NO_AXIS = 1e-9
 """Length [rad] below which a rotation vector has no direction."""
 MEAN_ITERATIONS = 10
-"""Number of iterations that compute a mean. Each reduces the distance to the mean to a small
-fraction of it, or of its cube if all orientations are close together."""
+"""Number of iterations that compute a mean. Each multiplies the distance to the mean by a small
+factor. If all orientations are close together, the new distance is proportional to the cube of
+the previous one."""
 NORM_TOLERANCE = 1e-2
 """Deviation from 1 up to which the norm of a recorded quaternion is corrected."""
 
@@ -220,7 +221,7 @@ def fitted_error(
     """Errors [rad] to the last valid orientation, and that orientation.
 
     The error is followed backwards from the end, continuously past any number of turns, so that
-    720 degrees are learned as two turns. Masked orientations may hold anything.
+    720 degrees are learned as two turns. Masked orientations may have any value.
     """
     q = _without_gaps(*_checked(time, orientation, mask))
     goal = q[..., -1, :]
@@ -279,7 +280,7 @@ def _checked(
         i, k = broken.nonzero()[0].tolist()
         raise ValueError(
             f"{demo_label(i, samples.batch)}orientation has norm {norm[i, k].item():.4f} at "
-            f"sample {k}: not a unit quaternion. Interpolating across a sign flip does this."
+            f"sample {k}: not a unit quaternion. Interpolation across a sign flip may cause it."
         )
     unit = samples.columns / norm.masked_fill(~samples.mask, 1).reshape(*samples.batch, -1, 1)
     return unit, samples.mask.reshape(unit.shape[:-1])

@@ -124,7 +124,8 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
 
         Args:
             time: Timestamps [s], (T,) or (*B, T).
-            position: (*B, T, 3) [m]. Its floating-point dtype is that of the primitive.
+            position: (*B, T, 3) [m]. The primitive has the floating-point dtype of the
+                positions.
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
             n_basis: Number N of basis functions, unless `basis` is given; None as for
                 `JointDMP.fit`.

@@ -1,7 +1,7 @@
 """Gaussians over primitives, and means of primitives, from several demonstrations.
 
-The columns of orientations and poses move linearly too, so everything is computed on the
-columns of `motion`.
+The motion of the columns is linear for orientations and poses too, so all functions compute
+with the columns of `motion`.
 """
 
 from copy import deepcopy
@@ -83,8 +83,8 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
 def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
     """Batch of primitives whose orientation errors have one common reference.
 
-    Orientations with different goals become errors to the mean of their references. The map is
-    not linear, so the errors are fitted again.
+    Orientations with different goals become errors to the mean of their references. This
+    conversion is not linear, so the errors are fitted again.
     """
     columns = primitives.error_columns
     if columns is None:
@@ -117,8 +117,8 @@ def common_reference(primitives: MotionPrimitive) -> Tensor | None:
 def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
     if motions.forcing_scale.turns and motions.weights.ndim > 2:
         raise ValueError(
-            f"scaling {motions.scaling!r} gives each primitive a frame of its own: fit with "
-            "'none' to average them"
+            f"scaling {motions.scaling!r} expresses each primitive in a different frame: fit "
+            "with 'none' to average them"
         )
     x, count = motions.coordinates().detach(), motions.timestamps.shape[-1]
     if not x.numel():
@@ -276,7 +276,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             time: Times of the via points [s], (n,), on the time scale of the most likely
                 motion. Empty: only the duration is known.
             value: Joints (n, D), unit quaternions (n, 4) or a `Pose` of (n). NaN leaves a
-                coordinate free; in a quaternion, the orientation.
+                coordinate free; a quaternion with a NaN leaves the orientation free.
             velocity: Joint velocities (n, D), angular velocities (n, 3) or twists (n, 6), per
                 second. An angular velocity without an orientation refers to the orientation of
                 the mean motion.
@@ -347,7 +347,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         well as the mean of all demonstrations.
 
         Args:
-            start: Start of one motion, as `rollout` of the primitive takes it.
+            start: Start of one motion, in the form that `rollout` of the primitive accepts.
             goal: Goal.
             duration: Known duration [s].
 
@@ -365,7 +365,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         E, k = spread[:, -2:].flatten(0, 1), self.dependence
         back = torch.linalg.pinv(E, rtol=SINGULAR)
         z = k * (back @ (ends - self.mean[:, -2:]).flatten())
-        # Square root of I - k^2 P, where P projects onto what start and goal determine.
+        # Square root of I - k^2 P. P projects factors on the columns of the spread onto those
+        # that start and goal determine.
         left = torch.eye(len(z)).to(E) - (1 - (1 - k**2) ** 0.5) * (back @ E)
         mean = torch.cat([(self.mean + spread @ z)[:, :-2], ends], dim=1)
         remaining = torch.nn.functional.pad(spread[:, :-2] @ left, (0, 0, 0, 2))
@@ -461,7 +462,7 @@ def gaussians_of_modes[P: MotionPrimitive](
     lasting = motion.duration.detach().double().flatten().log()
     fraction = r / r.sum(0)
     means, logarithms = torch.einsum("nk,ndm->kdm", fraction, x), fraction.mT @ lasting
-    # Primitives are weighted by their responsibilities. Each mean takes a degree of freedom.
+    # Primitives are weighted by their responsibilities. Each mean costs a degree of freedom.
     weight = (r / max(n - r.shape[1], 1)).sqrt()
     spread = ((x[:, None] - means) * weight[..., None, None]).flatten(2).flatten(0, 1).mT
     timing = ((lasting[:, None] - logarithms) * weight).flatten()

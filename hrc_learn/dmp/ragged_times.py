@@ -34,10 +34,10 @@ NEGLIGIBLE = 4
 largest value of a column. The rounding error of a sum of fifty products is as large."""
 CHUNK = {"cpu": 2**16, "cuda": 2**22}
 """Samples processed at a time. On a CPU, their indices and powers fit the cache, which halves
-the time for a million samples; on a GPU, they occupy the device and take under a gigabyte."""
+the time for a million samples; on a GPU, they keep all cores busy in less than a gigabyte."""
 LONG = 2**14
-"""Number of samples of a grid above which the matrices of the grid would take more memory and
-time than motions with few columns."""
+"""Longest shared time grid, in samples, for which response matrices are used. On longer grids,
+the matrices would cost more memory and time than the polynomials, if there are few columns."""
 
 
 def motion(

@@ -34,8 +34,8 @@ GAUSS_POINTS = 12
 DEGREE = 12
 """Degree of the polynomials; pieces are so short that the remaining error is rounding."""
 GRIDS_KEPT = 16
-"""Number of time grids whose matrices are cached. A program uses few grids; 16 of 1000 times
-take 10 MB in float32 with 50 functions."""
+"""Number of time grids whose matrices are cached. A program uses few grids; the matrices of 16
+grids of 1000 times take 10 MB in float32 with 50 functions."""
 
 SMALL_MATRIX_CORES = {"SkylakeX", "Cooperlake", "SapphireRapids"}
 """OpenBLAS core types (version 0.3.29) with kernels for small matrices, which skip packing.
@@ -146,7 +146,7 @@ class TimeGrid:
     version: int
     """Version counter of the tensor, compared where its values cannot be read; see `holds`."""
     content: bytes
-    """Values when the matrices were made."""
+    """Bytes of the times for which the matrices were computed."""
     matrices: tuple[Tensor, Tensor, Tensor]
     to_position: np.ndarray | None
     """The first of the matrices in NumPy; None if it is not on the CPU."""
@@ -201,7 +201,7 @@ class Response:
         self._latest: TimeGrid | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Copies and unpickled responses are the one cached response with these parts.
+        # A copied or unpickled response is the cached response with the same parts.
         return response_of, (self.spring, self.basis, self.approach)
 
     def matrices(
@@ -237,7 +237,7 @@ class Response:
 
     @torch.inference_mode(False)
     def _transposed(self, s: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the result of `matrices`, so that calls in any mode can use it."""
+        """Compute the result of `matrices`, usable inside and outside of inference mode."""
         H = self.evaluate(s.detach().clone().double()).to(dtype)
         position, velocity, acceleration = without_subnormals(H).permute(1, 2, 0).contiguous()
         return position, velocity, acceleration
@@ -285,7 +285,7 @@ class Response:
         if self.approach:
             force = self.approach_force(s)[..., None]
             forcing = torch.cat([forcing[..., :-2], -force, force], dim=-1)
-        # All columns are offsets from the goal, except the goal's column, which is 1 larger.
+        # The goal is 0 for all columns except the column of the goal, for which it is 1.
         free = self.spring.acceleration(state[..., 0, :] - goal, state[..., 1, :])
         return (free + forcing)[..., None, :]
 
@@ -312,7 +312,8 @@ class Response:
             E = propagate(knots[-1])
             cycle = torch.linalg.solve(torch.eye(2, dtype=torch.float64) - E, state[-1])
             state = state + propagate(knots) @ cycle
-        # On each piece: the motion from its first knot, and the forcing since then.
+        # On each piece: the free motion from its first knot, plus the effect of the forcing
+        # since this knot.
         values = propagate(points) @ state[:-1, None] + increments
         return PiecewisePolynomial.interpolate(values, interval, self.basis.periodic)
 
@@ -356,7 +357,7 @@ class _StateAt(torch.autograd.Function):
         return ctx.response.evaluate(s)[..., 1:, :] * ds[..., None, None]
 
 
-# A table of 50 Gaussians takes 1.3 MB; few programs use 64 different parts at a time.
+# A table of 50 Gaussians takes 1.3 MB; few programs use 64 different responses at a time.
 @lru_cache(maxsize=64)
 def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Response:
     """Shared `Response` of these parts: equal primitives use the same tables and matrices."""
@@ -412,7 +413,7 @@ def product(
 
 
 def empty_in_large_pages(like: Tensor, *shape: int) -> Tensor:
-    """Uninitialised tensor, on a CPU in memory that NumPy requested in large pages.
+    """Uninitialised tensor; on a CPU, in memory with large pages, which NumPy requests.
 
     With small pages, mapping hundreds of megabytes takes as long as the product.
     """

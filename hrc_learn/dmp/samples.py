@@ -208,8 +208,8 @@ def check_samples(
         time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
         position: (T,), (T, D) or (*B, T, D); D = 1 if its shape is that of `time`.
         velocity: Same shape as `position`, or None.
-        mask: Same shape as `time`, true at valid samples. Invalid ones may hold anything, NaN
-            included. None: all samples are valid.
+        mask: Same shape as `time`, true at valid samples. Invalid samples may have any value,
+            NaN included. None: all samples are valid.
         name: Name of `position` in error messages.
 
     Raises:
@@ -262,7 +262,8 @@ def check_samples(
 def check_precision(dtype: torch.dtype) -> None:
     """Raise ValueError unless the dtype is float32 or float64.
 
-    Weights reach several thousand: rounded to half precision, the path is off by over a radian.
+    Weights reach several thousand: rounding them to half precision moves the path by more than
+    a radian.
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(

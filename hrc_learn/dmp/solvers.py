@@ -259,8 +259,8 @@ def _force_operator(
     s, basis = _timestamps(timestamps, device), response.basis
     if method == "ridge":
         return ridge_inverse(basis.forcing(s), regularization)
-    # w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i). It needs no
-    # ridge: each weight is a mean over its own samples, so nothing is ill-posed.
+    # w_i = (z' Gamma_i f) / (z' Gamma_i z) minimises the paper's cost (Cost_i). It needs no
+    # ridge: each weight is a weighted mean of samples, which is always well-posed.
     z = basis.phase(s)
     weighted = (basis.kernels(s) * z[:, None]).T
     # A Gaussian narrower than the sampling may cover no sample: its weight is zero then.

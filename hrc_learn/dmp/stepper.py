@@ -1,4 +1,4 @@
-"""Closed-loop steps of one joint primitive in NumPy, for loops in which microseconds count."""
+"""Closed-loop steps of one joint primitive in NumPy, which take microseconds."""
 
 import math
 from copy import deepcopy
@@ -53,8 +53,8 @@ class StepperState(NamedTuple):
 class Stepper:
     """One frozen joint primitive, stepped in float64 without PyTorch.
 
-    `step` computes what `step` of the primitive does. The weights are multiplied into the table
-    of the forced motion beforehand, so that a step is a table look-up and a 2x2 product.
+    `step` returns the same state as `step` of the primitive. The table of the forced motion is
+    multiplied by the weights beforehand, so that a step is a table look-up and a 2x2 product.
     """
 
     def __init__(self, dmp: JointDMP):
@@ -134,7 +134,7 @@ class Stepper:
             # Loops repeat one step length, so keep its matrix. Another thread may replace it.
             E = self._spring.propagator(ds).numpy()
             self._transition = ds, E
-        # After the end of the forcing, the state that it caused moves by the spring alone.
+        # After the end of the forcing, only the spring changes the state that it caused.
         forced = after = self._forced(now) if s < self._end else E.dot(before)
         if scale is not None:
             before, after = before.dot(scale), after.dot(scale)

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 END = 0
-"""Token after which all integers are zero; it also pads."""
+"""Token after which all integers are zero; it also pads sequences."""
 PRIOR = 20.0
 """Weight of the prior (a Laplace distribution) of each integer, as a number of vectors."""
 LEAST = 0.02
@@ -48,7 +48,8 @@ class _Tree(NamedTuple):
     index: array
     """Integer that each question is about."""
     threshold: array
-    """Largest magnitude in the first branch; -1: the sign is asked, second branch negative."""
+    """Largest magnitude in the first branch. -1: the question is the sign, and the second
+    branch is negative."""
     branches: array
     """Two for each question: the next question, or -1 - i for leaf i."""
     after: list[Interval]

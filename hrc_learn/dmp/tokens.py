@@ -48,7 +48,8 @@ STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
 its switches in a motion (later switches are left out). `MOST_SLOTS`: largest number of times at
 which it can switch."""
 OF_SCALE = 0.07
-"""Product of tolerance and FAST's scale at equal errors, on five teleoperated datasets."""
+"""Product of our tolerance and the scale of FAST for which both tokenizers have equal errors,
+on five teleoperated datasets."""
 
 
 class MotionTokenizer(nn.Module):
@@ -138,7 +139,7 @@ class MotionTokenizer(nn.Module):
             raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance}")
         samples = _samples(time, motions)
         if len(samples.s) < 2:
-            raise ValueError("motions must be (N, T, D) with N of 2 or more: one does not vary")
+            raise ValueError("motions must be (N, T, D) with at least 2 motions, got 1 or none")
         y = samples.position.mT
         seen = y[samples.mask].numpy()
         chosen, levels = _levels(seen, steps)
@@ -152,7 +153,8 @@ class MotionTokenizer(nn.Module):
         units = _units(seen[:, smooth])
         components = MotionComponents.fit(parts, units, velocity, start_known, accuracy)
         config: dict[str, Any] = {"steps": chosen, "slots": min(y.shape[1] - 1, MOST_SLOTS)}
-        # Unknown starts are the lowest values, as for `encode` and `decode`.
+        # If starts are unknown, columns of steps start at their lowest value, as in `encode`
+        # and `decode`.
         reference = y[:, 0, chosen] if start_known else levels[:, 0].expand(len(y), -1)
         switches = _switches(samples, reference, chosen, levels, config["slots"])
         z = components.encode(parts, velocity) * components.spread
@@ -175,7 +177,7 @@ class MotionTokenizer(nn.Module):
     def parameters(
         self, time: Times, motion: Points, start_velocity: Vectors | None = None
     ) -> Float[Tensor, "*batch P"]:
-        """Parameters of recorded motions as `components` takes them, without rounding."""
+        """Parameters of `components` for recorded motions, without rounding."""
         return self._encoded(_samples(time, motion), start_velocity)
 
     def encode(
@@ -225,13 +227,13 @@ class MotionTokenizer(nn.Module):
         """Motions for any sequences of tokens.
 
         A motion begins exactly in the given state. It stays within the demonstrated range,
-        extended by a tenth to either side. A start outside moves the limits. A motion can
-        leave the limits if its start velocity puts the second control point outside by more
-        than a quarter of the range.
+        extended by a tenth to either side. A start outside of these limits moves them
+        outwards. A motion can leave the limits if its start velocity puts the second control
+        point outside by more than a quarter of the range.
 
         Args:
-            ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored. An
-                empty list is one sequence without tokens: the coarsest motion.
+            ids: Tokens, (*batch, L) or a list of lists; all tokens after token 0 are ignored.
+                An empty list is one sequence without tokens: the coarsest motion.
             time: Time since the start [s], (T,) or (*batch, T), at any sampling rate. After
                 its end, a motion rests.
             start: (*batch, D); by default the mean start, or the encoded one.
@@ -388,7 +390,7 @@ class ActionProcessor:
             action_dim: Ignored; D is read from the chunks.
 
         Raises:
-            ValueError: The scale leaves no tolerance below 1.
+            ValueError: The scale is infinite, or so small that the tolerance is 1 or more.
         """
         if not OF_SCALE < scale < np.inf:
             raise ValueError(f"scale must be above {OF_SCALE} and finite, got {scale}")
@@ -417,7 +419,7 @@ class ActionProcessor:
     ) -> Float[np.ndarray, "B T D"]:
         """Chunks of `time_horizon` frames, by default T, from any tokens."""
         frames = np.arange(time_horizon or self.time_horizon)
-        ids = [list(row) for row in tokens] or torch.zeros(0, 0)  # no chunks, no motion
+        ids = [list(row) for row in tokens] or torch.zeros(0, 0)  # an empty batch
         return self.tokenizer.decode(ids, frames).numpy()
 
     def save_pretrained(self, save_directory: str | Path) -> None:

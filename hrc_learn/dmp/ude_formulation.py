@@ -3,8 +3,8 @@
 eta' = alpha (beta log(g conj q) - eta) + f,   q' = (0, eta) q / 2,   eta = tau omega
 
 ("Orientation in Cartesian space dynamic movement primitives", eq. 16). Primes are derivatives
-with respect to s = t / tau; the logarithm here has the full angle; f is the forcing term. With
-e = log(g conj q) and v = -eta,
+with respect to s = t / tau, f is the forcing term, and the logarithm is the rotation vector
+with the full angle. With e = log(g conj q) and v = -eta,
 
     v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
 

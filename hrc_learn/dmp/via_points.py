@@ -26,7 +26,8 @@ OUTSIDE = 1e-9
 which a motion may change). Of the Gaussians inside, only the few nearest to the ends of the
 window exceed this height."""
 RIDGE = 1e-7
-"""Ridge that keeps weights with equal effect small, relative to the largest."""
+"""Ridge on the weights, relative to the norm of a column of the design matrix: it keeps weights
+small if their effects nearly cancel."""
 QUINTIC = torch.tensor(
     [[0, 0, 0, 10, -15, 6], [0, 1, 0, -6, 8, -3], [0, 0, 0, -4, 7, -3]], dtype=torch.float64
 )
@@ -35,7 +36,8 @@ change of the value, and for the rates at the start and the end."""
 DEPENDENT = 1e-12
 """Relative singular value below which a constraint counts as implied by the others."""
 OVERSHOOT = 1.5
-"""Largest allowed change of a motion, relative to the curve of changes that is asked for."""
+"""Largest allowed change of a motion, relative to the largest change that the via points
+require (`_change_curve`)."""
 CLOSEST, CLOSEST_TO_WINDOW = 2, 6
 """Smallest distances at which motions do not overshoot, in units of the distance between basis
 functions. `CLOSEST`: between via points, and to start and end. `CLOSEST_TO_WINDOW`: to the ends
@@ -83,7 +85,8 @@ def through_via_points(
     missing = _missing(motion, via)
     curve = _change_curve(follower.s, via.s, missing, window)
     z = follower.follow(curve)
-    # What the basis cannot follow is corrected at the constraints, by the smallest change.
+    # The basis follows the curve only approximately: the smallest change of z that satisfies
+    # the constraints corrects this.
     required = ~missing.flatten(-3, -2).mT.isnan()
     H = motion.response.evaluate(via.s)[..., :2, follower.chosen]
     rows = (H @ follower.to_weights).flatten(-3, -2)
@@ -124,8 +127,8 @@ def _check_overshoot(
     inside = f" ({CLOSEST_TO_WINDOW * spacing:.3g} s from the ends of `within`)"
     inside = "" if window == (0.0, 1.0) else inside
     raise ValueError(
-        f"the motion would change {ratio:.2g} times as far as its via points ask: they are too "
-        f"close for {motion.basis.count} basis functions. Keep {CLOSEST * spacing:.3g} s "
+        f"the motion would change {ratio:.2g} times as far as its via points require: they are "
+        f"too close for {motion.basis.count} basis functions. Keep {CLOSEST * spacing:.3g} s "
         f"between them and from start and end{inside}, or fit with more functions (n_basis)"
     )
 

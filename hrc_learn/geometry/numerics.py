@@ -2,8 +2,8 @@
 
 The module also converts arrays of users to tensors and checks the ranges of settings.
 
-Functions with a removable singularity take the *squared* length: a Euclidean norm has no second
-derivative at zero, its square has all derivatives. `where` selects a Taylor series below a
+Functions with a removable singularity take the *squared* length: a Euclidean norm has no
+derivative at zero, but its square has all derivatives. `where` selects a Taylor series below a
 threshold and the closed form above it. The form that is not selected is evaluated at a harmless
 argument, because a NaN there would reach the gradient as 0 * NaN.
 """
@@ -27,18 +27,18 @@ _ARCTAN_THRESHOLD = 1e-3
 
 
 def as_tensor(values: ArrayLike, like: Tensor | None = None) -> Tensor:
-    """Turn an array into a floating-point tensor; tensors of floats pass unchanged.
+    """Convert an array to a floating-point tensor; tensors of floats are returned unchanged.
 
     Args:
         values: Tensor, NumPy array, or nested list. Integers and lists become float64.
-        like: Tensor whose dtype and device the result takes; None keeps those of `values`.
+        like: Tensor with the dtype and device of the result; None keeps those of `values`.
 
     Returns:
         Tensor of the same shape.
     """
     if not isinstance(values, Tensor):
         if isinstance(values, np.ndarray):
-            # PyTorch takes neither negative strides nor other byte orders.
+            # PyTorch accepts neither negative strides nor other byte orders.
             values = np.require(values, values.dtype.newbyteorder("="), ["C", "W"])
         values = torch.as_tensor(np.asarray(values))
     if not values.is_floating_point():
@@ -160,7 +160,7 @@ def everywhere(mask: Bool[Tensor, "*batch"]) -> bool:
 
 
 def has_numbers(tree: Any) -> bool:
-    """True if Python may branch and all floating-point values of a pytree are numbers."""
+    """True if Python may branch and all floats of a pytree are valid numbers (`is_number`)."""
     values = [x.reshape(-1) for x in tree_leaves(tree) if x.is_floating_point()]
     return may_branch(values[0]) and bool(is_number(torch.cat(values)).all())
 

@@ -29,8 +29,8 @@ _PRODUCT_SIGN = Constant(torch.tensor(_SIGNS, dtype=torch.float64))
 _CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
 # The sum of the signs with these weights has the sign of the first non-zero component.
 _LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
-# Each entry of 4 q q^T - I is a sum of three entries of R with these signs, numbered row by row
-# from 1.
+# Each entry of 4 q q^T - I is a sum of up to three entries of R with these signs. The entries
+# of R are numbered row by row from 1; 0 stands for no entry.
 _OUTER = torch.tensor([
     [1, 8, 3, 4, 8, 1, 2, 3, 3, 2, -1, 6, 4, 3, 6, -1],
     [5, -6, -7, -2, -6, -5, 4, 7, -7, 4, 5, 8, -2, 7, 8, -5],
@@ -139,7 +139,7 @@ def slerp(
     Args:
         p: Orientation at t = 0.
         q: Orientation at t = 1.
-        t: Fraction of the way; outside 0 to 1 it extrapolates.
+        t: Fraction of the rotation; values outside 0 to 1 extrapolate.
     """
     way = log(multiply(conjugate(p), q))
     fraction = t[..., None] if isinstance(t, Tensor) else t
@@ -169,8 +169,9 @@ def continuous(q: Float[Tensor, "*batch time 4"]) -> Float[Tensor, "*batch time 
 def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 3"]:
     """Rotation vectors along time, made continuous past half turns.
 
-    `log` jumps to the opposite axis where the angle passes pi. This adds whole turns about
-    each sample's own axis, so that `exp` of the result is unchanged and neighbours are close.
+    `log` jumps to the opposite axis where the angle passes pi. This function adds whole turns
+    about the axis of each sample, so that `exp` of the result is unchanged and neighbours are
+    close.
     The first sample is kept. Neighbours must be less than half a turn apart.
 
     Args:

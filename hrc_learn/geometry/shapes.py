@@ -18,7 +18,7 @@ Colour = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
 
 PLAIN: Colour = (0.86, 0.87, 0.89, 1.0)
-"""Colour of a robot link without a colour of its own."""
+"""Colour of a robot link whose description specifies no colour."""
 
 _CREASE = np.deg2rad(40.0)
 """Smallest angle between two faces whose common edge is drawn sharp [rad]."""

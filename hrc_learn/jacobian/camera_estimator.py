@@ -62,7 +62,7 @@ class CameraConfig:
     frames: int = 56
     """Key frames in the window."""
     min_step: float = 0.006
-    """Least motion between key frames [m], rotation scaled with `rotation_scale`."""
+    """Least motion between key frames [m]; `rotation_scale` converts rotations."""
     max_step: float = 0.1
     """Largest motion between key frames over which the residual Jacobian is integrated [m]."""
     rotation_scale: float = 0.15
@@ -246,7 +246,10 @@ class CameraEstimator(ImageJacobianEstimator):
         return chosen(seen & kept, self._searched(state), state)
 
     def _roll_cost(self, cameras: Float[Tensor, "*batch hypotheses 13"]) -> Tensor:
-        """Small cost of rotations since the demonstrations, which decides before any motion."""
+        """Small cost of rotations since the demonstrations.
+
+        It selects the hypothesis without a rotation until the tool has moved.
+        """
         turn = quaternion.exp(cameras[..., ROTATION])
         return 0.05 * quaternion.angle(turn, quaternion.exp(self.reference[ROTATION]))
 
@@ -260,7 +263,9 @@ class CameraEstimator(ImageJacobianEstimator):
     def _prior_error(
         self, cameras: Float[Tensor, "*batch 13"]
     ) -> tuple[Float[Tensor, "*batch 5"], Float[Tensor, "*batch 5 13"]]:
-        """Tilt and translation over their prior deviations, and derivatives by a step."""
+        """Tilt and translation divided by their prior standard deviations, and the derivatives
+        of both with respect to a step.
+        """
         config = self.config
         home = quaternion.to_matrix(quaternion.exp(self.reference[ROTATION]))
         R = quaternion.to_matrix(quaternion.exp(cameras[..., ROTATION]))
@@ -377,7 +382,10 @@ class CameraEstimator(ImageJacobianEstimator):
         pixel: Float[Tensor, "*batch frames 2"],
         kernel: Float[Tensor, "*batch frames frames"],
     ) -> Float[Tensor, "*batch frames frames"]:
-        """Inverse covariance of the frames' errors; outliers of the best camera count less."""
+        """Inverse covariance of the frames' errors.
+
+        Frames that are outliers for the best camera count less.
+        """
         seen, _ = marker_pixels(state.best, Pose(state.position, state.orientation))
         size = torch.where(state.known, (pixel - seen).norm(dim=-1), 0.0)
         # The median over known frames: unknown frames have size zero and are sorted first.

@@ -3,7 +3,8 @@
 A camera fitted to demonstrations (`perspective`) predicts the pixel of the tool's marker
 at any tool pose. If the camera turns by w and moves by v, the seen pixel differs from the
 prediction by e = L (w, v), to first order. L is the interaction matrix: the derivative of the
-pixel by the camera twist. One motion (w, v) is fitted to the differences e of the last second.
+pixel with respect to the camera twist. One motion (w, v) is fitted to the differences e of the
+last second.
 The displacement L (w, v), as root mean square over the frames, is compared with a threshold:
 2.5 times the largest displacement in demonstrations that were held out of the camera's fit. The
 threshold covers errors of calibration, lens and time stamps. Outside the region of the
@@ -140,7 +141,7 @@ class CameraReference:
     def fit(
         demonstrations: Sequence[ImageDemonstration], fps: float, image_size: tuple[int, int]
     ) -> CameraReference:
-        """Fit the camera, and the threshold from displacements found for an unmoved camera.
+        """Fit the camera, and compute the threshold from displacements of an unmoved camera.
 
         Args:
             demonstrations: Two or more demonstrations with one fixed camera; read several
@@ -367,7 +368,7 @@ def _explained(
     """
     errors = pixels - pixels_and_depth(camera, points)[0]
     size = errors.norm(dim=-1)
-    # Clip at a tenth of a pixel or more: else all frames of exact images would be outliers.
+    # Clip at 0.1 px or more: otherwise, all frames of exact images would be outliers.
     most = (_OUTLIER * size.quantile(0.5)).clamp(min=0.1)
     errors = errors * (most / size.clamp(min=most)).unsqueeze(-1)
     slope = motion_jacobian(camera, points)
@@ -431,11 +432,11 @@ def object_height(
 ) -> float:
     """Height of the horizontal plane on which objects lie, in the camera's base frame [m].
 
-    The base frame of a fitted camera is shifted from the robot's by the part of the marker's
-    position on the tool that the demonstrations do not determine. The returned height is in the
-    camera's base frame, so it differs from a height in the robot's base frame. All objects have
-    the same offset from the tool when grasped. This offset is found by least squares on the
-    pixels.
+    The demonstrations determine the marker's position on the tool only in part. The error of
+    the other part shifts the base frame of the fitted camera from the robot's base frame. The
+    returned height is in the camera's base frame, so it differs from a height in the robot's
+    base frame. When they are grasped, all objects have the same unknown offset from the tool.
+    Least squares on the pixels finds this offset.
 
     Args:
         reference: Camera of the demonstrations.
@@ -468,10 +469,10 @@ def object_height(
 class CameraCorrection:
     """Estimates the motion of a camera and corrects pixels for it.
 
-    `CameraEstimator` does not replace it: it allows any rotation about the optical axis. One
-    image after a motion by 10 cm and 10 degrees, it misplaces objects by 110 px even if it has
-    converged (240 px after its one step an image), this class by 8 to 10 px; from 25 images on
-    they agree within 1 px.
+    `CameraEstimator` cannot replace this class, because it allows any rotation about the
+    optical axis. With one image after a motion by 10 cm and 10 degrees, `CameraEstimator`
+    misplaces objects by 240 px after its one step per image, and by 110 px after convergence.
+    This class misplaces them by 8 to 10 px. From 25 images on, both agree within 1 px.
 
     Attributes:
         motion: Motion of the camera since the demonstrations; None if none was detected.

@@ -180,7 +180,7 @@ class LearningConfig(KeyFrameConfig):
     """Settings of all estimators that learn from key frames."""
 
     weight_bound: float = 2e4
-    """Largest entry of the weights [px/m], rotation scaled with `rotation_scale`."""
+    """Largest entry of the weights [px/m]; `rotation_scale` converts entries of rotations."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -254,7 +254,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         """State after learning from a pair of frames, if there is one.
 
         Args:
-            state: State before.
+            state: State before the measurement.
             now: Measurement of this step.
             theta: Activations of the neurons at the measured pose, (*batch, K).
             pair: Motion from the key frame.
@@ -333,7 +333,7 @@ class PaperEstimator(ImageJacobianEstimator):
     xi_x and xi_r are the controller's vision and Cartesian feedback. L is a multiple of the
     identity. The law reduces the energy |s|^2 that the command puts into the task. It uses no
     measured image motion, so it cannot correct a wrong Jacobian. With L = 0.25 I (Table I),
-    weights of 1e3 px/m change by parts in 1e9.
+    weights of 1e3 px/m change by a few parts in 1e9.
     """
 
     def __init__(self, network: RBFImageJacobian, gain: float = 0.25):
@@ -495,9 +495,9 @@ class KalmanState(KeyFrameState):
 class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
     """Kalman filter of the weights and a drifting bias Jacobian, observed through dx = J_s dr.
 
-    With normalised neurons, a bias is an equal change of all weights. Therefore the bias needs
-    no state of its own, only a covariance. Both image rows have the same regressors and
-    therefore the same covariance.
+    With normalised neurons, a bias is an equal change of all weights. Therefore the filter has
+    no separate state for the bias: the covariance of the weights includes it. Both image rows
+    have the same regressors and therefore the same covariance.
     """
 
     constant = True
@@ -522,7 +522,7 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             bias, weight = self.config.bias_std, self.config.weight_std
             neurons = weight_covariance(network.centers, bias, weight)
             covariance = torch.block_diag(*[neurons] * 6)
-        else:  # from px per metre of the fit's rotations to px per metre of this filter's
+        else:  # convert from the `rotation_scale` of the fit to that of this filter
             scale = component_scale(covariance, network.rotation_scale) / self.scale
             scale = scale.repeat_interleave(len(network.centers))
             covariance = scale * covariance * scale[:, None]

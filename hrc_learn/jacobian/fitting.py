@@ -41,8 +41,8 @@ class KeyFrameConfig:
     """Choice of key frames, the frames that are compared."""
 
     min_step: float = 2e-4
-    """Least motion between key frames [m], rotation scaled with `rotation_scale`. Choose at
-    least ten times the noise of measured poses: pose noise shrinks the Jacobian towards zero
+    """Least motion between key frames [m]; `rotation_scale` converts rotations. Choose at least
+    ten times the noise of measured poses: pose noise shrinks the Jacobian towards zero
     (regression dilution). At ten times the noise, the Jacobian shrinks by 2 %."""
     max_step: float = 0.05
     """Largest motion of a pair of key frames [m]. A larger motion spans a gap in visibility,
@@ -445,7 +445,7 @@ def weight_covariance(
 ) -> Float[Tensor, "K K"]:
     """Prior covariance between neurons for a single entry of the Jacobian.
 
-    Each weight is the sum of a bias, common to all neurons, and a deviation of its own.
+    Each weight is the sum of a bias, common to all neurons, and an independent deviation.
     Normalised neurons sum to one, so the bias adds a constant Jacobian to the network: an
     observation at one pose applies everywhere until other poses are observed.
 

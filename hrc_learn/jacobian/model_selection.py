@@ -3,8 +3,8 @@
 For given neurons, the weights have a closed form. The evidence has one, too: the probability of
 the demonstrated image motion with the weights integrated out (type-II maximum likelihood;
 MacKay 1992, "Bayesian interpolation"). L-BFGS maximises the evidence over neurons, noise and
-prior. The error on held-out demonstrations decides when to stop. A pair below is a pair of
-successive key frames, between which image motion is compared.
+prior. The error on held-out demonstrations decides when to stop. In this module, a pair
+consists of two successive key frames and the motion between them.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class NegativeLogEvidence(nn.Module):
         return RegressionStatistics.of(phi, motion.dx).over_processes()
 
     def neurons(self, *, attached: bool = False) -> RBFCenters:
-        """The present neurons; if `attached`, in the graph, so that gradients reach them."""
+        """The present neurons; `attached` keeps them in the graph, so that gradients flow."""
         centers, width = self.centers, self.log_width.exp()
         if not attached:
             centers, width = centers.detach().clone(), float(width.detach())

@@ -68,7 +68,7 @@ class RBFImageJacobian(nn.Module):
     """Posterior covariance of the weights of one image row, (6 K, 6 K) in (component, neuron)
     order, with rotation scaled to metres (`rotation_scale`); None if not fitted."""
     rotation_scale: float = 0.15
-    """Length by which `covariance` converts rotations, that of the fit [m/rad]."""
+    """Length by which the fit converted the rotations of `covariance` [m/rad]."""
     camera: Tensor | None
     """Vector of the camera and its marker (see `perspective`), (13,); None: no camera."""
     camera_covariance: Tensor | None
@@ -157,7 +157,7 @@ class RBFImageJacobian(nn.Module):
             The network, with `report` and `covariance` set; the same in all processes.
 
         Raises:
-            ValueError: No pair of key frames is left.
+            ValueError: There is no pair of key frames.
         """
         config = config or ImageJacobianFitConfig()
         network = cls(
@@ -232,7 +232,7 @@ class RBFImageJacobian(nn.Module):
         )
 
     def uncertainty(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of each column of J_s_hat, larger value of both rows.
+        """Posterior standard deviation of each column of J_s_hat: the larger of both rows.
 
         Args:
             r: Pose, as for `forward`.
@@ -275,7 +275,7 @@ class RBFImageJacobian(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path) -> RBFImageJacobian:
-        """Read a saved network; the fit report stays in `config.json`.
+        """Read a saved network, without the fit report in `config.json`.
 
         Raises:
             FileNotFoundError: There is no such folder or file.
@@ -296,7 +296,7 @@ class RBFImageJacobian(nn.Module):
             raise saved.invalid(error) from error
         if "covariance" in saved.tensors:
             network.covariance = saved.tensor("covariance")
-        # Older files have the default.
+        # Older files lack this field; their networks were fitted with the default.
         network.rotation_scale = saved.config.get("rotation_scale", network.rotation_scale)
         return network
 

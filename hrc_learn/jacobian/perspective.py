@@ -81,7 +81,9 @@ _BLOCK = 25
 def pixels_and_depth(
     camera: Float[Tensor, "*batch 13"], points: Float[Tensor, "*batch frames 3"]
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 3"]]:
-    """Pixels of points in the camera frame [px], and their derivatives by the points [px/m]."""
+    """Pixels of points in the camera frame [px], and the derivatives of the pixels with respect
+    to the points [px/m].
+    """
     # Points behind the camera are treated as very near: their pixels are wrong, but finite.
     z = points[..., 2:].clamp_min(_NEAREST)
     xi = points[..., :2] / z
@@ -114,7 +116,7 @@ def from_base(
 def marker_pixels(
     camera: Float[Tensor, "*batch 13"], pose: Pose
 ) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 13"]]:
-    """Pixels of the marker [px], and their derivatives by a step of c (see `stepped`)."""
+    """Pixels of the marker [px], and their derivatives with respect to a step (`stepped`)."""
     points = marker_points(camera, pose)
     pixel, by_point = pixels_and_depth(camera, points)
     offset = pixel - camera[..., None, CENTER]
@@ -134,7 +136,7 @@ def marker_pixels(
 def camera_jacobian(
     camera: Float[Tensor, "*batch 13"], pose: Pose
 ) -> Float[Tensor, "*batch frames 2 6"]:
-    """Image Jacobian of the marker by the tool's twist in the base frame [px/m, px/rad]."""
+    """Image Jacobian of the marker for the tool's twist in the base frame [px/m, px/rad]."""
     _, by_point = pixels_and_depth(camera, marker_points(camera, pose))
     turn = quaternion.to_matrix(quaternion.exp(camera[..., None, ROTATION]))
     rows = matmul(by_point, turn.expand(*by_point.shape[:-2], 3, 3))
@@ -162,7 +164,7 @@ def eye_of(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3"]:
 
 
 def eye_by_step(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3 6"]:
-    """Derivative of `eye_of` by the rotation and shift of a step (`stepped`)."""
+    """Derivative of `eye_of` with respect to rotation and shift of a step (`stepped`)."""
     # A step moves the camera position e = -R^T t to e + R^T (w x t) - R^T dt.
     t = camera[..., SHIFT].unsqueeze(-2)
     axes = torch.eye(3).to(t).expand(*t.shape[:-2], 3, 3)
@@ -469,7 +471,7 @@ def _starts(
 def _shifts(
     point: Float[Tensor, "starts frames 3"], xi: Float[Tensor, "frames 2"]
 ) -> Float[Tensor, "starts 3"]:
-    """Shifts t of initial cameras [m], by least squares, with all points before the camera.
+    """Shifts t [m] of initial cameras, by least squares, with all points in front of them.
 
     A point x, rotated to the camera frame, is seen in direction xi = (x + t)_12 / (x + t)_3.
 
@@ -503,7 +505,7 @@ def _cube_rotations() -> Float[Tensor, "24 3 3"]:
 def motion_jacobian(
     camera: Float[Tensor, "13"], points: Float[Tensor, "frames 3"]
 ) -> Float[Tensor, "frames 2 6"]:
-    """Derivative of pixels by a twist of the camera in the camera frame [px/rad, px/m].
+    """Derivative of pixels with respect to a camera twist in the camera frame [px/rad, px/m].
 
     This is the interaction matrix of points of Espiau, Chaumette and Rives (1992), times the
     derivative of the lens; three columns for rotation, then three for translation.

@@ -35,7 +35,7 @@ class LoggedSteps:
     """
 
     def __init__(self, blocks: Sequence[np.ndarray], length: int, events: Sequence[Event]):
-        """Take blocks of rows, of which all but the last are full.
+        """Store blocks of rows; all blocks but the last are full.
 
         Args:
             blocks: Structured arrays of one type and length.

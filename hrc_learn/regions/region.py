@@ -26,7 +26,7 @@ class Region(ABC):
     def value(self, x: Float[Tensor, "*batch n"]) -> Tensor:
         """Region function f, a scalar or a value per component of x.
 
-        It is at most zero inside; that of `JointRegion` is at least zero inside.
+        It is at most zero inside the region; for `JointRegion`, it is at least zero inside.
         """
 
     @abstractmethod
@@ -65,8 +65,8 @@ class PositionRegion(Region):
 
     Far from a small box this pull grows with the cube of the distance. The axis with the
     largest offset then dominates, and a cap on the twist leaves almost nothing for rotation.
-    `formulation="saturated"` is the same up to twice the half size, f = 3. Beyond, its pull
-    grows linearly, so the tool moves straight to the box:
+    `formulation="saturated"` has the same potential up to twice the half size, f = 3. Beyond,
+    its pull grows linearly, so the tool moves straight to the box:
 
     P = sum_i k_c 3 (f_i - 3/2),   f_i > 3
     """
@@ -120,7 +120,7 @@ class _Cone(Region):
     goal: Float[Tensor, "*#batch 4"]
     """Goal orientation, a unit quaternion (w, x, y, z) of either sign."""
     sharpness: float = static(15.0)
-    """alpha_o, two over the tolerated angle [1/rad]."""
+    """alpha_o, two divided by the tolerated angle [1/rad]."""
     stiffness: float = static(0.02)
     """k_o."""
 

@@ -18,9 +18,9 @@ how far a killed process got, and the next writer of NAME, or `recover`, cleans 
 Two renames are used instead of an exchange because every file system supports them.
 
 When a folder is replaced, only files that its manifest lists, or that match the patterns of its
-kind (`Kind.files`), are deleted. A folder with other files is not replaced; only a kind with
-patterns carries them over. If a path is a symbolic link, the link stays and its target is
-replaced.
+kind (`Kind.files`), are deleted. If a folder contains other files, these are carried over to
+the new folder if its kind has patterns; otherwise the folder is not replaced. If a path is a
+symbolic link, the link stays and its target is replaced.
 """
 
 from hrc_learn.store._folder import DATASET as DATASET

@@ -160,7 +160,7 @@ def delete(place: Path) -> None:
 
 def delete_entries(folder: Path, names: Iterable[str]) -> None:
     """Delete entries of a folder, and the folder if that leaves it empty."""
-    # Only entries found in the folder: a list from elsewhere may name "../elsewhere".
+    # Delete only entries found in the folder: a damaged list may contain "../other".
     for entry in sorted(entries(folder) & set(names), reverse=True):  # content first
         with contextlib.suppress(OSError):  # entries that cannot be deleted remain visible
             if entry.endswith("/"):

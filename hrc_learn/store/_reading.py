@@ -28,7 +28,7 @@ Positive = Annotated[float, Meta(gt=0, le=1e300)]
 """Positive, finite number in a file."""
 
 MAX_SIZE = 64 * 2**20
-"""Largest file that is read [bytes]. Ours have a few kilobytes."""
+"""Largest file that is read [bytes]. Files written by this package have a few kilobytes."""
 
 
 def read_json[T](
@@ -99,7 +99,7 @@ def _content(path: Path, advice: str) -> bytes:
         raise ValueError(f"{path} is not a file")
     if path.stat().st_size > MAX_SIZE:
         raise ValueError(f"{path} is larger than {MAX_SIZE >> 20} MiB; {advice}")
-    return path.read_bytes().removeprefix(b"\xef\xbb\xbf")  # as editors of Windows write
+    return path.read_bytes().removeprefix(b"\xef\xbb\xbf")  # mark of some Windows editors
 
 
 def _finite(text: str) -> float:

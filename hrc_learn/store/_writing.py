@@ -154,7 +154,7 @@ class Claim:
         disk.write_manifest(self.new, kind, source)
         if replaces:
             owned = disk.owned_entries(self.target, kind) or set()
-            if kind.files:  # after the manifest: carried files stay foreign
+            if kind.files:  # carried over after the manifest, which must not list them
                 foreign = disk.entries(self.target) - owned
                 owned |= disk.carry_over(foreign, self.target, self.new)
             self._owned.write_text(json_text(sorted(owned)), encoding="utf-8")
@@ -285,14 +285,14 @@ def recover(path: str | os.PathLike[str]) -> list[str]:
     target = resolved(path)
     done = _recover_one(target) if _is_interrupted(target) else []
     for other in list(_interrupted_below(target)):
-        # In use, foreign, or not writable.
+        # Skip paths that are in use, foreign or not writable.
         with contextlib.suppress(FileExistsError, PermissionError):
             done += _recover_one(other)
     return done
 
 
 def settle(path: str | os.PathLike[str]) -> None:
-    """Before `path` is read: complete an interrupted replacement that left nothing there."""
+    """Complete an interrupted replacement that left nothing at `path`. Call before reading."""
     place = resolved(path)
     while not place.exists():
         if _is_interrupted(place):
@@ -320,7 +320,7 @@ def _interrupted_below(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_file(path: str | os.PathLike[str] | Claim) -> Iterator[Path]:
-    """Context for writing a file: in a temporary folder, then moved to its path when complete.
+    """Context for writing a file in a temporary folder; the complete file moves to its path.
 
     Args:
         path: Path of the file, whose folder must exist, or a claim to the path. A claim stays
@@ -354,12 +354,12 @@ def replacing(
     *,
     source: str = "",
 ) -> Iterator[Path]:
-    """Context for writing a folder: in a temporary place, then moved to its path when complete.
+    """Context for writing a folder in a temporary place; the complete folder moves to its path.
 
     Args:
         path: Path of the folder, or a claim to the path. A claim stays held.
         kind: Kind of the folder.
-        overwrite: Replace an older folder of the same kind; others are never touched.
+        overwrite: Replace an older folder of the same kind; other folders are never replaced.
         source: Identifier of the source, for `source_of`.
 
     Yields:
@@ -381,7 +381,7 @@ def replacing(
 def new_folder(
     path: str | os.PathLike[str], made_by: Mapping[str, Any], overwrite: bool = False
 ) -> Iterator[Path]:
-    """Context for writing results in a temporary folder, moved to its path when complete.
+    """Context for writing results in a temporary folder, which moves to its path when complete.
 
     Args:
         path: Path of the folder.
@@ -396,7 +396,7 @@ def new_folder(
         BusyError: Another process is writing this folder.
         InTheWayError: `path` exists and may not be replaced.
     """
-    inputs = json_text(made_by)  # before the work, which an error here would lose
+    inputs = json_text(made_by)  # converted first: an error after the work would lose the work
     with replacing(path, RESULTS, overwrite) as folder:
         folder.mkdir()
         yield folder

@@ -192,7 +192,7 @@ def test_curvature_is_the_derivative_of_the_rate():
 @pytest.mark.parametrize("rate", [0.0, -1.0, 12.5])
 def test_impossible_goal_filters_are_refused(rate):
     dmp = primitive()
-    with pytest.raises(ValueError, match="goal filter"):
+    with pytest.raises(ValueError, match="goal_filter must be positive and not near a mode"):
         dmp.step(dmp.initial_state(), 0.1, goal=[0.0], goal_filter=rate)
 
 

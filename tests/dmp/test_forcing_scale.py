@@ -336,7 +336,7 @@ def test_a_line_cannot_turn():
 
 def test_frames_of_several_demonstrations_have_no_mean():
     dmp = JointDMP.fit(TIME, torch.stack([POSITION, -POSITION]), 8, scaling="rotation")
-    with pytest.raises(ValueError, match="frame of its own"):
+    with pytest.raises(ValueError, match="each primitive in a different frame"):
         mean_primitive(dmp)
 
 

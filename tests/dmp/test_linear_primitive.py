@@ -105,8 +105,8 @@ def test_a_flipped_bit_is_noticed(saved, name):
 @pytest.mark.parametrize(
     ("field", "value", "complaint"),
     [
-        ("version", 2, "config.json: version is 2, this reads 1"),
-        ("kind", "Cake", "config.json: kind is 'Cake', this reads 'JointDMP'"),
+        ("version", 2, "config.json: version is 2, expected 1"),
+        ("kind", "Cake", "config.json: kind is 'Cake', expected 'JointDMP'"),
         ("scaling", None, "config.json: field 'scaling' must be str, got None"),
         ("scaling", "cubic", "unknown scaling 'cubic'"),
         ("spring", {"alpha": -1.0}, "alpha must be positive"),
