@@ -1,4 +1,4 @@
-"""Play a fitted model to a goal: path, joints, film and episode.
+"""Write the motion of a fitted model to a goal: path, joints, film and episode.
 
 The same as `hrc play`.
 """

@@ -1,4 +1,4 @@
-"""Grasp objects beside a person, carry them to the cabinet and place them on shelves.
+"""Grasp objects near a person, carry them to the cabinet and place them on shelves.
 
 The same as `hrc run collaboration`.
 """

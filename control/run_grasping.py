@@ -1,4 +1,4 @@
-"""Grasp an object from afar with an uncalibrated camera.
+"""Grasp an object with an uncalibrated camera, from a distant start.
 
 The same as `hrc run grasping`.
 """

@@ -1,4 +1,4 @@
-"""Place an object on three shelves by a motion that was demonstrated for one of them.
+"""Place an object on three shelves, with a motion that was demonstrated for one shelf.
 
 The same as `hrc run placing`.
 """

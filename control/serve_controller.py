@@ -1,4 +1,4 @@
-"""Run the controller at a fixed rate on the simulated arm, and report how fast it answers.
+"""Run the controller at a fixed rate, and report its latency.
 
 The same as `hrc serve`.
 """

@@ -1,4 +1,4 @@
-"""Lead the simulated arm in a browser, and record demonstrations of your own.
+"""Guide the arm in a browser, and record your own demonstrations.
 
 The same as `hrc page`.
 """

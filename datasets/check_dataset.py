@@ -1,4 +1,4 @@
-"""Check a LeRobot dataset: what is broken, and what is odd enough to look at before training.
+"""Check a LeRobot dataset: list errors, and oddities to inspect before training.
 
 The same as `hrc check`.
 """

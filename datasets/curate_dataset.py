@@ -1,4 +1,4 @@
-"""Look through the episodes of a LeRobot dataset and decide which of them stay.
+"""Review the episodes of a LeRobot dataset and decide which episodes to keep.
 
 The same as `hrc curate`.
 """

@@ -50,7 +50,7 @@ class Args:
     episodes: tuple[int, ...] = ()
     """Episodes to write; all by default."""
     json: Path | None = None
-    """File for the figures."""
+    """File for the measured values."""
 
 
 def main(args: Args) -> None:
@@ -68,8 +68,8 @@ def write_mcap(path: Path, demos: Iterable[Demonstration], reader: ImageReader) 
 
     Args:
         path: File to write; it appears only when complete.
-        demos: The demonstrations. They keep their start times; an episode that began earlier
-            than 2 s after the end of the one before it is moved there.
+        demos: The demonstrations. They keep their start times, except that each episode starts
+            at least 2 s after the end of the episode before it.
         reader: Reader of the dataset's images.
 
     Returns:

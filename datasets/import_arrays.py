@@ -1,4 +1,4 @@
-"""Turn recordings kept as plain arrays (.npz, .npy, .csv) into a LeRobot dataset.
+"""Convert recordings of any format, such as .npz, .npy or .csv, to a LeRobot dataset.
 
 The same as `hrc import`.
 """

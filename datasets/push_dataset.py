@@ -1,4 +1,4 @@
-"""Check a LeRobot dataset and bring it to the Hugging Face Hub, with a card.
+"""Check a LeRobot dataset and upload it to the Hugging Face Hub with a dataset card.
 
 The same as `hrc push`.
 """

@@ -1,4 +1,4 @@
-"""Record demonstrations of placing an object, end effector and null-space posture at once.
+"""Record demonstrations of placing an object, with the null-space posture of the arm.
 
 The same as `hrc record placing`.
 """

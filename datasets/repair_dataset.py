@@ -1,4 +1,4 @@
-"""Repair a LeRobot dataset into a new copy, and say what was changed in which episode.
+"""Write a repaired copy of a LeRobot dataset, and list the changes by episode.
 
 The same as `hrc repair`.
 """

@@ -1,4 +1,4 @@
-"""Look at the demonstrations of a LeRobot dataset, or at a run or a fit, in Rerun.
+"""Show the demonstrations of a LeRobot dataset, a run or a fit in Rerun.
 
 The same as `hrc show`.
 """

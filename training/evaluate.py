@@ -1,4 +1,4 @@
-"""Evaluate fitted movement primitives on demonstrations, such as those held out.
+"""Evaluate fitted movement primitives or an image Jacobian on held-out demonstrations.
 
 The same as `hrc evaluate`.
 """

@@ -1,4 +1,4 @@
-"""Fit motion tokens to a dataset, and report them.
+"""Fit motion tokens to a dataset, and report their counts and errors.
 
 The same as `hrc tokens`.
 """

@@ -1,4 +1,4 @@
-"""Let a trained LeRobot policy's actions be smoothed: any policy, wherever it is run.
+"""Limit velocity, acceleration and jerk of the actions of any trained LeRobot policy.
 
 The same as `hrc smooth`.
 """

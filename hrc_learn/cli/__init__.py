@@ -1,6 +1,6 @@
-"""The command `hrc`, and the frame of programs with a command line.
+"""The command `hrc`, and the common code of programs with a command line.
 
-`main()` runs the command that was typed, `main("record", "placing")` a given one. Other
+`main()` runs the typed command, `main("record", "placing")` runs this command. Other
 programs declare a dataclass as their command line and call `run`. Importing this package
 imports no large library.
 """

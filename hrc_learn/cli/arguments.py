@@ -43,11 +43,11 @@ def refuse_given(args: Any, names: Iterable[str], reason: str) -> None:
 def refuse_of_others(
     args: Any, kinds: Mapping[str, Sequence[str]], kind: str, command: str
 ) -> None:
-    """Refuse options that a kind of a command does not have.
+    """Refuse options that do not belong to the chosen kind of a command.
 
     Args:
         args: Arguments of a command.
-        kinds: Kinds that have an option, by the name of its field.
+        kinds: Kinds that an option belongs to, by the name of its field.
         kind: Chosen kind.
         command: The command, for the message.
 
@@ -85,7 +85,7 @@ class OnDataset(Measured):
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Meaning of those columns of a dataset that cannot be detected."""
+    """Meaning of columns of a dataset, for columns whose meaning cannot be detected."""
 
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm. For -100..100 of
@@ -117,8 +117,8 @@ class Check(Columns, OnDataset, Written):
     keep_contract: bool = False
     """Store the meaning of the columns in DATASET/meta/hrc_learn.json."""
     robot: str = ""
-    """Arm whose kinematics tell the units, as in `hrc demo` (NAME or FILE). Default: by the
-    dataset's robot type."""
+    """Arm whose kinematics determine the units, given as in `hrc demo` (NAME or FILE). Default:
+    the arm of the dataset's robot type."""
     camera: bool = False
     """Also detect between which episodes the camera was moved, from the tool's marker."""
 
@@ -279,8 +279,8 @@ class Show(Measured):
     """Open a run, a fit or the demonstrations of a dataset in Rerun.
 
     A dataset is shown with its arm in 3D, cameras, gripper, and commands next to measured
-    joints. Each episode has a timeline of its own; choose it in the time panel. The arm is
-    given by the dataset's robot type, or by --robot.
+    joints. Each episode has its own timeline: select it in the time panel. The arm is given by
+    the dataset's robot type, or by --robot.
     """
 
     dataset: Path
@@ -292,7 +292,7 @@ class Show(Measured):
     episodes: tuple[int, ...] = ()
     """Episodes to show. Default: all, but at most 200 or a million frames."""
     robot: str = ""
-    """Arm to draw, as in `hrc demo`. Default: by the dataset's robot type."""
+    """Arm to draw, given as in `hrc demo`. Default: the arm of the dataset's robot type."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,10 +346,10 @@ class FitPrimitives(Columns, Fit):
     channels: tuple[Channel, ...] = ()
     """Channels to learn. Default: joint and pose, if the dataset has them."""
     several: Literal["best", "mean", "distribution", "contextual", "streamed"] = "best"
-    """Common model of several demonstrations. best: of mean, contextual and nearest, the one
-    that predicts held-out demonstrations best. mean: their mean. distribution: their mean and
-    all primitives (for a ProbabilisticDMP). contextual: a function of the context. streamed:
-    one primitive, fitted in a single pass over the data."""
+    """Common model of several demonstrations. best: the model that predicts held-out
+    demonstrations best, such as the mean, the nearest or contextual. mean: their mean.
+    distribution: their mean and all primitives (for a ProbabilisticDMP). contextual: a function
+    of the context. streamed: one primitive, fitted in a single pass over the data."""
     context: tuple[str, ...] = ()
     """Columns whose values in the first frame are the context. Default: start and goal."""
     n_basis: int | None = 60
@@ -432,9 +432,9 @@ class Evaluate(OnDataset, Written):
     out: Path | None = None
     """Folder for figures and measured values of primitives."""
     episodes: tuple[int, ...] = ()
-    """Episodes to evaluate on. Default: those not learned from, or all."""
+    """Episodes to evaluate on. Default: those not used for the fit, or all."""
     most_nrmse: float | None = None
-    """Largest median NRMSE of primitives that passes. Default: any."""
+    """Exit status 1 if the median NRMSE of primitives exceeds this. Default: no limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -458,7 +458,7 @@ class Play(Written):
     start: tuple[str, ...] = ()
     """Start, in the same form; an episode gives its first frame. Default: the model's."""
     robot: str = ""
-    """Arm, as in `hrc demo`. Default: no arm."""
+    """Arm, given as in `hrc demo`. Default: no arm."""
     duration: float | None = None
     """Duration [s]. Default: the model's."""
     out: Path | None = None
@@ -509,7 +509,8 @@ class Report(Measured):
     out: Path
     """HTML file to write. Replaces an older one."""
     evidence: bool = False
-    """Instead, list the requirements of ISO 10218:2025 near people, with measured values."""
+    """List the requirements of ISO 10218:2025 for work near people, with measured values,
+    instead of the reports."""
 
 
 Shelf = Literal["lower", "middle", "upper"]
@@ -622,7 +623,7 @@ class Run(WithImperfections, WithDriver, Written):
     aiming: Path | None = None
     """Folder written by `hrc fit image-jacobian`. Default: the model of `hrc demo`."""
     seed: int = 0
-    """Random seed of the run. Trials count up from it."""
+    """Random seed of the run, and of the first trial; each further trial adds 1."""
     trials: int = 0
     """Number of repetitions with random conditions, for statistics."""
     camera: str = "auto"
@@ -633,7 +634,7 @@ class Run(WithImperfections, WithDriver, Written):
     shelf: tuple[Shelf, ...] = ("middle",)
     """Shelf for the object. With two or three shelves, as many objects are placed."""
     pulls: Literal["scripted", "random", "none"] = "scripted"
-    """Pulls at the elbow: while the arm waits for them, at random moments, or never."""
+    """Pulls at the elbow: while the arm waits for a pull, at random moments, or never."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     worker: bool = False
@@ -653,7 +654,7 @@ class Record(WithRobot, Written):
     placing: an object is carried to a shelf while the elbow is pulled past the cabinet's door.
     servoing: the marked end effector moves above an object, seen by an uncalibrated camera.
     expert: demonstrations with the columns of LeRobot's robots, for LeRobot's policies.
-    leader: a LeRobot teleoperator leads a real LeRobot arm within the arm's limits:
+    leader: a LeRobot teleoperator guides a real LeRobot arm within the arm's limits:
 
         hrc record leader --robot so101 --out demos --robot.type=so101_follower
             --robot.port=/dev/ttyACM0 --teleop.type=so101_leader --teleop.port=/dev/ttyACM1
@@ -709,9 +710,9 @@ class Multiply(OnDataset):
 class ServePage(WithDriver):
     """Guide the arm in a browser and record demonstrations.
 
-    Open the printed address in a browser, the other one in a headset or on a phone. Drag a link
-    to move the arm in its null space, drag the end effector's gizmo to move the tool. Ends with
-    "Finish", Ctrl-C or after --duration, and leaves a LeRobot dataset of the saved
+    Open the first printed address in a browser, the last one in a headset or on a phone. Drag a
+    link to move the arm in its null space, drag the end effector's gizmo to move the tool. Ends
+    with "Finish", Ctrl-C or after --duration, and leaves a LeRobot dataset of the saved
     demonstrations.
     """
 
@@ -731,11 +732,12 @@ class ServePage(WithDriver):
 class Serve(WithDriver):
     """Run the controller at a fixed rate and report its latency.
 
-    The arm servoes the image of its marker to a target; a camera is simulated at 31 Hz, but a
-    real arm does move. The report lists the time from reading the joints to the command, the
-    delay of each tick, and missed ticks. The first start takes about 10 s to compile the step;
-    `--config step=eager` skips this. With --ros2, the controller is a lifecycle node instead:
-    it receives goals, images and pushes on topics and commands a standard ROS 2 controller.
+    The arm servoes the image of its marker to a target. The camera is always simulated, at 31
+    Hz; with --arm, a real arm moves. The report lists the time from reading the joints to the
+    command, the delay of each tick, and missed ticks. The first start takes about 10 s to
+    compile the step; `--config step=eager` skips this. With --ros2, the controller is a
+    lifecycle node instead: it receives goals, images and pushes on topics and commands a
+    standard ROS 2 controller.
 
         hrc serve --ros2 --robot /robot_description:tool0
     """

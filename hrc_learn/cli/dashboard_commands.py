@@ -168,7 +168,7 @@ def report(args: Report) -> None:
     names = [run.resolve().name for run in args.runs]
     values = {}
     for number, (name, report) in enumerate(zip(names, reports, strict=True), start=1):
-        # Runs in folders of the same name are told apart by their numbers on the page.
+        # Numbers on the page distinguish runs in folders of the same name.
         own = name if names.count(name) == 1 else f"{name}_{number}"
         values |= {f"{own}_{m.key}": m.value for m in report.table}
     write_values(args.json, values)

@@ -286,7 +286,7 @@ def _digest(folder: Path, pattern: str = "*") -> str:
 def _learning_steps(
     out: Path, robot: WithRobot, markerless: bool
 ) -> Iterator[tuple[str, Callable[[], object], list[Path]]]:
-    """Title and work of each step, the folders that it reads, and last the one it writes."""
+    """Title and work of each step, the folders that it reads, and last the folder it writes."""
     from hrc_learn.cli.fit_command import fit_primitives
     from hrc_learn.cli.image_jacobian_commands import fit_image_jacobian
     from hrc_learn.cli.record_command import record

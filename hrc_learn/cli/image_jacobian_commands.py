@@ -108,7 +108,8 @@ def _demonstrations(args: FitImageJacobian, console: Console, rank: int) -> _Sea
         refuse_given(args, ["camera"], "needs --marker or --markerless")
         return demos, {}, None
     if rank != 0:
-        distributed.sum_over_processes(torch.zeros(()))  # waits for the search of the first one
+        # Waits until the first process has searched.
+        distributed.sum_over_processes(torch.zeros(()))
     found = _find_marker(args, args.marker, console)
     if rank == 0:
         distributed.sum_over_processes(torch.zeros(()))

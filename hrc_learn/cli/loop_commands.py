@@ -221,7 +221,7 @@ class _ServeSettings:
     step: Literal["fastest", "eager"] = "fastest"
     """fastest: compile the step to machine code; eager: do not compile it."""
     autostart: bool = True
-    """Configure and activate the node at once; False: a launch file does."""
+    """Configure and activate the node at once; False: a launch file does this."""
 
 
 def serve(args: Serve) -> None:

@@ -40,7 +40,7 @@ class TokenSettings:
     """True if a chunk starts at the arm's state; False: the tokens also encode the start, and
     no velocity is used."""
     held_out: int = 5
-    """Number n if every n-th episode is held out of the fit, for the report; 0: none."""
+    """n: every n-th episode is held out of the fit, for the report; 0: none is held out."""
 
 
 class Chunks(NamedTuple):
