@@ -10,6 +10,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,23 +39,28 @@ class Args:
     """File for the measured values."""
 
 
-def _robot(*options: str) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, str(ROBOT), *options], stdout=subprocess.PIPE)
+@contextmanager
+def _robot(*options: str) -> Iterator[None]:
+    """A robot that publishes, until the block ends."""
+    robot = subprocess.Popen([sys.executable, str(ROBOT), *options], stdout=subprocess.PIPE)
+    try:
+        assert robot.stdout is not None
+        robot.stdout.readline()
+        yield
+    finally:
+        robot.send_signal(signal.SIGINT)
+        robot.wait(10)
 
 
 def stream(seconds: float, hostile: float) -> dict[str, float]:
     """Latencies of the served node while a goal moves, and the limits that were violated."""
     with tempfile.TemporaryDirectory() as folder:
         of_robot, of_node = Path(folder) / "robot.json", Path(folder) / "node.json"
-        robot = _robot("--hostile", str(hostile), "--json", str(of_robot))
-        assert robot.stdout is not None
-        robot.stdout.readline()
-        # A stop by a fault is the defined one: the node stays, and its figures end there.
         words = ["-m", "hrc_learn.cli", "serve", "--ros2", "--duration", str(seconds)]
         command = [sys.executable, *words, "--json", str(of_node)]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        robot.send_signal(signal.SIGINT)
-        robot.wait(10)
+        with _robot("--hostile", str(hostile), "--json", str(of_robot)):
+            # A stop by a fault is the defined one: the node stays, and its figures end there.
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         node, seen = (
             json.loads(of_node.read_text("utf-8")),
             json.loads(of_robot.read_text("utf-8")),
@@ -79,30 +86,28 @@ def kill(times: int) -> dict[str, float]:
     """Times from `kill -9` of a node until the arm is at rest [s]."""
     from sensor_msgs.msg import JointState
 
-    robot, took, newest = _robot(), [], {"velocity": 0.0}
-    assert robot.stdout is not None
-    robot.stdout.readline()
+    took, newest = [], {"velocity": 0.0}
     session = Ros2Session("bench")
 
     def take(message: JointState) -> None:
         newest["velocity"] = float(np.abs(message.velocity).max())
 
     session.node.create_subscription(JointState, "/joint_states", take, quality())
-    for _ in range(times):
-        node = subprocess.Popen([sys.executable, "-c", LOOP], stdout=subprocess.PIPE)
-        assert node.stdout is not None
-        node.stdout.readline()
-        while newest["velocity"] < 0.2:  # it has to be discovered first
-            time.sleep(0.02)
-        time.sleep(0.5)
-        node.kill()
-        node.wait()
-        began = time.monotonic()
-        while newest["velocity"] > 0.01 and time.monotonic() - began < 5:
-            time.sleep(0.002)
-        took.append(time.monotonic() - began)
-    robot.send_signal(signal.SIGINT)
-    robot.wait(10)
+    with _robot():
+        for _ in range(times):
+            with subprocess.Popen([sys.executable, "-c", LOOP], stdout=subprocess.PIPE) as node:
+                assert node.stdout is not None
+                node.stdout.readline()
+                while newest["velocity"] < 0.2:  # it has to be discovered first
+                    if node.poll() is not None:
+                        sys.exit("the commanding process ended by itself: see its error above")
+                    time.sleep(0.02)
+                time.sleep(0.5)
+                node.kill()
+            began = time.monotonic()
+            while newest["velocity"] > 0.01 and time.monotonic() - began < 5:
+                time.sleep(0.002)
+            took.append(time.monotonic() - began)
     session.close()
     return {
         "rest_after_kill_median_s": float(np.median(took)),

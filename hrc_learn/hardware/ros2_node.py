@@ -39,8 +39,8 @@ _HISTORY = 500
 """Number of joint states kept, to find the one at the time of an image."""
 _PUSH = 0.25
 """Time for which a push counts [s], as at the page: the message that ends it may be lost."""
-_PATH = 500
-"""Number of points of the tool path in the markers."""
+_PATH = 200
+"""Number of points of the tool path in the markers, 20 s at their period."""
 
 
 class ControllerNode:
@@ -90,7 +90,7 @@ class ControllerNode:
         self._heard = self._shown = self._diagnosed = self._pushed = 0.0
         self._taken = 0.0  # time of the joint state at the newest feature's exposure [s]
         self._states = deque[tuple[float, np.ndarray]](maxlen=_HISTORY)
-        self._path = deque[np.ndarray](maxlen=_PATH)
+        self._path = deque[Any](maxlen=_PATH)  # messages: making them anew would cost 5 us each
         stages = ManagedEntity()
         for stage in ("configure", "activate", "deactivate", "cleanup", "shutdown"):
             setattr(stages, f"on_{stage}", self._transition(getattr(self, stage)))
@@ -324,6 +324,7 @@ class ControllerNode:
     def _report(self, now: float) -> None:
         """Publish diagnostics and markers, both at low rates."""
         from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+        from geometry_msgs.msg import Point
         from visualization_msgs.msg import MarkerArray
 
         stamp = self.node.get_clock().now().to_msg()
@@ -342,12 +343,12 @@ class ControllerNode:
         if now - self._shown > _REPORTS:
             self._shown = now
             q = self._runner.observation["joint_position"]
-            self._path.append(self._chain.forward(q.copy()).position.numpy())
+            x, y, z = self._chain.forward(q.copy()).position.tolist()
+            self._path.append(Point(x=x, y=y, z=z))
             self._markers.publish(MarkerArray(markers=self._drawn(stamp)))
 
     def _drawn(self, stamp: Any) -> list[Any]:
         """Markers for the box of the goal and the path of the tool."""
-        from geometry_msgs.msg import Point
         from visualization_msgs.msg import Marker
 
         values = self._runner.observation
@@ -357,7 +358,7 @@ class ControllerNode:
             setattr(box.pose.position, axis, at)
             setattr(box.scale, axis, edge)
         path.scale.x = 0.004
-        path.points = [Point(x=p[0], y=p[1], z=p[2]) for p in self._path]
+        path.points = list(self._path)
         for marker, colour in ((box, (0.2, 0.6, 1.0, 0.3)), (path, (1.0, 0.6, 0.1, 1.0))):
             marker.header.frame_id, marker.header.stamp = self._config.base, stamp
             marker.ns = "hrc_learn"
