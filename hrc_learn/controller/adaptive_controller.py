@@ -181,7 +181,8 @@ class AdaptiveController(nn.Module):
         Args:
             arm: The arm, or its kinematic chain.
             estimator: Estimator of the image Jacobian.
-            goals: Regions to go to; an observation may replace them.
+            goals: Regions that attract tool, image feature and joints; an observation may
+                replace them.
             config: Settings; default: the recommended ones.
             joint_region: Region within the joint limits; default: from the arm's limits.
 

@@ -161,8 +161,9 @@ class ArmLoop:
         return self._filtered(state, reading, wanted)
 
     def _known(self, state: ArmLoopState, reading: ArmReading) -> ArmReading:
-        """The reading. Where joint positions or push are not finite, the arm has to stop, and
-        they are replaced by the positions that its commands lead to, and by zero.
+        """The reading, with invalid values replaced and `stop` set where there were any. The
+        positions predicted from the commands replace joint positions that are not finite; zero
+        replaces a push that is not finite.
         """
         q, push = reading.joint_position, reading.nullspace_input
         located, felt = (is_number(x).all(-1, keepdim=True) for x in (q, push))

@@ -129,12 +129,12 @@ class PathState:
     pose: Pose
     """Pose of the end effector at `goal`."""
     twist: Float[Tensor, "*batch 6"]
-    """Velocity of that pose along the path (linear [m/s], angular [rad/s])."""
+    """Velocity of `pose` along the path (linear [m/s], angular [rad/s])."""
     blocked: Bool[Tensor, "*batch"]
     """True if the arm is off its path and would hit something if the path advanced."""
     narrow_ahead: Bool[Tensor, "*batch"]
-    """True if the path, before it can stop, comes near a singularity. The joints cannot leave
-    the path there."""
+    """True if the path comes near a singularity within its stopping distance. The joints cannot
+    leave the path near a singularity."""
     waited: Float[Tensor, "*batch"]
     """Waiting time in which the joints came no nearer to the path [s]."""
     nearest: Float[Tensor, "*batch"]

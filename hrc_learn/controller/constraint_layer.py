@@ -33,7 +33,7 @@ from hrc_learn.geometry.numerics import (
 )
 from hrc_learn.pytree import pytree, zero_where
 
-# Violations of a limit up to this are rounding.
+# Violations of a limit up to this size count as rounding.
 _TOLERANCE = 1e-10
 # The row of a limit counts as linearly dependent on the active rows if its part in their null
 # space is shorter than this fraction of the row. Rounding leaves 1e-16; with weights of 1e7, a

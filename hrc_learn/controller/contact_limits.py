@@ -204,7 +204,7 @@ class SeparationConfig:
 
 
 def region_numbers(names: Sequence[str]) -> Int[Tensor, " parts"]:
-    """Indices of body regions, as `contact_speed` takes them.
+    """Indices of body regions, for `contact_speed`.
 
     Raises:
         ValueError: A name is not in `BODY_REGIONS`.
@@ -265,7 +265,7 @@ class ContactLimits:
             furniture: Boxes against which the arm may clamp people, in the base frame.
 
         Raises:
-            ValueError: The kinematics of the capsules are not an `Arm`, which has masses.
+            ValueError: `arm.chain` is not an `Arm`, so the masses of its links are unknown.
         """
         if not isinstance(arm.chain, Arm):
             raise ValueError(

@@ -55,8 +55,9 @@ class SafetyConfig:
     """Protective distance from people. It lowers the tool-speed cap where `human_distance` is
     given, and limits all links where `distances` to a person are given."""
     constraints: ConstraintConfig | None = None
-    """Keeps limits and distances by one quadratic program, in which the null space yields to
-    the task; None: each joint brakes by itself before its limits, and no distance is kept."""
+    """Settings of the quadratic program that keeps limits and distances; in this program, the
+    null space yields to the task. None: each joint brakes by itself before its limits, and no
+    distance is kept."""
 
     def __post_init__(self):
         check_settings(
@@ -85,7 +86,7 @@ class SafetyState:
     position: Float[Tensor, "*batch n"]
     """Predicted joint positions [rad], used while the measurement is invalid."""
     dt: Float[Tensor, "*batch"]
-    """Last valid step [s], used while the given one is invalid."""
+    """Length of the last valid step [s], used while the given `dt` is invalid."""
     fresh: Bool[Tensor, "*batch"]
     """True before the first step after a start."""
     too_fast: Float[Tensor, "*batch"]
@@ -159,8 +160,7 @@ class Goals:
     """Posture approached in joint space before task-space feedback takes over; None: task-space
     feedback acts from the start."""
     rest: PostureRegion | None = None
-    """Posture to which the null space returns; None: the null space stays where task and people
-    leave it."""
+    """Posture to which the null space returns; None: the null space does not return."""
 
     @property
     def task(self) -> TaskSpace:
@@ -185,9 +185,9 @@ class Goals:
         Args:
             centre: Centre of the box for the tool centre point [m].
             orientation: Orientation of the tool, a unit quaternion (w, x, y, z).
-            target: Target of the feature in the image [px], u and v of each of its points. None
-                stands for one point and switches vision feedback off; with several points,
-                `with_vision(False)` does.
+            target: Target of the feature in the image [px]: u and v of each point. None: a
+                feature of one point, with vision feedback switched off. To switch it off for
+                several points, pass a target and call `with_vision(False)`.
             half_size: Half edges of the box [m].
             image_size: Width and height of the image [px].
             task: Controlled part of the tool pose: all of it, position and z axis, or position.
@@ -228,12 +228,13 @@ class Goals:
     ) -> Goals:
         """The goals, with a null space that returns to a posture [rad].
 
-        Minimum-norm velocities of a repeated task add up to a drift of the null space, which
-        in time takes joints to their limits and the arm into singularities.
+        Without a posture, the minimum-norm velocities of a repeated task add up to a drift of
+        the null space. This drift eventually moves joints to their limits and the arm into
+        singularities.
 
         Args:
-            posture: Posture in which the tool is in the box; None: the null space stays where
-                it is.
+            posture: Posture in which the tool is in the box; None: the null space does not
+                return.
             rate: Convergence rate near the posture [1/s].
             speed: Highest speed, norm over all joints [rad/s].
 
@@ -272,7 +273,7 @@ class Observation:
     nullspace_input: Float[Tensor, "*batch n"] | None = None
     """Null-space input d of the paper: joint torques exerted by a person [N m]; None: none."""
     goals: Goals | None = None
-    """Regions to go to; None: those of the controller."""
+    """Goals of this step; None: the goals of the controller."""
     feature_new: Bool[Tensor, "*batch"] | None = None
     """True if `feature` is from an image that no earlier step has used; None counts as True."""
     feature_age: Float[Tensor, "*batch"] | None = None
@@ -346,11 +347,12 @@ class Command:
     """Fraction of vision feedback, 0 to 1."""
     potential: Float[Tensor, "*batch"]
     """Sum P_t + P_o + P_v of the potentials of position, orientation and vision, with P_v
-    scaled by the blending: the part of the Lyapunov function without the true weights."""
+    scaled by the blending. It is the part of the Lyapunov function that does not depend on the
+    unknown true weights of the estimator."""
     potential_rate: Float[Tensor, "*batch"]
-    """s^T J u, the rate of the potential predicted with the estimated image Jacobian [1/s]; not
-    positive while no limit or person turns the motion against the task. A measured potential
-    that falls more slowly shows an error of the image Jacobian."""
+    """s^T J u, the rate of the potential predicted with the estimated image Jacobian [1/s]. It
+    is at most zero, unless a limit or a person moves the tool away from its goals. If the
+    measured potential falls more slowly than predicted, the image Jacobian has an error."""
     safety: SafetyReport
     """Interventions of the safety filter."""
 
@@ -364,4 +366,4 @@ INITIAL_IMAGE_JACOBIAN = (
     (-1500.0, 0.0, 0.0, 0.0, -200.0, 60.0),
     (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
 )
-"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above the table, image right along -x."""
+"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above the table, u increasing along -x."""

@@ -27,16 +27,16 @@ from hrc_learn.pytree import pytree
 CHANGE_OF_RATE = 0.2
 """Time in which a path comes to rest, or to its full speed [s]."""
 FAR_ASIDE = 1.8
-"""Largest distance of the joints from a path that still advances [rad]. In simulation, all
-joints returned to their path from 1.4 rad, with the elbow about 0.2 m off it; from 2 rad some
-did not."""
+"""Largest distance of the joints from their path at which the path still advances [rad]. In
+simulation, arms always returned to their path from 1.4 rad, where the elbow is about 0.2 m off
+the path; from 2 rad some arms did not."""
 WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
 """Alignments (`return_alignment`): above `WELL_ALIGNED`, pushes are followed in full; below
 `POORLY_ALIGNED`, the null space may lead to a posture other than the path's. The alignment is
 0.7 when the elbow has moved a quarter of its circle, and 0 after half of the circle."""
 NARROW = 0.07
-"""Smallest singular value of the Jacobian below which the joints cannot leave a path. The
-damping of the inverse Jacobian begins at 0.05."""
+"""Lower bound on the smallest singular value of the Jacobian: below it, the joints may not
+leave their path. The damping of the inverse Jacobian begins at 0.05."""
 
 # Distance at which a path that has waited goes on [rad].
 _NEAR_AGAIN = 1.4

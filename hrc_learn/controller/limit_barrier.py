@@ -34,7 +34,7 @@ class LimitBarrier(nn.Module):
     set, that the joint moves by v_k dt, and that the next acceleration is max(a_k - j dt, -A).
     Then v_hat_{k+1} <= v_hat_k - A dt, and for every dt <= 1/rate
 
-        Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt,
+        Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt.
 
     If v_hat < A dt, the joint moves by at most v_hat dt <= rate dt delta <= delta. So a step
     that keeps all limits always exists. dt is the time between two steps, at most 1/rate; if it
@@ -222,7 +222,8 @@ class LimitBarrier(nn.Module):
         reach = jerk * dt
         lowest = torch.maximum(last - reach, -acceleration)
         highest = torch.minimum(last + reach, acceleration)
-        # A start may be further outside than one step leads back.
+        # At the start, the acceleration may be so far outside its limit that the jerk limit
+        # does not permit a return in one step.
         return torch.minimum(lowest, last + reach), torch.maximum(highest, last - reach)
 
     def reachable_velocity(

@@ -111,9 +111,9 @@ class MotionFilter:
 
         Args:
             dt: Time from one position to the next [s].
-            velocity: Limit of each value [1/s].
-            acceleration: [1/s^2].
-            jerk: [1/s^3].
+            velocity: Velocity limit of each value [1/s].
+            acceleration: Acceleration limit of each value [1/s^2].
+            jerk: Jerk limit of each value [1/s^3].
             lower: Lowest position, may be infinite.
             upper: Highest position, may be infinite.
 

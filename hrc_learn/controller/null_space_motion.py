@@ -137,8 +137,7 @@ def null_space_slowdown(
     Returns:
         Factor of at most 1.
     """
-    # Check the present joints and those after the look-ahead, by which time the arm can slow
-    # down.
+    # Check the joints now and after the look-ahead time, in which the arm can slow down.
     times = null_velocity.new_tensor([0.0, LOOK_AHEAD])
     times = torch.stack([times, times + _DIFFERENCE_STEP])
     steps = times.reshape(2, 2, *(1 for _ in null_velocity.shape)) * null_velocity

@@ -36,7 +36,7 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# `_ASIDE`: joints farther than this from the start of a path begin off the path [rad].
+# `_ASIDE`: joints count as off the path if they are farther than this from its start [rad].
 # `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
 # by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
@@ -49,10 +49,10 @@ class TrackedPose(NamedTuple):
     blocked: Tensor
     slowdown: Tensor
     clear: Tensor
-    """Fraction of the null-space velocity that obstacles leave."""
+    """Fraction of the null-space velocity that obstacles permit."""
     distance: Tensor
     within: Tensor
-    """Fraction of the remaining null-space velocity that joint limits leave."""
+    """Fraction of the remaining null-space velocity that joint limits permit."""
     joint: Tensor
     """Index of the joint that limits the velocity most."""
 
@@ -75,7 +75,7 @@ class PathTarget(NamedTuple):
     narrow: Tensor
     """True where the joints cannot leave the path."""
     narrow_ahead: Tensor
-    """True where the path becomes narrow before it can stop."""
+    """True where the path becomes narrow within its stopping distance."""
 
 
 class OffPath(NamedTuple):
@@ -235,7 +235,8 @@ class PathLaw:
         waited, nearest = path.waiting(off, counts, self.config.back_after, dt)
         waited = torch.where(state.aside, waited, 0.0)
         held = torch.where((path.rate <= 0) & pushed, path.held + dt, 0.0)
-        # Joints that find no way back to this sample may find one where they left the path.
+        # Joints that cannot return to this sample may be able to return to an earlier one, near
+        # which they left the path.
         backs = (waited > self.config.back_after) & (path.progress > 0)
 
         def astray(part: tuple[Any, ...]) -> tuple[Tensor, Tensor]:
@@ -312,8 +313,8 @@ class PathLaw:
         )
 
     def _target_motion(self, target: PathTarget, aside: Tensor) -> tuple[Pose, Tensor]:
-        """Pose of the end effector on the path, and its twist along the path, which is zero
-        except for arms that are aside.
+        """Pose of the end effector on the path, and its twist along the path, which is zero for
+        arms on their path.
         """
         ahead = target.goal + self.config.command_delay * target.velocity
         twist = apply_where(

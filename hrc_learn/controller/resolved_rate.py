@@ -104,8 +104,8 @@ def resolved_rate(
     Args:
         J: Geometric Jacobian, or its rows in the task: at most 6.
         twist: Twist of the tool (linear [m/s], angular [rad/s]), or its part in the task.
-        null_velocity: Wanted joint velocity w, of which N keeps the part that leaves the tool
-            at rest [rad/s].
+        null_velocity: Wanted joint velocity w [rad/s]; N keeps only the part of it that does
+            not move the tool.
 
     Returns:
         Joint velocity of the task, and joint velocity of the null space [rad/s].
@@ -350,9 +350,9 @@ def planned_motion(
     return (fraction * dt).unsqueeze(-1) * task_twist
 
 
-# Region function of the posture beyond which a joint-space approach starts again: with the
-# default tolerance of 0.5 rad it is a distance of 1.5 rad, more than a person pulls the elbow
-# aside.
+# Value of the posture's region function above which a joint-space approach starts again. With
+# the default tolerance of 0.5 rad, this value is reached at a distance of 1.5 rad, to which
+# persons do not pull the elbow.
 _FAR_FROM_POSTURE = 2.0
 
 
@@ -514,9 +514,9 @@ def next_task_level(
     """Level of task-space feedback after a joint-space approach, 0 to 1.
 
     The level rises inside the posture region: task-space feedback from an arbitrary posture
-    often ends at a joint limit. Then the level stays up, even if a person or the task moves the
-    joints out of the region. It falls only while no feature is followed and the posture is far
-    away, as at the start of a new phase.
+    often ends at a joint limit. Afterwards the level does not fall if a person or the task
+    moves the joints out of the region. It falls only while no feature is followed and the
+    posture is far away, for example at the start of a new phase.
 
     Args:
         task_level: Level after the last step.

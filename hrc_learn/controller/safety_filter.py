@@ -32,9 +32,9 @@ from hrc_learn.pytree import zero_where
 # as an intervention. Smaller values are rounding, also in float32: if they were reported, a
 # command along a limit would be flagged at random.
 _REPORTED = 1e-6
-# Fraction of the acceleration and jerk limits left unused. A check of the sent positions
-# divides differences of rounded numbers by powers of the step: for the jerk at 1 kHz by 1e-9
-# s^3, which turns rounding of 4e-16 rad into 2e-6 rad/s^3, compared with limits of thousands.
+# Fraction of the acceleration and jerk limits left unused, because finite differences of the
+# sent positions amplify rounding. At 1 kHz, rounding of 4e-16 rad changes the measured jerk by
+# 2e-6 rad/s^3; the limits are thousands of rad/s^3.
 _ROUNDING = 1e-9
 # Smaller joint velocities are rounded to rest [rad/s].
 _REST = 1e-15
@@ -68,7 +68,7 @@ class _Inputs(NamedTuple):
 class SafetyFilter(nn.Module):
     """Joint velocities that keep the limits of position, velocity, acceleration and jerk.
 
-    A step is a chain of stages, each of which takes the velocity of the one before:
+    A step is a chain of stages. Each stage changes the velocity that the previous one returns:
 
         limit_velocity -> cap_speed -> limit_acceleration -> keep_constraints -> keep_speed
 
@@ -177,8 +177,9 @@ class SafetyFilter(nn.Module):
         )
 
     def restored(self, state: SafetyState) -> SafetyState:
-        """The state with invalid values replaced: at rest, in the middle of the joint range. A
-        valid state is returned itself, where Python may branch.
+        """The state with invalid values replaced: zero velocity and acceleration, and the
+        middle of the joint range as position. Outside of traced code, a valid state is returned
+        unchanged.
         """
         valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
         if everywhere(valid) and has_numbers(state):
@@ -283,8 +284,7 @@ class SafetyFilter(nn.Module):
         constrained = self.config.constraints is not None
         if jacobian is None and (constrained or human_distance is not None):
             raise ValueError(
-                "constraints find the null space, and human_distance limits the speed of the "
-                "tool, by its Jacobian: pass jacobian as well"
+                "constraints and human_distance need the Jacobian of the tool: pass jacobian too"
             )
 
     def _validated(
