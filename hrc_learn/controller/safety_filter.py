@@ -284,7 +284,7 @@ class SafetyFilter(nn.Module):
         constrained = self.config.constraints is not None
         if jacobian is None and (constrained or human_distance is not None):
             raise ValueError(
-                "constraints and human_distance need the Jacobian of the tool: pass jacobian too"
+                "constraints and human_distance need the Jacobian of the tool: set jacobian"
             )
 
     def _validated(

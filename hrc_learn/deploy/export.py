@@ -160,7 +160,9 @@ _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device)
 
 
 class UnknownCodeError(TypeError):
-    """An object cannot be hashed: a function, or of a class outside this library and torch."""
+    """An object cannot be hashed: it is a function, or its class is outside this library and
+    torch.
+    """
 
 
 def content_hash(*objects: Any) -> str:

@@ -1,10 +1,10 @@
 """Compile a scalar program (see `scalar_program`) with LLVM, and run its machine code.
 
-For a batch, the code computes as many arms at once as a vector register holds numbers; for one
-arm, successive elements of a tensor where their operands are successive or equal. The code is a
-sequence of short functions, so that the compile time is only proportional to the length of the
-program. A value that a later function reads is kept in a slot of the workspace, a small array
-that the caller provides.
+For a batch, the code computes as many arms at once as a vector register holds numbers. For one
+arm, it computes successive elements of a tensor at once if their operands are successive or
+equal. The code is a sequence of short functions, so that the compile time is only proportional
+to the length of the program. A value that a later function reads is kept in a slot of the
+workspace, a small array that the caller provides.
 """
 
 import ctypes
@@ -40,7 +40,7 @@ _TRUTH, _INDEX = ir.IntType(1), ir.IntType(32)
 _INTRINSICS = {"abs": "fabs", "round": "roundeven"}
 
 type Unit = tuple[int, ...]
-"""Value numbers that one instruction computes, consecutive ones."""
+"""Consecutive value numbers that one instruction computes."""
 
 ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.
@@ -161,7 +161,8 @@ class NativeCode:
     def _value(self, builder: ir.IRBuilder, made: dict[Unit, Any], xs: Unit) -> Any:
         """Operand: made by this function, constant, or loaded from an input or the workspace.
 
-        Loads are repeated at each use, since the processor's instructions load an operand.
+        Each use repeats the load, since the processor's instructions can read an operand from
+        memory.
         """
         if xs in made:
             return made[xs]

@@ -347,15 +347,15 @@ def c_header(metadata: Mapping[str, str]) -> str:
         *(f"#define {name.upper()}_ROWS {x.size}" for name, x in layouts._asdict().items()),
         f"#define WORKSPACE_SIZE {metadata[WORKSPACE]} /* numbers, of any value */",
         *places,
-        "/* At rest in the ready posture, and the observation of the export. */",
+        "/* State at rest in the ready posture, and the observation given to export_step. */",
         *(
             f"static const {dtype} first_{name}[] = {{{_c_numbers(metadata[key])}}};"
             for name, key in (("state", _STATE), ("observation", _OBSERVATION))
         ),
         '#ifdef __cplusplus\nextern "C"\n#endif',
-        "/* Takes a step: reads the observation, writes the command and the next state. Rows",
-        "   are `stride` numbers apart; `count` arms, a multiple of STEP_ARMS_AT_ONCE. If",
-        "   that is 1, so are `stride` and `count`. */",
+        "/* Takes a step for `count` arms, a multiple of STEP_ARMS_AT_ONCE: reads the",
+        "   observation, writes the command and the next state. Rows are `stride` numbers",
+        "   apart. If STEP_ARMS_AT_ONCE is 1, pass 1 for `stride` and `count`. */",
         f"void control_step({dtype} *state, const {dtype} *observation, {dtype} *command,",
         f"                  {dtype} *workspace, long long stride, long long count);",
         "",

@@ -177,8 +177,8 @@ def open_step(
     return runner
 
 
-# Last part of a wait, spent in a busy loop [s]: sleeping processes wake up about this much
-# late.
+# Last part of a wait, spent in a busy loop [s]: sleeping processes wake up too late by about
+# this time.
 _SPIN = 0.0002
 
 

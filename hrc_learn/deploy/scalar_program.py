@@ -34,8 +34,8 @@ index in the flattened batch.
 """
 
 BOOLEAN = frozenset({"gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"})
-"""Operations whose result is a truth value. The result of "select" is one if both of its
-choices are truth values."""
+"""Operations whose result is always a truth value. The result of "select" is a truth value if
+both of its choices are."""
 
 
 @final

@@ -104,7 +104,7 @@ class ArmShape:
     shapes: tuple[tuple[int, Shape], ...] = ()
     """Collision shapes, each with the number of its link's frame; capsules contain them."""
     masses: tuple[float | None, ...] = ()
-    """Masses of base, links, flange and tool [kg], as far as the description gives them."""
+    """Masses of base, links, flange and tool [kg]; None where the description gives no mass."""
     inertia: tuple[Float[np.ndarray, "4 4"] | None, ...] = ()
     """Pseudo-inertias of the bodies of `masses` (`description.pseudo_inertia`), each in the
     frame of its body."""
@@ -113,7 +113,8 @@ class ArmShape:
 class Arm(SerialChain):
     """A serial arm: kinematics, limits, shape, gripper and inverse kinematics.
 
-    Made by `arm("ur5e")` or `arm("robot.urdf", tip="tcp")`; `panda` and `fr3` are ready-made.
+    `arm("ur5e")` and `arm("robot.urdf", tip="tcp")` return arms; `panda` and `fr3` are
+    ready-made.
 
     Attributes:
         name: Registered name, or the stem of the description's file.
@@ -257,8 +258,8 @@ class Arm(SerialChain):
 
         Raises:
             UnreachableError: A pose has no solution; the message names the first such pose.
-            ValueError: `q7` was given to an arm without a closed-form inverse, or for a part of
-                the pose.
+            ValueError: `q7` was given to an arm without a closed-form inverse, or for a task
+                other than the arm's `task`.
         """
         task = task or self.task
         if q7 is not None and (self._closed_form is None or task != self.task):

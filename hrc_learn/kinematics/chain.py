@@ -1,8 +1,8 @@
 """Serial arms: forward kinematics and geometric Jacobians.
 
-Both exist twice. Matrix products are fast when they run eagerly. For compilers the same
+Both have two implementations. In eager mode, matrix products are fast. For compilers, the same
 kinematics are written out number by number: products with the zeros and ones of the arm's
-description are left out, and each number is a tensor over the batch alone, so the compiler
+description are omitted, and each number is a tensor over the batch alone, so the compiler
 fuses everything into one loop over the batch.
 """
 

@@ -70,9 +70,9 @@ def arm_from_file(
 ) -> Arm:
     """An arm from a URDF or MJCF file.
 
-    Beyond the last joint of the arm, links on further moving joints are the gripper. They
-    belong to the tool, as does a hand that carries only the fingers. Links on moving joints
-    that branch off earlier are left out.
+    Links on moving joints beyond the arm's last joint form the gripper. They belong to the
+    tool, as does a hand that carries only the fingers. Links on moving joints that branch off
+    earlier are left out.
 
     Args:
         path: The file.
@@ -320,13 +320,14 @@ def _inertias(
         if link.inertia is not None:
             more, before = pose @ link.inertia @ pose.T, inertia[number]
             inertia[number] = more if before is None else before + more
-    # The frame of the flange carries no bodies, and without a gripper the tool's frame neither.
+    # The frame of the flange carries no bodies. Without a gripper, the tool's frame carries no
+    # bodies either.
     for number in {last + 1, last + 2} - {number for number, _ in bodies.values()}:
         masses[number], inertia[number] = 0.0, np.zeros((4, 4))
     return {"masses": tuple(masses), "inertia": tuple(inertia)}
 
 
-# Number of random postures among which `_comfortable` chooses; the seed repeats the choice.
+# Number and seed of the random postures among which `_comfortable` chooses.
 _POSTURES, _SEED = 4096, 0
 
 

@@ -116,7 +116,7 @@ class Joint:
     effort: float | None = None
     """[N m] or [N]"""
     follows: tuple[str, float, float] | None = None
-    """Mimicked joint, factor and offset; the name is empty if the offset holds the joint."""
+    """Mimicked joint, factor and offset; the name is empty if the joint rests at the offset."""
 
     @property
     def is_finger(self) -> bool:

@@ -39,9 +39,9 @@ TASK_ROWS: dict[TaskSpace, int] = {
 # Weight of angles relative to distances [m/rad]: 1 rad counts as much as this distance.
 _LEVER = 0.3
 # Singular values below these fractions of the largest one count as zero: `_RANK` in
-# `null_space_dimension`, `_LED` in `task_rank`. `_LED` ignores weak directions: the SO-101's
-# tool lies 8 mm off the axis of the last joint, so this joint hardly moves the tool.
-_RANK, _LED = 1e-6, 0.02
+# `null_space_dimension`, `_WEAK` in `task_rank`. `_WEAK` excludes directions that joints hardly
+# move: the SO-101's tool lies 8 mm off the axis of the last joint, which thus hardly moves it.
+_RANK, _WEAK = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
 # Starts per pose in each round, largest number of rounds, and iterations from each start.
 _STARTS, _ROUNDS, _ITERATIONS = 24, 6, 40
@@ -128,17 +128,17 @@ def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
 
     The rank is six for the pose of an arm with six or more joints. For "position+axis" it is
     five, but four (position and tilt) for a five-joint arm if the last joint turns the tool
-    about its z axis. The remaining joint motion is null space. A direction that takes 50 times
-    as much joint motion as another one does not count.
+    about its z axis. The remaining joint motion is null space. A direction does not count if it
+    needs more than 50 times as much joint motion as the direction that needs least.
 
     Args:
         chain: The arm.
         task: Constrained part of the tool's pose.
     """
-    limits, rng = chain.limits, torch.Generator().manual_seed(0)
-    fraction = torch.rand(_SAMPLES, len(chain.joint_names), generator=rng, dtype=torch.float64)
+    n, limits, rng = len(chain.joint_names), chain.limits, torch.Generator().manual_seed(0)
+    fraction = torch.rand(_SAMPLES, n, generator=rng, dtype=torch.float64)
     q = limits.lower + fraction * (limits.upper - limits.lower)
-    return len(chain.joint_names) - int(null_space_dimension(chain, q, task, below=_LED).amin())
+    return n - int(null_space_dimension(chain, q, task, below=_WEAK).amin())
 
 
 _LINEAR = Constant(torch.eye(6, dtype=torch.float64)[:3])
@@ -223,7 +223,7 @@ def solve_inverse(
         if len(missing) == 0:
             break
         # All poses have the same starts, so a result does not depend on the other poses. Starts
-        # are drawn on the CPU: a seed gives other numbers on other devices.
+        # are drawn on the CPU, because the numbers that a seed gives depend on the device.
         random = torch.rand(_STARTS, joints, generator=rng, dtype=torch.float64).to(wish.device)
         half = ((upper - lower) / 2).clamp(max=math.pi)
         start = ((lower + upper) / 2 + (2 * random - 1) * half).repeat(len(missing), 1, 1)
@@ -404,7 +404,7 @@ _STEP = 1e-5
 # Damping of the joint motion that turns the arm angle, as a squared rate [1]. Without it, the
 # motion is unbounded near configurations in which the null space does not move the elbow.
 _DAMPING = 1e-2
-# A larger singular value [1], or a larger distance to a limit [rad], counts as much as these.
+# Singular values [1] and distances to a limit [rad] above these values do not raise a score.
 _GOOD_SINGULAR_VALUE = 0.2
 _GOOD_DISTANCE = 0.5
 # Postures closer to each other than this count as the same [rad].

@@ -118,7 +118,8 @@ class JointLimits(MotionLimits):
         path keeps them already.
 
         Args:
-            path: Joint positions [rad]. Too few samples for a derivative keep its limit.
+            path: Joint positions [rad]. A derivative for which the path has too few samples
+                counts as zero.
             dt: Time between samples [s].
             kinds: Limits to keep: velocity, acceleration, jerk, or the first of these.
 
@@ -135,8 +136,8 @@ class JointLimits(MotionLimits):
         return worst, at
 
 
-# Defaults for limits that a description does not give. The velocity of revolute joints is lower
-# than the slowest joint's limit on every registered arm except Kinova's. The velocity of
+# Defaults for limits that a description does not give. The velocity of revolute joints is at
+# most the slowest joint's limit on every registered arm except Kinova's Jaco. The velocity of
 # prismatic joints is the reduced speed of ISO 10218-1:2025. We chose the times to full speed
 # and to full acceleration; the Panda's times are 0.13 to 0.29 s and 2 ms.
 DEFAULT_VELOCITY = 1.0  # [rad/s]

@@ -146,7 +146,7 @@ class _Reader:
             place["pose"] = pose @ np.linalg.inv(moved)
             sx, sy, sz = model.mesh_scale[mesh].tolist()
             place_of_name = int(model.mesh_pathadr[mesh])
-            if place_of_name < 0:  # its vertices stand in the description itself
+            if place_of_name < 0:  # the description itself contains the vertices
                 return None
             name = bytes(model.paths[place_of_name:]).partition(b"\0")[0]
             path = Path(name.decode())

@@ -158,8 +158,8 @@ def installed_descriptions(name: str) -> list[Path]:
     """Descriptions of a robot in installed packages, by the name of their file or folder.
 
     The search covers example-robot-data, robosuite, and files that mujoco-menagerie and
-    robot_descriptions have already fetched; nothing is downloaded. The first of these sources
-    that has the robot counts, and in each folder the file with the shortest name.
+    robot_descriptions have already fetched; nothing is downloaded. Results come from the first
+    of these sources that has the robot: in each folder, the file with the shortest name.
     """
     wanted = _plain(name)
     for root in _description_folders():
@@ -250,7 +250,7 @@ def _fitted_body(name: str, description: Path) -> FittedBody | None:
 
 @dataclass(frozen=True)
 class ArmChoice:
-    """An arm by its name or file, as configurations keep it."""
+    """Name or file of an arm, for configurations."""
 
     name: str = "panda"
     """Registered name, or a URDF or MJCF file, also as FILE:TIP or FILE:BASE:TIP."""

@@ -80,7 +80,8 @@ def joints_near(
 
     Args:
         chain: Kinematics of the arm.
-        pose: Pose of the end effector. If it is out of reach, the result only comes closer.
+        pose: Pose of the end effector. If it is out of reach, the joint positions only bring
+            the end effector closer to it.
         near: Joint positions with the end effector about a centimetre from the pose [rad].
     """
     q = near
@@ -214,6 +215,7 @@ class PositionServo:
         """Joint positions, near the commanded ones, with the end effector at a pose [rad].
 
         Args:
-            pose: Pose of the end effector. If it is out of reach, the result only comes closer.
+            pose: Pose of the end effector. If it is out of reach, the joint positions only
+                bring the end effector closer to it.
         """
         return joints_near(self._chain, pose, torch.from_numpy(self._motion.position)).numpy()

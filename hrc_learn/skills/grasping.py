@@ -5,8 +5,8 @@
       +---------+---- start over ----+
 
 In "servo", the arm approaches in joint space and is then controlled by vision, as in the paper.
-In "interact", servoing continues while a person pulls the elbow, if the job gives time for
-this. Recoveries from failures are noted in the job:
+In "interact", servoing continues while a person pulls the elbow, if the job has time for a
+person. Recoveries from failures are noted in the job:
 
 - occluded marker of the end effector: the controller holds the end effector until the marker is
   detected again; after a timeout the arm goes home and starts over;
@@ -249,7 +249,7 @@ class Grasping:
         job.recoveries.append(Recovery(time=self._cell.time, mishap=mishap, what=what))
 
     def _aim(self, job: GraspJob, target: ServoTarget) -> None:
-        """Servo to the object, then keep servoing for the time that the job gives a person."""
+        """Servo to the object, then keep servoing for `GraspJob.time_for_person`."""
         self._servo(job, target)
         if job.time_for_person > 0:
             self._cell.begin_phase(INTERACT)

@@ -22,8 +22,8 @@ from hrc_learn.protocols import PersonTracker
 _NAN = math.nan
 # Distance that is reported while no person is seen: no protective distance is that large [m].
 _NO_PERSON = 100.0
-# Largest time by which the tracker's clock may be ahead of the arm's [s]. The age of an
-# observation that comes from further ahead is unknown.
+# Largest time by which the tracker's clock may be ahead of the arm's [s]. An observation whose
+# time stamp is further ahead has an unknown age.
 _CLOCK_ERROR = 0.05
 # Time in which an arm comes to rest [s]. The arm's drivers brake with 0.7 of the highest joint
 # acceleration; a joint of a Panda then stops from 0.8 rad/s in this time. It determines a speed

@@ -82,7 +82,7 @@ class PickAndPlaceConfig:
     interaction: float = 11.0
     """Time for which the robot keeps servoing while a person pulls its elbow [s]."""
     interactions: int = 1
-    """The person gets this time for the first objects only; this is their number."""
+    """Number of objects, counted from the first, with such an interaction."""
     speed: float = 1.5
     """Speed of the transfer relative to the demonstration."""
     waits: int = 3

@@ -240,8 +240,8 @@ class PlacingSkill:
         if joint.joint_names != names:
             raise ValueError(
                 f"{folder / 'joint'} moves the joints {joint.joint_names}, but the "
-                f"{robot.name} has {names}: fit demonstrations of this arm, or choose theirs "
-                "with --robot."
+                f"{robot.name} has {names}: fit demonstrations of this arm, or choose the arm "
+                "of the demonstrations with --robot."
             )
         if not (folder / "pose").is_dir():
             raise ValueError(
@@ -313,8 +313,8 @@ def follow_pose(
 
     Here J^+ is the pseudo-inverse of the Jacobian, e the pose error, N the projector on the
     null space, n the joint motion that turns the arm angle at unit rate, and xi_q the gradient
-    of the joint-limit region. The poses are tracked exactly, the arm angle as far as null space
-    and joint limits allow.
+    of the joint-limit region. The poses are tracked exactly, the arm angle as closely as null
+    space and joint limits permit.
 
     Args:
         chain: Kinematics of the arm.

@@ -39,7 +39,7 @@ class ReceivingConfig:
     motion_threshold: float = 0.06
     """The hand counts as moving if its displacement within the window is larger, and the body
     counts as standing if its displacement is smaller [m]. With a tracker noise of 1 cm, a hand
-    at rest seems to be displaced by a quarter of this."""
+    at rest seems to be displaced by a quarter of this threshold."""
     noise: float = 0.012
     """Standard deviation of each coordinate of the hand [m]: tracker noise and human
     variation."""
@@ -216,7 +216,8 @@ class Receiving:
         """Go to the predicted meeting point.
 
         Returns:
-            Demonstrated position of the hand minus that of the end effector at the end [m].
+            Demonstrated position of the hand minus demonstrated position of the end effector,
+            both at the end of the movement [m].
         """
         cell, config, receipt = self._cell, self._config, self.receipt
         start, dt = cell.pose, cell.config.dt

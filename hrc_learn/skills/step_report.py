@@ -45,7 +45,7 @@ _INTERVENTIONS: Mapping[str, Hindrance] = _TABLES["interventions"]
 
 
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
-    """Reason why a safety filter may have reduced a motion; None: at most it caused a delay."""
+    """Reason why a safety filter may have reduced a motion; None: it caused at most a delay."""
     acted = {INTERVENTIONS[int(k)] for k in report.flags.nonzero()}
     return next((cause for kind, cause in _INTERVENTIONS.items() if kind in acted), None)
 

@@ -44,8 +44,8 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 # Fractions of the probe height. They are tried in turn until the marker's target pixel at that
 # height is well within the image.
 _PROBE_FRACTIONS = np.array([1.0, 0.75, 0.5])
-# Largest predicted error above the object with which the gripper turns for the object [m]. With
-# a larger error, the camera's estimated orientation may be entirely wrong.
+# Largest predicted error above the object at which the gripper turns to align with the object
+# [m]. With a larger error, the camera's estimated orientation may be entirely wrong.
 _LOST = 0.03
 _NOT_SEEN = np.full(2, np.nan)
 _NOT_FOUND = SeenFeature(_NOT_SEEN, np.nan)
@@ -91,9 +91,9 @@ class VisualServoConfig:
     """Distance of the marker from the border below which the gripper does not turn if the turn
     would reduce the distance [px]."""
     turn_rate: float = 0.8
-    """Highest angular speed at which the gripper turns for the object [rad/s]. A turn moves the
-    marker by 0.15 m per radian. At this speed, the marker stays within 10 px of its target even
-    with delayed images."""
+    """Highest angular speed at which the gripper turns to align with the object [rad/s]. A turn
+    moves the marker by 0.15 m per radian. At this speed, the marker stays within 10 px of its
+    target even with delayed images."""
     marker_tolerance: float = 1.5
     """Deviation of the marker from its predicted pixel, while the end effector is held, above
     which it counts as half hidden [px]: three times the noise of pixel and prediction."""
@@ -573,7 +573,7 @@ class ServoStep:
 
 
 def _towards_middle(pixel: Float[np.ndarray, "2"], side: float) -> Float[np.ndarray, "2"]:
-    """Direction 40 degrees to one side (1 or -1) of that to the middle of the image."""
+    """Direction 40 degrees to one side (1 or -1) of the direction to the image's middle."""
     u, v = np.array(IMAGE_SIZE) / 2 - pixel
     angle = np.arctan2(v, u) + 0.7 * side
     return np.array([np.cos(angle), np.sin(angle)])
@@ -612,8 +612,8 @@ class VisualServo:
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
         for k in range(config.max_probes):
-            # If the camera is not known well, the gripper first passes a point higher up, and
-            # after the first probe aside, to either side in turn.
+            # If the camera is not known well, the gripper first passes a higher point. After
+            # the first probe, this point is also shifted sideways, to alternating sides.
             self._read()
             if self._law.uncertainty(self.state, target) > config.object_error:
                 aside = config.probe_aside * min(k, 1) * _towards_middle(target.item, (-1) ** k)
@@ -626,8 +626,8 @@ class VisualServo:
                 return reached - begun
         raise MissedGraspError(
             f"visual servoing: after {config.max_probes} probes the end effector may still be "
-            f"{1e3 * error:.1f} mm off the object, more than {1e3 * config.object_error:.1f}: "
-            "check that the camera stands still and the marker is in view."
+            f"{1e3 * error:.1f} mm off the object; {1e3 * config.object_error:.1f} mm are "
+            "allowed. Check that the camera does not move and the marker is in view."
         )
 
     def hold(self, target: ServoTarget, duration: float) -> None:

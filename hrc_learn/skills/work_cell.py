@@ -367,7 +367,7 @@ class WorkCell:
         """Move the end effector to a pose on a straight line, and let it settle.
 
         The motion slows down while the end effector lags behind, for example at a joint limit
-        to which a person pushed the arm. This may cost 5 s in all.
+        to which a person pushed the arm. This makes the motion at most 5 s longer.
 
         Args:
             goal: Pose at the end.
@@ -420,7 +420,7 @@ class WorkCell:
                 begun, moving = self.task_time - passed, 0
                 waited += self.config.dt
                 busy = "while the gripper felt for a contact, the null space was pushed"
-                self._give_up_after(waited, busy, "let it go")
+                self._give_up_after(waited, busy, "release the arm")
                 continue
             self._track_line(line, passed)
             force_now = contact_force(self.jacobian, self.state)
@@ -569,7 +569,7 @@ class WorkCell:
             raise StoppedByPersonError(f"stopped: {asked.stop}")
         self._tell_of_pause(asked.pause, before)
         held = float(self.loop_state.path.held)
-        self._give_up_after(held, "while its path waited, the arm was held aside", "let it go")
+        self._give_up_after(held, "while its path waited, the arm was held aside", "release it")
 
     def _sense(self, state: ArmState, asked: HumanInput) -> None:
         """Store a reading of the arm with its kinematics and the people near it."""
