@@ -24,9 +24,9 @@ type Measure = Callable[[CollaborationRun], float | int | None]
 _SAME_TASK = "main task not affected (Experiment 3)"
 
 
-# Largest normalised error of a reproduction. What is left is the tremor of the demonstrating
-# hand, which primitives do not repeat: 0.0006 (SO-101) to 0.00102 (UR3) of the joints' range,
-# whether there are 15, 60 or 80 basis functions.
+# Largest normalised error of a reproduction. The remaining error is the tremor of the
+# demonstrating hand, which primitives do not reproduce. It is 0.0006 (SO-101) to 0.00102 (UR3)
+# of the joints' range, and the same with 15, 60 and 80 basis functions.
 _REPRODUCTION = 1.5e-3
 
 
@@ -96,7 +96,7 @@ def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
 _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
     Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
-    # Five joints set the pitch of the tool; its yaw follows from where it is.
+    # Five joints set the pitch of the tool; its yaw follows from its position.
     Metric("place pitch", lambda run: _off_by_five_joints(run, 0), "deg", at_most=3.0),
     Metric("place yaw", lambda run: _off_by_five_joints(run, 1), "deg", at_most=3.0),
     never("joint limit violations", lambda run: measures.limit_violations(run.cell)),

@@ -98,8 +98,8 @@ class CollaborationScenario:
     camera: CameraKind = "auto"
     """Kind of camera that watches the table."""
     forces: Sequence[ScriptedForce] | Literal["random"] = NULL_SPACE_FORCES
-    """Forces of the person on the elbow, timed from when the robot waits for them; "random":
-    forces at random moments of the whole job."""
+    """Forces of the person on the elbow, timed from the moment at which the robot begins to
+    wait for them; "random": forces at random moments of the whole job."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     """Configuration of the job."""
@@ -330,7 +330,7 @@ class _Stage:
 
     @property
     def visit(self) -> WorkerVisit | None:
-        """Motion of the person, as far as decided; None without a person."""
+        """Motion of the person that is decided so far; None without a person."""
         if self.watch is None:
             return None
         return self._visit if self.giving is None else self.giving.hand_over.visit

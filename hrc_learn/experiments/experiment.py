@@ -51,7 +51,7 @@ class Study:
     """Runs one trial with a seed. A frozen dataclass, so that it can be sent to other processes
     and its settings can be saved with the trials."""
     metrics: Sequence[Metric[Sequence[Trial]]] = ()
-    """Rows of the table that the trials add."""
+    """Rows that the trials add to the table."""
     text: str = ""
     """Description of the differences between trials."""
 

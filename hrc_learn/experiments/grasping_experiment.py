@@ -50,7 +50,7 @@ REACH = 0.02
 
 
 def descent(run: GraspingRun) -> tuple[float, float]:
-    """State at the start of the last descent onto the object; NaN if it never descended.
+    """State at the start of the last descent onto the object; NaN if there was no descent.
 
     Returns:
         Horizontal distance of the end effector from the object [mm], and angle between the

@@ -124,9 +124,9 @@ class GraspingScene:
                     workplace=workplace, start=start, object_pose=pose, imperfections=drawn
                 )
         raise ValueError(
-            f"from none of {_MOST_STARTS} random starts does the camera see the object and a "
-            "free path lead home: turn the camera to the table (scene.random_camera=false keeps"
-            " it in place), or move table and cabinet away from the arm"
+            f"none of {_MOST_STARTS} random starts has a free path home and leaves the object "
+            "in the camera's view: turn the camera to the table (scene.random_camera=false "
+            "keeps it in place), or move table and cabinet away from the arm"
         )
 
 

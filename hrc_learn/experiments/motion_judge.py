@@ -206,7 +206,7 @@ class SceneJudge:
         return "" if done else f"{self._config.success} returned False"
 
     def _put(self, name: str, pose: Float[np.ndarray, "7"]) -> None:
-        """Put a body somewhere: its free joint, its mocap pose, or its place in its parent."""
+        """Set the pose of a body: of its free joint, as a mocap body, or in its parent."""
         body = self.model.body(name)
         first, mocap = int(body.jntadr[0]), int(body.mocapid[0])
         if first >= 0 and self.model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:

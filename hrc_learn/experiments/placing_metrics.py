@@ -42,7 +42,8 @@ class PlacingOutcome:
     place_tilt: float
     """Angle of the object from its intended orientation [rad]."""
     place_turns: tuple[float, float] | None = None
-    """Its pitch and its yaw [rad]; None with more than five joints."""
+    """Pitch and yaw of the object from its intended orientation [rad]; None with more than five
+    joints."""
     violations: int
     """Steps in which a joint was outside its range of position or velocity."""
     contacts: tuple[Touch, ...]

@@ -32,12 +32,12 @@ from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}
-"""Spaces in which motions to other shelves are planned; the paper's is joint space."""
+"""Spaces in which motions to other shelves are planned; the paper uses joint space."""
 
 # Iterations of the taught correction: each reduces errors of milliradians a thousandfold.
 _TEACHING_ITERATIONS = 4
-# Largest distance of the end of a demonstration from a shelf [m]. Shelves are 24 cm apart: 5 cm
-# is a careless demonstration, more is another place.
+# Largest distance of the end of a demonstration from a shelf [m]. Shelves are 24 cm apart. A
+# careless demonstration may miss its shelf by 5 cm.
 _SHELF_DISTANCE = 0.05
 # Starts drawn before the search for a collision-free one fails.
 _DRAWS = 100

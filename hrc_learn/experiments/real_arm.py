@@ -1,8 +1,8 @@
 """Tasks of the experiments on a real arm with a real camera.
 
 The task code is the same as in the simulated work cell. True poses are unknown here: results
-are what the robot itself measures. A simulated world of the assumed surroundings checks the
-plans for collisions, and mirrors the arm for the recording.
+are the robot's own measurements. A simulated world of the assumed surroundings checks the plans
+for collisions, and mirrors the arm for the recording.
 """
 
 import sys
@@ -63,7 +63,7 @@ _DELAY = 0.03
 """Delay from reading the joints to the motion of the arm [s]: that of
 `Imperfections.nominal`, not measured."""
 _SERVO_DELAY = 0.08
-"""The same delay of position servos on a bus that is read at 50 Hz [s], not measured."""
+"""The same delay for position servos on a bus that is read at 50 Hz [s], not measured."""
 _REDUCED_SPEED = 0.25
 """Speed of the tool near people [m/s] (ISO 10218-1:2025, reduced speed)."""
 

@@ -45,12 +45,12 @@ def lasting(phases: Sequence[Event], last: float = math.inf) -> list[tuple[Event
 
 
 def spans(log: LoggedSteps, phase: str) -> list[tuple[float, float]]:
-    """Start and end of each time a phase was entered [s]; the last end may be infinite."""
+    """Start and end of each occurrence of a phase [s]; the last end may be infinite."""
     return [(event.time, end) for event, end in lasting(log.events) if event.text == phase]
 
 
 def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
-    """Start and end of the first time a phase was entered [s]; (0, 0) if it never was."""
+    """Start and end of the first occurrence of a phase [s]; (0, 0) if the phase never began."""
     return (spans(log, phase) or [(0.0, 0.0)])[0]
 
 
@@ -174,7 +174,7 @@ def unwanted_contacts(
     The fingertips may touch the table while the arm feels for the table's height.
 
     Args:
-        world: World in the state that the run left.
+        world: World at the end of the run.
         log: Log of the run.
         released: Time at which each object was released on its shelf [s]; its later contacts
             are wanted.
@@ -313,11 +313,12 @@ def pull_effects(
 def _hidden_displacement(
     chain: SerialChain, log: LoggedSteps, offset: Float[Tensor, " joints"]
 ) -> Float[np.ndarray, "time 3"]:
-    """Displacement of the end effector by a push that the encoders do not show [m].
+    """Displacement of the end effector that a push causes and the encoders do not show [m].
 
-    The encoders' errors move the end effector by an amount that depends on the joints. The
-    result is this amount minus that at the undisturbed joints: those of the path, or without a
-    path the last joints before the push.
+    Because of the encoders' errors, the true position of the end effector differs from the
+    measured one by an offset that depends on the joints. The result is the change of this
+    offset from the undisturbed joints to the present ones. The undisturbed joints are the
+    joints of the path or, without a path, the last joints before the push.
     """
     joints = torch.from_numpy(log["joint_position"])
     path = torch.from_numpy(log["path_joints"])
@@ -339,8 +340,9 @@ def _elbow_displacement(
 ) -> Float[Tensor, " time"]:
     """Distance of the elbow from its undisturbed position [m].
 
-    The undisturbed position is that of the path, or else that at the start of the pull, moved
-    along with the end effector.
+    The undisturbed position is the elbow's position on the path. Without a path, it is the
+    elbow's position at the start of the pull, shifted by the motion of the end effector since
+    then.
     """
     on_path = planned.isfinite().all(-1, keepdim=True)
     elbow, tool = chain.joint_origins(joints)[:, ELBOW], chain.forward(joints).position
@@ -357,7 +359,7 @@ def path_distance(
     """Distance of each position from the path of the goals [m]; NaN without a path.
 
     The end effector may be anywhere along the path: behind its goal, as servos lag, or ahead of
-    it when it stops. The distance is therefore measured from the nearest of the recent goals,
+    a goal that stops. The distance is therefore measured from the nearest of the recent goals,
     and from the line along which the goal moved last.
 
     Args:

@@ -58,7 +58,7 @@ LONGEST = 16.0
 """Longest film [s]; a longer run is shown faster."""
 
 _EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
-_EXTENT = 0.8  # a smaller job, as of SO-101, is shown from nearer [m]
+_EXTENT = 0.8  # a job of smaller extent, such as the SO-101's, is shown from nearer [m]
 _FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
 
 _CAPTIONS: dict[str, str] = read_toml(Path(__file__).with_name("film_captions.toml"))

@@ -134,7 +134,7 @@ class CellRun:
     """One run of a work cell, successful or not."""
 
     world: World
-    """World in the state that the run left."""
+    """World at the end of the run."""
     cell: WorkCell
     motion: MotionLog
     """Poses of everything that moved."""

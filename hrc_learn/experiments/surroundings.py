@@ -98,13 +98,16 @@ _APART = 0.118
 # Largest number of arrangements of the objects that are tried.
 _ARRANGEMENTS = 10_000
 
-# Ranges of the arrival at the elbow [s] and of the number of reaches: the robot waits above its
-# first object 11 s after the start, and the worker should reach under it then.
-_ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
-# Distance that people keep from a resting arm that they see, the thickness of a sleeve [m];
-# time between checks of this distance [s]; and workers drawn until one can reach and keep it.
+# `_ENTERS`: range of the time at which the worker enters [s]. The robot waits above its first
+# object 11 s after the start, and the worker should reach under it then.
+# `_REACHES`: range of the number of reaches.
+_ENTERS, _REACHES = (4.0, 9.0), (3, 5)
+# `_KEPT_CLEAR`: distance that people keep from a resting arm that they see [m]: the thickness
+# of a sleeve. `_CHECKED_EVERY`: time between checks of this distance [s]. `_DRAWS`: largest
+# number of workers that are drawn to find one who can reach under the arm at this distance.
 _KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 60
-# Drawn workers of whom at least one can reach under the arm: where there is room, one in three.
+# The search ends if none of this many drawn workers can reach under the arm. Where there is
+# room, one in three can.
 _HOPELESS = 30
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
 # push creep.
@@ -122,9 +125,10 @@ _WAITING_OFFSET = (0.05, -0.16, 0.25)
 _WATCHED = PARTS.index("pelvis"), PARTS.index("hand_right")
 # Fewest images of a movement to learn from.
 _FEWEST_IMAGES = 8
-# The person brings the object to the robot's hand after it has moved this far [m] and rested
-# this long [s], perceives its position with this standard deviation [m], and releases the
-# object after the robot has held it this long [s].
+# `_APPROACHED`, `_RESTED`: the person brings the object to the robot's hand after this hand has
+# moved this far [m] and then rested this long [s]. `_PERCEPTION_NOISE`: standard deviation with
+# which the person perceives the position of the robot's hand [m]. `_RELEASE_AFTER`: time for
+# which the robot has held the object when the person releases it [s].
 _APPROACHED, _RESTED, _PERCEPTION_NOISE, _RELEASE_AFTER = 0.05, 0.5, 0.004, 0.3
 # Speed below which a hand rests [m/s], and longest time for which the object is held out [s].
 _RESTING_SPEED, _GIVE_UP_AFTER = 0.02, 25.0
@@ -213,8 +217,8 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
     Raises:
         ValueError: No worker can reach under the arm that waits.
     """
-    # Visits are drawn at the side +y of a table that is turned by -90 degrees, so that its side
-    # -x is there. Then they are turned back.
+    # `random_visit` draws visits at a table's side +y. The table is therefore turned by -90
+    # degrees, so that its side -x faces +y, and the visit is turned back afterwards.
     table = workplace.scene.table
     arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
     links = arm.segments(waiting)[:, None]
@@ -243,7 +247,7 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
                 rng,
                 bench=bench,
                 under=(y, -x),
-                begin=_ARRIVES,
+                begin=_ENTERS,
                 reaches=_REACHES,
                 is_clear=is_clear,
             )
@@ -385,7 +389,7 @@ class GivingPerson:
     """Person with an object in the hand, reacting to the motion of the robot's hand.
 
     Attributes:
-        hand_over: Actions of the person, as far as decided.
+        hand_over: Actions of the person that are decided so far.
     """
 
     def __init__(self, world: World, item: ObjectConfig, rng: np.random.Generator):

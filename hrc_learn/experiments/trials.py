@@ -149,13 +149,13 @@ def repeat(
 ) -> list[Trial]:
     """Run once for each seed that is not in the file yet.
 
-    Every result is saved at once: the same call resumes interrupted trials.
+    Every result is saved immediately, so the same call resumes interrupted trials.
 
     Args:
         run: Called with each seed. A trial fails by returning a reason as `failure` with its
             values, or by raising one of `failures`; any other exception stops all trials.
-            For several processes it must be picklable, such as a frozen dataclass of paths
-            and settings with `__call__` that loads its models itself.
+            For several processes, `run` must be picklable, such as a frozen dataclass of paths
+            and settings with a method `__call__` that loads the models.
         seeds: Seeds in order; repeated seeds are run once.
         file: JSON-lines file of the results; trials already in it are not repeated.
         made_by: Settings. A file of trials with other settings is refused.

@@ -35,7 +35,7 @@ constant.
 """
 
 FINGER_STROKE = 0.04
-"""Travel of one finger [m]; the gripper opens to twice this."""
+"""Travel of one finger [m]; the gripper opens to twice this width."""
 
 
 _THICKNESS = 0.002  # thickness of a marker plate [m]
@@ -175,7 +175,7 @@ _HAND = "hand"
 def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     """Add the arm, its hand and its servos to a model, with the base at the world's origin.
 
-    Bodies of links are named link0, link1, ...; joints keep their names of the chain; fingers
+    Bodies of links are named link0, link1, ...; joints have the names of the chain; fingers
     are named `finger_left` and `finger_right`.
     """
     robot, n = config.robot, config.robot.joints

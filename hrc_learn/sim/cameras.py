@@ -198,7 +198,7 @@ def hidden_markers(world: World, model: CameraModel, markers: list[Marker]) -> s
             length = np.linalg.norm(point - eye)
             ray = (point - eye) / length
             hit = mujoco.mj_ray(world.model, world.data, eye, ray, None, 1, -1, geom, normal)
-            # Rays to visible points hit the plate itself, 5 mm at most before the point.
+            # A ray to a visible point hits the plate itself, at most 5 mm before the point.
             if 0 <= hit < length - 5e-3:
                 hidden.add(marker.id)
                 break

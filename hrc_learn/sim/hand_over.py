@@ -68,7 +68,7 @@ class HandOver:
     """The planned part of a handover; the rest depends on the robot."""
 
     visit: WorkerVisit
-    """Postures up to the one that holds the object out."""
+    """Postures up to the one in which the worker holds the object out."""
     reaches: tuple[Reach, ...]
     carried: tuple[tuple[float, float], ...]
     """Intervals in which the hand holds the object [s]; between them it lies on the bench."""

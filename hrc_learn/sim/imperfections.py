@@ -76,9 +76,10 @@ class Imperfections:
     image_loss: float = 0.20
     """Fraction of the images that never arrive."""
     image_noise: float = 2.0
-    """Standard deviation of the sensor noise, grey levels of 255, beyond the camera's own."""
+    """Standard deviation of the sensor noise in grey levels of 255, in addition to
+    `ImageNoise.noise`."""
     image_blur: float = 0.5
-    """Standard deviation of the blur, beyond the camera's own [px]."""
+    """Standard deviation of the blur, in addition to `ImageNoise.blur` [px]."""
     table_height: float = 0.02
     """Range of the height error of the table's top [m]."""
     object_height: float = 0.005
@@ -157,7 +158,7 @@ class Imperfections:
             rng: Random generator, also for the noise during the run.
             joints: Number of joints of the arm.
             size: Size of the hand relative to the Franka hand. Height errors of table and
-                objects grow in proportion, and an unknown load with the cube, as weights do.
+                objects are proportional to it, and the unknown load to its cube.
         """
 
         def uniform(size: int | None = None):
@@ -280,7 +281,7 @@ class CommandChannel:
 
     def advance(self, time: float, dt: float) -> Float[np.ndarray, " joints"]:
         """Joint velocity that the servos follow from `time` to `time + dt` [rad/s]."""
-        # Clocks add up steps of rounded length: a nanosecond early still counts as due.
+        # Clocks sum rounded steps, so a command that is a nanosecond early counts as due.
         while self._pending and self._pending[0][0] <= time + 1e-9:
             self._wanted = self._pending.popleft()[1]
         lag = self._drawn.sizes.servo_lag

@@ -2,8 +2,9 @@
 
 The arm follows the paths of the job without physics. The smallest margin to joint limits,
 singularities and furniture is the quality of the starting posture. Above the table, the camera
-must also see the marker on the gripper while the gripper takes all turns of half a circle about
-the vertical. Half a circle is enough: then a parallel gripper grasps in the same way again.
+must also see the marker on the gripper while the gripper turns through half a circle about the
+vertical. Half a circle is enough, because after half a turn a parallel gripper grasps an object
+in the same way.
 """
 
 import math
@@ -29,7 +30,8 @@ type Clearances = Callable[[Tensor], tuple[Tensor, Tensor]]
 # singular value [m/rad]. `_CLEAR`, `_APART`: distance of the arm from furniture and from itself
 # [m]. `_SPEED`: largest joint speed, as a fraction of its limit.
 _MARGIN, _SINGULAR, _CLEAR, _APART, _SPEED = 0.25, 0.08, 0.04, 0.01, 0.8
-# A pose counts as not reached from this tracking error on: distance [m] or angle [rad].
+# A pose counts as not reached if its tracking error is at least this: distance [m] or angle
+# [rad].
 _LOST = 5e-3
 # Numbers of samples: of a path to a shelf (`_STEPS`), of a path across the table (`_ACROSS`),
 # and of half a turn of the gripper above the table.
@@ -100,7 +102,9 @@ def path_quality(
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedTurns:
-    """Turns that the gripper may take above the table, and the marker's side of the hand."""
+    """Turns that the gripper may make above the table, and the side of the hand that carries
+    the marker.
+    """
 
     plate: Plate
     """Plate that carries the marker."""

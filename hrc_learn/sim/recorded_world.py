@@ -132,7 +132,8 @@ class WorkerDistance:
         loads = [model.geom(name).id for name in held]
         geoms = np.concatenate([self._arm, np.array(loads, dtype=int)])
         # Distances of spheres around the geoms are lower bounds. Pairs are measured in order of
-        # these bounds, until a bound exceeds the smallest distance: a dozen of four hundred.
+        # these bounds, until a bound exceeds the smallest distance. About a dozen of four
+        # hundred pairs are measured.
         centres = data.geom_xpos[geoms][:, None] - data.geom_xpos[self._worker]
         radii = model.geom_rbound[geoms][:, None] + model.geom_rbound[self._worker]
         bounds = (np.linalg.norm(centres, axis=-1) - radii).ravel()

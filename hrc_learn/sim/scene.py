@@ -135,7 +135,7 @@ _TABLE = Box(
 
 
 def overhead_camera() -> CameraModel:
-    """The camera above the table: image right is -x, down is +y, with a little distortion."""
+    """The camera above the table: u increases along -x, v along +y; a little distortion."""
     pose = np.eye(4)
     pose[:3, :3] = np.diag([-1.0, 1.0, -1.0])
     pose[:3, 3] = (0.24, 0.52, 1.55)

@@ -165,7 +165,7 @@ class PhysicsWatch:
             raise self._error("a force on it is not finite", body)
         if len(new := np.flatnonzero(data.warning.number != self._warnings)):
             kind = int(new[0])
-            # Name the body where the error began: by the end of the step it may have spread.
+            # Name the body where the error began; during the step it may have spread to others.
             place = int(data.warning.lastinfo[kind])
             body = self._body(place, _INDEXED[kind]) if kind in _INDEXED else ""
             raise self._error(f"MuJoCo warns: {mujoco.mju_warningText(kind, place)}", body)

@@ -351,7 +351,7 @@ class WorkerSensor:
 
     def read(self) -> PersonObservation | None:
         """The newest observation that has arrived by now."""
-        # Clocks add up steps of rounded length: a nanosecond early still counts as in time.
+        # Clocks sum rounded steps, so an image that is a nanosecond early counts as in time.
         now = self._clock() + 1e-9
         while (time := self._first + self._taken / IMAGE_RATE) <= now:
             self._take(time)

@@ -261,7 +261,8 @@ class BenchScript(PoseWriter):
             rng: Random generator.
             bench: The table, whose far side (+y) is free.
             across: Least and greatest x of the place to stand [m].
-            sway: Largest angle by which the worker there turns from facing the bench [rad].
+            sway: Largest angle between the worker's heading there and the normal of the
+                bench's edge [rad].
         """
         self._worker, h = worker, worker.config.stature
         self.top = bench.centre[2] + bench.half_size[2]

@@ -84,7 +84,7 @@ class Workplace:
     """Joint 7 of Franka's arms at home [rad]: the elbow leans to the left, away from the
     cabinet."""
     home_posture: tuple[float, ...] = ()
-    """Joint positions near which other arms are at home [rad]."""
+    """Joint positions of other arms at home, the start of their inverse kinematics [rad]."""
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     table_reach: tuple[float, float] = (0.14, 0.14)
@@ -96,7 +96,8 @@ class Workplace:
     hover_q7: float = -0.1
     """Joint 7 of Franka's arms above the table [rad]."""
     hover_posture: tuple[float, ...] = ()
-    """Joint positions near which other arms are above the table [rad]."""
+    """Joint positions of other arms above the table, the start of their inverse kinematics
+    [rad]."""
     fingertip: float = 0.012
     """Length of the fingers beyond the tool centre point, in the middle of the pads [m]."""
     palm: float = 0.0374
@@ -408,7 +409,8 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
     if beside:
-        # The longest way to the shelves first: tremor of a hand dominates a short motion.
+        # Begin with the longest way to the shelves: in short demonstrations, the tremor of the
+        # person's hand dominates the motion.
         for home, far, higher in product(_ON_THE_WAY, _BESIDE, (*_HIGHER, _DOWN)):
             yield _beside(_placed(usual, scale, 0.0, higher, _DEPTHS[-1], far), home)
         return

@@ -24,14 +24,14 @@ from hrc_learn.sim.step_checks import ContactMonitor, PhysicsWatch
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 _PADS = ("finger_left_pad", "finger_right_pad")
-# A tenth of a millimetre apart still counts as touching [m].
+# Bodies count as touching if they are less than this apart [m].
 _TOUCHING = 1e-4
 # Cosine of the largest angle between the normals of a contact and of a flat face: 3 degrees.
 _FLAT = math.cos(math.radians(3.0))
 # Orientation of an object in the tool's frame: its x lies along the fingers' line of closing,
 # its top towards the gripper.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-# Number of latest touches that `touched_since` searches; no control step begins more.
+# Number of latest touches that `touched_since` searches: more than begin in any control step.
 _REMEMBERED = 64
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 
@@ -130,8 +130,8 @@ class World:
             monitor.clear()
 
     def touched_since(self, time: float) -> tuple[str, ...]:
-        """Unwanted contacts of the arm since a time [s]: cabinet, table, itself or the worker,
-        in words.
+        """Texts about unwanted contacts of the arm since a time [s]: contacts with cabinet,
+        table, itself or the worker.
         """
         monitors = (m for m in self._monitors if m is not self.object_contacts)
         met = [
@@ -184,7 +184,7 @@ class World:
         self._watch.restart()
 
     def follow(self, state: ArmState, carried: str | None = None) -> None:
-        """Show the state of an arm that is controlled elsewhere; no physics.
+        """Show the state of an arm that is controlled elsewhere, without physics.
 
         Args:
             state: State of that arm.
@@ -221,11 +221,11 @@ class World:
     def move_obstacle(
         self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]
     ) -> None:
-        """Put an obstacle, or the occluder, at a new position; `NOWHERE` takes it away.
+        """Put an obstacle, or the occluder, at a new position.
 
         Args:
             name: Name of the obstacle.
-            centre: Centre in the base frame [m].
+            centre: Centre in the base frame [m]; `NOWHERE`: out of the scene.
         """
         self.data.mocap_pos[self.model.body(name).mocapid[0]] = centre
         mujoco.mj_kinematics(self.model, self.data)

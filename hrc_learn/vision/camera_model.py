@@ -70,7 +70,7 @@ class CameraModel:
         if distance < 1e-9:
             raise ValueError("eye and target must differ, but both are " + str(eye.tolist()))
         z = z / distance
-        # Within 2.6 degrees of the vertical the base's z axis no longer tells which way is up.
+        # Within 2.6 degrees of the vertical, the base's z axis does not define "up" reliably.
         up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
         x = np.cross(z, up)
         x /= np.linalg.norm(x)

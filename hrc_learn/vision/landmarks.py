@@ -27,11 +27,12 @@ _SAME_POINT = 0.006
 _REACH, _WIDTH = 5.0, 1440
 # Fewest points that must agree on a tool (`FEWEST_POINTS`) and on an object.
 FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
-# Largest numbers of samples of matches that are tried, of the clearest matches and of all: an
-# image without the tool takes a fifth of a second.
+# Largest number of samples drawn from the clearest matches, and then from all matches. With
+# these numbers, an image without the tool takes a fifth of a second.
 _TRIALS = 300, 1000
-# Once a pose is found, features are matched where it expects the tool's points, within these
-# multiples of `_REACH`, if their descriptors differ by less than `_SIMILAR`.
+# Once a pose is found, it predicts the pixels of the tool's points. Features within these
+# multiples of `_REACH` from a predicted pixel match the point if their descriptors differ by
+# less than `_SIMILAR`.
 _GUIDED, _SIMILAR = (2.0, 1.0, 1.0), 270.0
 # Least standard deviation of a feature's position in the image [px].
 _LEAST_NOISE = 0.15

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import cv2
 
 MODULES = 6
-"""Squares along a marker's edge: 4 of code between two of black border."""
+"""Squares along a marker's edge: four code squares between two squares of the black border."""
 QUIET_MODULES = 1
 """Squares of white on each side, which detection needs."""
 PLATE_MODULES = MODULES + 2 * QUIET_MODULES

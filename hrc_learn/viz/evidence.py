@@ -82,7 +82,7 @@ def _filled(clause: Clause, reports: Sequence[Report]) -> Clause:
 
 
 def _ending(settings: dict[str, Any], name: str) -> list[Any]:
-    """Values of the settings whose names end in `name`: those of the work cell, if any."""
+    """Values of the settings whose names end in `name`; only those of the work cell, if any."""
     found = {key: value for key, value in settings.items() if f".{key}".endswith(f".{name}")}
     cell = [value for key, value in found.items() if "cell." in key]
     return cell or list(found.values())

@@ -43,7 +43,7 @@ _SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
 
 
 def active_intervals(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
-    """First and last index of every run of true samples."""
+    """First and last index of every interval of consecutive true samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 

@@ -42,7 +42,7 @@ def rgba(colour: str) -> tuple[int, int, int, int]:
 def followed_colour(fraction: float) -> str:
     """Colour for the followed fraction of a push, 0 to 1: vermilion for 0, green for 1.
 
-    In five distinguishable steps.
+    The colour changes in five distinguishable steps.
     """
     return (VERMILION, "#DE8000", ORANGE, "#A0A030", GREEN)[
         round(4 * min(max(fraction, 0.0), 1.0))
@@ -63,5 +63,9 @@ _ON_WHITE = {
 
 
 def on_white(colour: tuple[int, int, int, int]) -> tuple[float, ...]:
-    """Colour for white paper, 0 to 1, in place of a colour for dark screens, given as bytes."""
+    """Colour for white paper, in channels from 0 to 1, that replaces a colour for dark screens.
+
+    Args:
+        colour: Colour for dark screens, in bytes.
+    """
     return tuple(channel / 255 for channel in _ON_WHITE.get(colour, colour))

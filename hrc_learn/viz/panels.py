@@ -25,7 +25,7 @@ class Curves:
     marks: bool = False
     """Draw points rather than lines, so that single steps are visible."""
     time: Shaped[np.ndarray, " time"] | None = None
-    """Time of these curves in a figure [s]; None: that of all curves."""
+    """Time of these curves in a figure [s]; None: the common time of all curves."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -237,7 +237,7 @@ class LogStream:
     """Sends the chosen columns of a log, and a grid of plots that shows them.
 
     `stream` is any recording stream: `stream.serve_grpc()`, `stream.spawn()` or
-    `stream.connect_grpc()` show it in a viewer, `stream.save()` keeps it.
+    `stream.connect_grpc()` show it in a viewer; `stream.save()` writes it to a file.
     """
 
     def __init__(self, log: LoggedSteps, stream: rr.RecordingStream, columns: Sequence[str]):
