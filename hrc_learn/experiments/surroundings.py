@@ -338,11 +338,11 @@ def near_worker(
     """Margin of the true distance from the worker over the stopping distance, and the force of
     contacts, at each step.
 
-    The stopping distance is v_h v/a + v^2/(2 a), for a part of the arm that approaches a part
-    of the worker at speed v while the latter comes at v_h: the protective distance without
-    reaction time and uncertainty. The margin is the smallest over all parts. It is infinite
-    while the arm approaches no part, and for contacts within the limits of power and force
-    limiting.
+    The stopping distance is v_h v/a + v^2/(2 a), where the arm approaches the worker at the
+    speed v, and the worker approaches the arm at the speed v_h. This is the protective distance
+    without reaction time and uncertainty. The margin is the smallest over all parts. It is
+    infinite while the arm approaches no part, and for contacts within the limits of power and
+    force limiting.
 
     Args:
         log: Log of the run.
@@ -424,7 +424,7 @@ class GivingPerson:
         return self.hand_over.visit.ends_at(time)
 
     def update(self) -> None:
-        """Move the person and the object in their hand to where they are now."""
+        """Move the person, and the object in their hand, to the present positions."""
         world, now = self._world, self._world.time
         passed, self._time = now - self._time, now
         tool = self._tool()
@@ -512,7 +512,7 @@ def _movements(
             if seen is None or seen is newest:
                 continue
             newest = seen
-            # Only until the hand arrives: afterwards the watch adds samples of a resting hand.
+            # Samples count only until the hand arrives: later ones show a resting hand.
             if watch.see(seen) and seen.time < reach.end:
                 times, hand = watch.times.copy(), watch.hand.copy()
         if len(times) >= _FEWEST_IMAGES and times[-1] > reach.begin:

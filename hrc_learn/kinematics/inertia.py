@@ -34,7 +34,7 @@ class MassMatrix:
         """
         self._arm = arm
         count = arm.joints + 3
-        # Without the base, which does not move.
+        # The base is omitted, because it does not move.
         bodies = np.stack([_inertia(arm, link) for link in range(1, count)])
         self._bodies = Constant(torch.from_numpy(bodies))
         self._rotors = Constant(rotor_inertia * torch.eye(arm.joints, dtype=torch.float64))
@@ -72,7 +72,7 @@ def _at_last(vector: Tensor) -> Float[Tensor, "*batch 3 4"]:
 
 
 def _inertia(arm: Arm, link: int) -> Float[np.ndarray, "4 4"]:
-    """Pseudo-inertia of a link: the description's, or its mass spread over its capsules."""
+    """Pseudo-inertia of a link from the description, or else from its mass and its capsules."""
     given, mass = arm.shape.inertia, arm.masses[link]
     if given and (known := given[link]) is not None and abs(known[3, 3] - mass) <= 0.01 * mass:
         return known

@@ -91,7 +91,7 @@ def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
             f"{name}_plate",
             (half, half, _THICKNESS / 2),
             (0.9, 0.9, 0.9, 1.0),
-            # Just below the picture: in one plane, box and picture would flicker.
+            # The box lies just below the picture: in the same plane, both would flicker.
             pos=np.array(plate.position) - 0.75 * _THICKNESS * normal,
             quat=plate.orientation,
             mass=0.02,

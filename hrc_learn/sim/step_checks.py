@@ -55,7 +55,7 @@ class ContactMonitor:
         self._model = model
         mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
         self._mover, self._obstacle = mover, obstacle
-        # With one look-up for each contact, most steps need no further work.
+        # A table of pairs: one look-up for each contact is all that most steps need.
         self.watched = np.outer(mover, obstacle) | np.outer(obstacle, mover)
         self.touches: list[Touch] = []
         self._running: dict[tuple[int, int], int] = {}

@@ -63,7 +63,8 @@ _STRETCHED = 0.995
 # Directions in which the left elbow and the left knee point, in the worker's frame. For the
 # right ones, y has the opposite sign.
 _ELBOW, _KNEE = (-0.8, 0.2, -0.7), (1.0, 0.1, 0.0)
-# For both arms and both legs, left ones first: these directions, and lengths of the two links.
+# Directions of bending, and lengths of the first and the second link as fractions of the
+# stature: rows for left arm, right arm, left leg and right leg.
 _BENT_TO = np.array([(x, side * y, z) for x, y, z in (_ELBOW, _KNEE) for side in (1, -1)])
 _FIRST = np.array([[_UPPER_ARM], [_UPPER_ARM], [_THIGH], [_THIGH]])
 _SECOND = np.array([[_FOREARM], [_FOREARM], [_SHANK], [_SHANK]])
@@ -74,7 +75,7 @@ _BALANCE = 0.06
 # Lean of the head as a fraction of the trunk's: people look up while they lean.
 _HEAD_LEANS = 0.7
 _LIFT = 0.04  # height of a foot in its swing, as a fraction of the stature
-# Time over which velocities are averaged [s]: three images, as a compromise of noise and lag.
+# Time over which velocities are averaged [s]: three images, a compromise between noise and lag.
 _SPAN = 0.1
 IMAGE_RATE = 30.0
 """Images per second of an ordinary depth camera."""
@@ -152,7 +153,7 @@ class Worker:
         return np.array([[x, y, z], [x, -y, z]])
 
     def standing(self) -> Posture:
-        """Upright at the origin, the arms hanging."""
+        """Posture of a person who stands upright at the origin with hanging arms."""
         zero = np.zeros(())
         return Posture(
             place=np.zeros(2),
