@@ -300,7 +300,7 @@ class ArmLoop:
             return slowed
         slowed = slowed | (people.speed_scale < 1)
         if (layer := report.constraints) is not None:
-            # Slowing down for the arm's own limits does not count: a path would wait for ever.
+            # Slowing down for the arm's own limits does not count; a path could wait for ever.
             given_up = (layer.slowed > _SLOWED) & closes_in(
                 people.distances, sent, self.safety.config
             )

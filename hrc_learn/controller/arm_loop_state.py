@@ -70,7 +70,7 @@ class WatchedPeople:
     distances: Distances
     """Distances of the most urgent pairs of an arm capsule and a body capsule, reduced by the
     distance that people may have moved since the observation. NaN (the arm brakes) if there is
-    no observation, or if people are close enough to touch the arm where they must not."""
+    no observation, or if people are close enough for a contact that is not allowed."""
     nearest: Float[Tensor, "*batch"]
     """Smallest distance between the observed people and the arm at its present joints [m]."""
     age: Float[Tensor, "*batch"]

@@ -211,7 +211,7 @@ class ConstraintConfig:
     """Cost of leaving the path of the task by 1 rad/s, relative to stopping it."""
     distance_weight: float = 1e2
     """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2,
-    the violation of conflicting distances exceeds the least possible one by a part in 1e4."""
+    the violation of conflicting distances exceeds the least possible one by 1 part in 1e4."""
     steps: int = 16
     """Steps of the solver; the arm brakes where they are not enough. Arms approached by a
     person never needed more than 12; random limits need more than 16 in 4 % of the states, and
@@ -292,7 +292,7 @@ class ConstraintReport:
     """Fraction of the task velocity given up, 0 to 1."""
     violation: Float[Tensor, "*batch"]
     """Excess of the fastest closing speed over the allowed one [m/s]; above zero where joint
-    limits or other distances leave no better solution."""
+    limits or other distances permit no better solution."""
     solved: Bool[Tensor, "*batch"]
     """False: the arm brakes, because the solver needed more steps."""
 

@@ -38,7 +38,7 @@ NARROW = 0.07
 """Lower bound on the smallest singular value of the Jacobian: below it, the joints may not
 leave their path. The damping of the inverse Jacobian begins at 0.05."""
 
-# Distance at which a path that has waited goes on [rad].
+# Distance of the joints from a path that has waited for them, at which it goes on [rad].
 _NEAR_AGAIN = 1.4
 # Distances from the path [rad]. Below the first, joints return whatever their alignment is.
 # Above the second, the alignment counts in full.
@@ -138,8 +138,8 @@ def may_not_return(
         error: Path minus joint positions [rad].
         alignment: `return_alignment` of that error.
         waited: True if the path has waited for the joints and they are no longer pushed. The
-            path then goes on only once the joints are well on their way back; otherwise it
-            would lead them off again.
+            path then goes on only once the joints are well on their way back; otherwise, its
+            motion would move them away again.
     """
     waited = torch.as_tensor(waited)
     farthest = torch.where(waited, _NEAR_AGAIN, FAR_ASIDE)

@@ -253,8 +253,7 @@ class LimitBarrier(nn.Module):
 
 # Velocity that ramps of the acceleration may add during gentle braking, as a fraction of the
 # velocity limits at a cap of 1 m/s. With a smaller fraction, the arm brakes more gently. The
-# added velocity falls with the square of the cap, like the turning of the links that gentle
-# braking has to allow for.
+# added velocity falls with the square of the cap, as does the effect of the turning links.
 _RAMP = 0.005
 
 

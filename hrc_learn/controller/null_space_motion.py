@@ -304,8 +304,9 @@ def kept_clear(
         null: Null-space velocity [rad/s].
         clearance: Function for the distance from obstacles. It is called once, for all
             postures to compare, along a new first axis.
-        margin: Clearance to keep [m]. Where the task alone leaves less, the null space reduces
-            the clearance by at most 2 mm/s, and not at all if 5 mm or more are missing.
+        margin: Clearance to keep [m]. Where the task alone results in less, the null space
+            reduces it further by at most 2 mm/s, and not at all if it is 5 mm or more below the
+            margin.
     """
     ahead = joint_position + LOOK_AHEAD * (task + _fractions_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))

@@ -149,7 +149,7 @@ class SafetyFilter(nn.Module):
         joint_velocity: ArrayLike | None = None,
         joint_acceleration: ArrayLike | None = None,
     ) -> SafetyState:
-        """State of an arm at rest, or in motion: pass what is measured.
+        """State of an arm at rest or in motion.
 
         Args:
             joint_position: Measured joint positions (*batch, n) [rad].
@@ -462,7 +462,7 @@ class SafetyFilter(nn.Module):
         """The velocity nearest to a given one that keeps limits and distances, and a report."""
         state, command = given.state, given.command
         assert given.jacobian is not None
-        # The arm has picked up this fraction of the command so far.
+        # Fraction of the command that the arm has picked up so far.
         square = torch.linalg.vecdot(command, command)
         along = torch.linalg.vecdot(command, v)
         fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
@@ -536,8 +536,8 @@ class SafetyFilter(nn.Module):
         state = replace(
             before,
             velocity=v,
-            # From the rounded velocities, so errors do not add up and a check finds the same
-            # value.
+            # Computed from the rounded velocities, so that errors do not add up, and a check of
+            # the sent velocities finds the same value.
             acceleration=(v - before.velocity) / given.dt,
             position=given.joint_position + v * given.dt,
             fresh=torch.zeros_like(before.fresh),

@@ -357,7 +357,7 @@ class Description:
 
 
 def _length(joint: Joint, height: dict[str, int]) -> int:
-    """Number of moving joints in a row from a joint, included, to the furthest leaf."""
+    """Number of moving joints from a joint, which counts too, to the furthest leaf."""
     return height[joint.child] + (joint.kind != "fixed")
 
 

@@ -39,8 +39,8 @@ TASK_ROWS: dict[TaskSpace, int] = {
 # Weight of angles relative to distances [m/rad]: 1 rad counts as much as this distance.
 _LEVER = 0.3
 # Singular values below these fractions of the largest one count as zero: `_RANK` in
-# `null_space_dimension`, `_WEAK` in `task_rank`. `_WEAK` excludes directions that joints hardly
-# move: the SO-101's tool lies 8 mm off the axis of the last joint, which thus hardly moves it.
+# `null_space_dimension`, `_WEAK` in `task_rank`. With `_WEAK`, directions in which the joints
+# hardly move the tool do not count: the SO-101's tool is only 8 mm off its last joint's axis.
 _RANK, _WEAK = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
 # Starts per pose in each round, largest number of rounds, and iterations from each start.
@@ -68,8 +68,9 @@ def task_error_and_jacobian(
 ) -> tuple[Float[Tensor, "rows task"], Float[Tensor, "rows task joints"]]:
     """Error to a pose, and the Jacobian of the task with respect to the joints.
 
-    The first three rows are linear, in the base frame [m]. A pose adds three angular rows in
-    the base frame [rad], "position+axis" two, perpendicular to the wanted axis of the tool.
+    The first three rows are linear, in the base frame [m]. "pose" adds three angular rows in
+    the base frame [rad]; "position+axis" adds two, about axes perpendicular to the wanted axis
+    of the tool.
 
     Args:
         chain: The arm.
@@ -120,7 +121,7 @@ def null_space_dimension(
     return (q.shape[-1] - rank).reshape(q.shape[:-1]).to(q)
 
 
-_SAMPLES = 64  # joint positions at which `task_rank` looks: nearly all are regular
+_SAMPLES = 64  # random joint positions that `task_rank` evaluates: nearly all are regular
 
 
 def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
