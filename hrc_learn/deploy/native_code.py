@@ -182,7 +182,7 @@ class NativeCode:
             return kind(values if len(xs) > 1 else values[0])
         if name == "input" and _fixed(self._program, xs):
             return builder.load(self._row(builder, *where[:2]), align=self._size, typ=kind)
-        # One or two values, each in several places.
+        # Only one or two different values, each several times.
         order = ir.VectorType(_INDEX, len(xs))([0] * len(xs))
         repeated = []
         for value in [self._value(builder, made, (x,)) for x in dict.fromkeys(xs)]:

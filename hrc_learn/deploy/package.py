@@ -122,7 +122,7 @@ class IOLayout:
         return torch.cat(parts)
 
     def unpack(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
-        """Tensors in a vector: views of it, or copies for another dtype."""
+        """Tensors in a vector: views of the vector, or copies if the dtypes differ."""
         views = zip(self.views(vector), self.fields, strict=True)
         return [view.to(field.dtype) for view, field in views]
 
@@ -199,7 +199,7 @@ class PackedStep(nn.Module):
         self.first_state = self.layouts.state.pack(tensors_of(state))
 
     def example(self, observation: StepObservation) -> Vectors:
-        """Vectors before the first step: at rest in the ready posture."""
+        """Vectors before the first step, with the arm at rest in the ready posture."""
         return Vectors(
             self.first_state.clone(),
             self.layouts.observation.pack(tensors_of(observation)),

@@ -204,8 +204,8 @@ def scalar_program(program: ExportedProgram, dtype: torch.dtype) -> ScalarProgra
         dtype: Floating-point type of the numbers.
 
     Raises:
-        UnknownOperationError: An operation is not known here, or an arm of the batch depends
-            on another.
+        UnknownOperationError: An operation is unknown here, or an arm of the batch affects
+            another arm.
     """
     result = ScalarProgram(dtype)
     with torch.no_grad():

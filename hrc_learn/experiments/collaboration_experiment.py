@@ -150,7 +150,7 @@ class CollaborationExperiment(CollaborationScenario):
         return {"none": (), "random": "random", "scripted": drags}[self.pulls]
 
     def _job(self) -> PickAndPlaceConfig:
-        """Job that waits for the time of the drags even without drags: runs stay comparable."""
+        """Job that waits as long without drags as with them, so that runs are comparable."""
         if not self.worker:
             return self.config
         end = DRAGS_NEAR_WORKER[-1].end + _AFTER_DRAGS

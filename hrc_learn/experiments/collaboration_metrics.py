@@ -85,7 +85,7 @@ def _near_worker(of: Callable[[NearWorker], float | int]) -> Measure:
 
 
 def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
-    """Metric of the number of unwanted contacts with `hit`."""
+    """Metric of the number of unwanted contacts with the object `hit`."""
     return never(
         name,
         lambda run: len(_contacts(run)[hit]),
@@ -103,7 +103,7 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
     _touches("cabinet", "contacts with the cabinet"),
     _touches("table", "contacts with the table"),
     _touches("arm itself", "contacts of the arm with itself"),
-    # Not listed, as the rows above name what was hit.
+    # Not listed: the rows above count the contacts by object.
     Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
     Metric("contacts with the worker", lambda run: _worker_contacts(run)),
     Metric("min distance", lambda run: _min_distance(run), "mm"),
@@ -263,7 +263,7 @@ def _elbow_pulled(run: CollaborationRun) -> float | None:
 
 
 def _worst(run: CollaborationRun, name: str) -> float | None:
-    """Largest value over the objects taken from the table and released; None without any."""
+    """Largest value over the objects picked from the table and released; None without any."""
     grasped = [e for e in run.picks if e.release is not None and e.receipt is None]
     return max((float(getattr(job, name)) for job in grasped), default=None)
 

@@ -88,7 +88,7 @@ class Disturbances:
     occlusions: tuple[OcclusionInterval, ...] = ()
     """Intervals in which the gripper's marker is hidden."""
     camera_change: CameraChange | None = None
-    """Motion of the camera between two objects; None: it stays."""
+    """Motion of the camera between two objects; None: the camera does not move."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,8 +185,8 @@ def simulate_collaboration(
         observer: Live dashboard and messages.
 
     Raises:
-        ValueError: If not every object has a shelf of its own, a shelf is unknown or out of
-            reach, or both a worker and a hand-over are asked for.
+        ValueError: If the objects do not have one shelf each, a shelf is unknown or out of
+            reach, or the scenario has both a worker and a hand-over.
     """
     scenario = scenario or CollaborationScenario()
     workplace = (workplace or Workplace()).approached(aiming.approach)
@@ -196,7 +196,8 @@ def simulate_collaboration(
     if scenario.worker and scenario.handover:
         raise ValueError("only one person can come: give --worker or --handover, not both.")
     rng, sizes = np.random.default_rng(seed), scenario.imperfections
-    # Scripted forces wait for the robot; random ones do not, and the robot does not wait.
+    # Scripted forces begin when the robot waits for them. Random forces do not depend on the
+    # robot, and the robot does not wait for them.
     config, forces, begin = scenario.config, scenario.forces, None
     pulls: tuple[ScriptedForce, ...] = ()
     if forces == "random":
@@ -330,7 +331,7 @@ class _Stage:
 
     @property
     def visit(self) -> WorkerVisit | None:
-        """Motion of the person that is decided so far; None without a person."""
+        """Motion of the person that is planned so far; None without a person."""
         if self.watch is None:
             return None
         return self._visit if self.giving is None else self.giving.hand_over.visit

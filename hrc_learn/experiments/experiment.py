@@ -36,7 +36,7 @@ from hrc_learn.viz.report import (
 from hrc_learn.viz.run_dashboard import record_run
 
 RUN = "run"
-"""Name of the recording of the run itself, among the recordings of an experiment."""
+"""Key of the recording of the run itself in the recordings of an experiment."""
 TRIALS = "trials"
 """Name of the file of the trials."""
 
@@ -48,8 +48,8 @@ class Study:
     title: str
     """Heading of its section in the report."""
     trial: TrialRun
-    """Runs one trial with a seed. A frozen dataclass, so that it can be sent to other processes
-    and its settings can be saved with the trials."""
+    """Runs one trial with a seed. It is a frozen dataclass, because it is sent to other
+    processes, and its settings are saved with the trials."""
     metrics: Sequence[Metric[Sequence[Trial]]] = ()
     """Rows that the trials add to the table."""
     text: str = ""

@@ -84,8 +84,8 @@ def lift(run: GraspingRun) -> float:
 
 
 def jacobian_errors(run: GraspingRun) -> tuple[float, float]:
-    """Relative errors of the image Jacobian's translational part when vision starts, and at
-    the descent; NaN if vision never started.
+    """Relative errors of the translational part of the image Jacobian, when vision starts and
+    at the descent; NaN if vision never started.
     """
     log = run.cell.log
     guided = np.flatnonzero(log["vision_activation"] > 0)

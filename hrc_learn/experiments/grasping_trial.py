@@ -102,7 +102,7 @@ class GraspingScene:
             imperfections: Imperfections of arm, calibration, camera and object; None: none.
 
         Raises:
-            ValueError: The camera sees the object from no start, or no start has a free path.
+            ValueError: Every drawn start hides the object or has no free path home.
         """
         scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
         # A separate generator, so that the scenes do not depend on the imperfections.

@@ -27,7 +27,7 @@ class Metric[Run]:
     """One row of the table. `Run` is the result of one run of the experiment.
 
     Raises:
-        ValueError: If it has both an upper and a lower bound.
+        ValueError: The metric has both an upper and a lower bound.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Metric[Run]:
         Args:
             part: Extracts the part from the whole.
             prefix: Prefix of the name.
-            bounded: Keep the bound; else the value is only reported for comparison.
+            bounded: Keep the bound. False: the value is only reported, for comparison.
         """
         free = {} if bounded else {"at_most": None, "at_least": None, "essential": False}
         parted: Any = replace(self, name=f"{prefix}{self.name}", **free)

@@ -152,7 +152,7 @@ class SceneJudge:
         self.succeeded, self._widest = _function(config.success), widest or 1.0
         self._steps = max(1, round(1 / fps / model.opt.timestep))
         known = {model.joint(i).name: i for i in range(model.njnt)}
-        # Joint that each actuator moves; tendons and sites have numbers of their own.
+        # Joint that each actuator moves; tendons and sites are numbered separately.
         joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
         direct = np.isin(model.actuator_trntype, joint)
         at = np.where(direct, model.actuator_trnid[:, 0], -1)
@@ -277,7 +277,7 @@ type Judge = Callable[[Sequence[Trial]], Iterator[Replay]]
 def judging(
     config: JudgeConfig, robot: ArmChoice, fps: float, widest: float
 ) -> Iterator[Judge]:
-    """Judge in several processes; arguments and errors as for `JudgeConfig.open`."""
+    """Judge in several processes, with the arguments and errors of `JudgeConfig.open`."""
     given = (config, robot, fps, widest)
     # Opened here first, so that a wrong setting raises one error, in this process.
     _begin(*given)

@@ -84,7 +84,7 @@ class PlacingExperiment:
         The seed draws the imperfections.
 
         Raises:
-            ValueError: If the demonstration is not of this arm or ends at no shelf.
+            ValueError: The demonstration is of another arm, or does not end at a shelf.
         """
         scene = self.open_scene(np.random.default_rng(seed))
         joints = scene.demonstration.joint_position
@@ -143,7 +143,7 @@ class PlacingExperiment:
         return run_metrics(self._shelves)
 
     def recordings(self, run: PlacingRun) -> Mapping[str, RunRecording]:
-        """Placings planned in task space; that on the demonstrated shelf is named "run"."""
+        """Placings planned in task space; "run" is the placing on the demonstrated shelf."""
         recordings = {}
         for shelf in run.scene.workplace.shelf_names():
             placed = run.placings["pose", shelf]

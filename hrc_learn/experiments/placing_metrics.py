@@ -24,8 +24,9 @@ from hrc_learn.sim import Touch
 from hrc_learn.skills.placing import PlanningSpace
 
 DEVIATION_MM, PLACE_ERROR_MM, PLACE_TILT_DEG = 12.0, 3.0, 3.0
-"""Bounds of a good placing. Approach paths planned in task space deviate by 2 mm, those planned
-in joint space with a shifted goal by 100 mm. Errors are those of the object on its board."""
+"""Bounds of a good placing. Approach paths planned in task space deviate by 2 mm; approach
+paths planned in joint space with a shifted goal deviate by 100 mm. The other two bounds are for
+errors of the object on its board."""
 
 # Largest dimensionless jerk of a reproduction relative to the demonstration.
 _JERK = 1e-2
@@ -90,8 +91,8 @@ def approach_deviation(
 ) -> float:
     """Largest distance of an approach from the demonstrated one, shifted to the goal [m].
 
-    Approaches run along -y, because the boards open towards +y. They are compared sideways and
-    in height at the same depth, so that different shelves can be compared.
+    Approaches run along -y, because the boards open towards +y. Their sideways and vertical
+    distance at equal depths is measured, so that different shelves can be compared.
 
     Args:
         path: Path of the end effector [m].
@@ -256,7 +257,7 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
         ),
         Metric("reproduction, joint RMSE", _joint_rmse, "deg", at_most=2.0),
         *(m.of_part(lambda run: run.outcomes["pose"]) for m in table),
-        # Joint space, for comparison only: the table lists only the rows of single shelves.
+        # Joint space serves only for comparison: the table lists only rows of single shelves.
         *(
             replace(
                 m.of_part(lambda run: run.outcomes["joint"], joint_space, bounded=False),

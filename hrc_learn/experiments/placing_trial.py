@@ -95,7 +95,7 @@ class PlacingScene:
     demonstration: Demonstration
     demonstrated_shelf: str
     correction: PlaceCorrection | None = None
-    """Correction of the arm's measured poses; None: they are taken as true."""
+    """Correction of the arm's measured poses; None: they are not corrected."""
 
     def place(
         self,
@@ -185,7 +185,7 @@ def random_start(
 ) -> Float[Tensor, " joints"]:
     """Random joint positions about home, within the limits and free of contacts [rad].
 
-    Leaves the world there, with its first object in the gripper.
+    Afterwards, the world is in this state, with its first object in the gripper.
 
     Args:
         world: World of the workplace.

@@ -27,10 +27,10 @@ ELBOW = 3
 
 # Time after the end of a pull in which its effect still counts, while the arm moves back [s].
 _AFTER = 1.0
-# Largest lag of the end effector behind its goal [s]: servos lag, and a motion that waits for
-# a limit lags further.
+# Largest lag of the end effector behind its goal [s]: servos lag, and a motion that a limit
+# delays lags further.
 _LAG = 0.5
-# Distance the goal must move within that lag to have a direction [m].
+# Distance that the goal must move within `_LAG` to have a direction [m].
 _LEAST_MOTION = 0.002
 # Orientation of a held object in the hand: its x axis along the closing direction of the
 # fingers, which is the y axis of the hand, its top towards the palm.
@@ -275,18 +275,18 @@ def pull_effects(
     chain: SerialChain,
     encoder_offset: Float[np.ndarray, " joints"] | None = None,
 ) -> list[PullEffect]:
-    """Effects of those pulls that acted during a run.
+    """Effects of the pulls that acted during a run.
 
-    While the arm follows a motion or holds its end effector, the path is known, and so is the
-    distance from it. Visual servoing has no path: the grasp offset is measured instead.
+    While the arm follows a motion or holds its end effector, the distance from this path is
+    measured. Visual servoing has no path: the grasp offset is measured instead.
 
     Args:
         log: Log of a work cell.
         pulls: Pulls in the time of the log [s].
         chain: Kinematics of the arm.
-        encoder_offset: Constant errors of the encoders [rad], to compute true distances: the
-            errors act differently where a displaced elbow changes the joints. None: distances
-            as the encoders show them.
+        encoder_offset: Constant errors of the encoders [rad], to compute true distances: a
+            displaced elbow changes the effect of these errors. None: distances as the encoders
+            show them.
     """
     time, joints = log["time"], torch.from_numpy(log["joint_position"])
     tool = chain.forward(joints).position.numpy()
@@ -296,7 +296,7 @@ def pull_effects(
     effects = []
     for pull in pulls:
         elbow, known = [], [math.nan]
-        # Each phase has a path of its own, from which the elbow was displaced.
+        # Each phase has another path, from which the elbow is displaced.
         for phase, end in lasting(log.events):
             rows = (time >= max(pull.start, phase.time)) & (time < min(pull.end + _AFTER, end))
             if not (rows & (time < pull.end)).any():

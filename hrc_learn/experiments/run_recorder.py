@@ -45,7 +45,7 @@ from hrc_learn.viz.film import Picture, annotated, camera_inset, draw_run, film_
 from hrc_learn.viz.report import Film
 
 # Joint, counted from 1, whose frame is at the elbow of an arm with seven joints: the person
-# takes hold of the arm there (paper, Experiment 3).
+# grips the arm there (paper, Experiment 3).
 _PUSHED = 4
 # Null-space input below which no push is shown [N m], and length of a push's arrow [m].
 _NO_PUSH, _ARROW = 0.5, 0.45
@@ -58,7 +58,7 @@ LONGEST = 16.0
 """Longest film [s]; a longer run is shown faster."""
 
 _EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
-_EXTENT = 0.8  # a job of smaller extent, such as the SO-101's, is shown from nearer [m]
+_EXTENT = 0.8  # the camera is nearer to a job of smaller extent, such as the SO-101's [m]
 _FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
 
 _CAPTIONS: dict[str, str] = read_toml(Path(__file__).with_name("film_captions.toml"))

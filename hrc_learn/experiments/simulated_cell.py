@@ -92,7 +92,7 @@ def access_by(
         raise ValueError(f"{text} simulate without a driver.")
 
     def connected(address: str) -> Any:
-        # No real-time check: a server that waits for each answer does not need it.
+        # No real-time check: the simulated server waits for each answer.
         if driver == "franky":
             # The grip force of the simulated gripper.
             config = FrankyConfig(realtime=False, grip_force=40.0, dynamics=dynamics)

@@ -92,8 +92,9 @@ OBJECT_REACH = (0.10, 0.08, 0.0)
 OBJECTS_REACH = (0.12, 0.10)
 """Largest distance of several objects from the middle of the table along x and y [m]."""
 
-# Distance between objects at which the open fingers around one clear the other in any
-# orientation [m]: 0.06 m to the outside of a finger, 0.046 m to the farthest object corner.
+# Distance between two objects at which open fingers around one of them do not touch the other,
+# in any orientation [m]: 0.06 m to the outside of a finger, 0.046 m to the farthest object
+# corner.
 _APART = 0.118
 # Largest number of arrangements of the objects that are tried.
 _ARRANGEMENTS = 10_000
@@ -236,7 +237,7 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
         radius = torch.from_numpy(worker.radius)
 
         def is_clear(ends: Float[np.ndarray, "time parts 2 3"], radius=radius) -> bool:
-            """True if the body stays clear of the arm that waits, as people do."""
+            """True if the body stays clear of the waiting arm, as people do."""
             there = torch.from_numpy(turned_about_base(ends, np.pi / 2))
             apart = segment_distance(links, there.unsqueeze(-4))
             return bool((apart >= arm.radius[:, None] + radius + _KEPT_CLEAR).all())
@@ -258,7 +259,7 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
         if is_clear(visit.capsules_at(on_the_way).ends):
             return visit.turned(np.pi / 2)
     raise ValueError(
-        f"none of {number} workers can reach under the arm that waits over "
+        f"none of {number} workers can reach under the arm, which waits over "
         f"({workplace.table_centre[0]:g}, {workplace.table_centre[1]:g}) m, its forearm "
         f"{z - c - half_c:.2f} m above the table: move the table's centre away from the arm's "
         "base, or choose an arm with a higher elbow (panda, ur5e, iiwa7 or gen3)."
@@ -414,7 +415,7 @@ class GivingPerson:
         self.update()
 
     def begin(self, time: float) -> None:
-        """Let the person come from this time on [s]."""
+        """Start the hand-over at a time [s]; the person enters 1 to 3 s later."""
         if not self._begun:
             self.hand_over = self.hand_over.starting(time - 1e6)
             self._begun, self._start = True, self._tool()

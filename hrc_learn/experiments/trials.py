@@ -13,8 +13,8 @@ import torch
 from hrc_learn.distributed import ByValue, worker_pool
 from hrc_learn.store import Claim, json_text, naming, new_file, parse_json, sync_file
 
-# Keys of a line of the file: one JSON object per trial. The first line of the file holds the
-# settings under the last key, so that results of different settings never mix.
+# Keys of a line of the file: one JSON object per trial. The first line of the file has the
+# settings under the key `_MADE_BY`, so that results of different settings never mix.
 _SEED, _FAILURE, _MADE_BY = "seed", "failure", "made_by"
 
 

@@ -442,7 +442,8 @@ class MujocoArm:
         """Advance the servos' reference by one physics step.
 
         The reference is ahead of each joint by at most the error at which the joint's servo
-        saturates. So a joint that a contact blocked does not make up for the missed motion.
+        saturates. A joint that was blocked by a contact therefore does not catch up on the
+        missed motion.
         """
         q = self._data.qpos[self.joints]
         dt = self._model.opt.timestep

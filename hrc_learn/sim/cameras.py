@@ -356,7 +356,7 @@ class OcclusionInterval:
 
 
 class ScriptedOcclusion:
-    """Holds a board between the camera and a marker, wherever the marker moves."""
+    """Keeps a board between the camera and a marker, even while the marker moves."""
 
     def __init__(self, world: World, intervals: Sequence[OcclusionInterval]):
         self._world, self._intervals = world, tuple(intervals)

@@ -40,8 +40,8 @@ UNHURRIED = HumanSpeeds(reaching=0.9)
 takes about a second.
 """
 
-# The object is held out at this distance from the bench's edge (`_OVER_BENCH`) and this height
-# above the bench [m]: a forearm's length over the bench, at the height of the elbow.
+# Distance from the bench's edge (`_OVER_BENCH`) and height above the bench at which the object
+# is held out [m]: a forearm's length over the bench, at the height of the elbow.
 _OVER_BENCH, _HEIGHT = (0.26, 0.42), (0.24, 0.36)
 # `_ASIDE`: range of the object's x relative to the worker, with -x to the worker's right [m].
 # `_WITHIN`: range of the object's x that the robot reaches well [m].

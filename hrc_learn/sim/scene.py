@@ -237,7 +237,7 @@ class SceneConfig:
     objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)
     camera: CameraModel = field(default_factory=overhead_camera)
     obstacles: tuple[Box, ...] = ()
-    """Obstacles that people put in the way and take away again (`World.move_obstacle`)."""
+    """Obstacles that people put in the way and remove again (`World.move_obstacle`)."""
     worker: WorkerConfig | None = None
     """Worker at the table (`World.move_worker`); None: no worker."""
     look: UnmarkedLook | None = None

@@ -153,7 +153,7 @@ class Worker:
         return np.array([[x, y, z], [x, -y, z]])
 
     def standing(self) -> Posture:
-        """Posture of a person who stands upright at the origin with hanging arms."""
+        """Posture of a person at the origin, standing upright with hanging arms."""
         zero = np.zeros(())
         return Posture(
             place=np.zeros(2),
@@ -292,7 +292,7 @@ def _two_links(
     second: np.ndarray,
     bent_to: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint and end of two links from a start towards an end, as near to it as they reach."""
+    """Joint and end of two links that reach from a start as near to an end as they can."""
     way = end - start
     distance = np.linalg.norm(way, axis=-1, keepdims=True)
     towards = way / distance

@@ -46,7 +46,8 @@ class HumanSpeeds:
 
     def drawn(self, rng: np.random.Generator) -> HumanSpeeds:
         """Speeds of one visit: 50 to 95 % of these largest speeds."""
-        # A margin remains: the body also sways up and down, and elbows may outrun hands.
+        # The margin is for the body, which sways up and down, and for elbows, which may be
+        # faster than hands.
         return HumanSpeeds(
             walking=rng.uniform(0.6, 0.9) * self.walking,
             reaching=rng.uniform(0.5, 0.85) * self.reaching,
@@ -138,7 +139,7 @@ class WorkerVisit:
         turns = vigour * np.minimum(np.abs(change[..., 2]), 1.0)
         stride = walks * self.step / 2 * np.sin(phase)
         hands = row[..., 4:].reshape(*row.shape[:-1], 2, 3).copy()
-        # Arms swing against the legs, but only a little: a hand may carry something.
+        # Arms swing opposite to the legs, but only a little: a hand may carry an object.
         hands[..., 0, 0] -= 0.15 * stride
         hands[..., 1, 0] += 0.15 * stride
         return Posture(
@@ -267,7 +268,7 @@ class BenchScript(PoseWriter):
         self._worker, h = worker, worker.config.stature
         self.top = bench.centre[2] + bench.half_size[2]
         self.edge = bench.centre[1] + bench.half_size[1]
-        # As near to the bench as the body allows.
+        # Distance at which the body is clear of the bench.
         y = self.edge + 0.1 * h
         self.stand = np.array([rng.uniform(*across), y + rng.uniform(0, 0.05)])
         self.facing = -np.pi / 2 + rng.uniform(-sway, sway)
@@ -413,7 +414,7 @@ def _marker(
     """A reachable point around the arm's working point, low over the bench [m]."""
     middle = np.array([*under, script.top])
     for _ in range(_MARKERS_TRIED):
-        # To either side of the gripper that hovers there: a hand cannot reach through it.
+        # A hand cannot reach through the gripper that hovers there, but to either side of it.
         x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
         point = middle + np.array([x, rng.uniform(-0.10, 0.12), HAND_OVER_BENCH])
         target = script.own(point)

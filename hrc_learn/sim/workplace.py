@@ -57,7 +57,7 @@ _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
 _DOWN = -0.3
 # Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
-# A layout of at least this quality is taken without evaluating others.
+# A layout of at least this quality is used without evaluating others.
 _ENOUGH = 0.3
 _UNSEEN = 10.0  # loss of quality per fraction of poses without a view of the marker
 # `_POSTURES`: number of postures considered at home, and above the table.
@@ -186,7 +186,7 @@ class Workplace:
         return replace(self, hover_orientation=(w, x, y, z))
 
     def hover_joints(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table, with the upper arm well off the vertical.
+        """Joint positions above the table, with the upper arm far from vertical.
 
         With the upper arm upright, the axes of joints 1 and 3 coincide and the elbow cannot be
         pulled.
@@ -285,7 +285,7 @@ class Workplace:
                 f"the boards: an object of {2 * a:g} x {2 * c:g} m stands on them for x from "
                 f"{left:g} to {right:g} m and depths from {front:g} to {back:g} m."
             )
-        # Grasped from above, an object lies on its side once the end effector is level.
+        # An object that was grasped from above lies on its side when the end effector is level.
         height = cabinet.shelves[name] + b + self.clearance
         position = _vector(self.shelf_x, cabinet.front - self.shelf_depth, height)
         return Pose(position, coarse_orientation(position, self.level_at))
@@ -540,7 +540,7 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
     best: CellLayout | None = None
     for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
         home, quality = at_home[k], float(to_shelves[k])
-        # Among postures above the table that are good enough, the nearest to home is taken.
+        # Of the postures above the table that are good enough, use the nearest to home.
         nearest = sorted(above, key=lambda pair: float((pair[0] - home).abs().max()))
         for hover, marked in nearest if quality > 0 else ():
             between = torch.lerp(home, hover, torch.linspace(0, 1, 25).double()[:, None])

@@ -330,8 +330,8 @@ class World:
     ) -> list[Touch]:
         """Touches of arm and cabinet, table or itself along a path of joint positions.
 
-        Purely geometric: nothing is simulated and the world stays as it is. Times in the
-        touches are sample numbers.
+        The test is purely geometric: nothing is simulated, and the world does not change. Times
+        in the touches are sample numbers.
 
         Args:
             path: Joint positions [rad].

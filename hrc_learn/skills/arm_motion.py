@@ -20,7 +20,7 @@ from hrc_learn.skills.person_watch import PersonWatch
 # Mean angular speed on a straight line, if the rotation takes longer than the translation
 # [rad/s].
 _TURNING_SPEED = 0.6
-# Steps of Newton's method. Each step doubles the number of correct digits, so these reduce an
+# Steps of Newton's method. Each step doubles the number of correct digits. Four steps reduce an
 # error of 1 cm to below 1e-9 m.
 _ITERATIONS = 4
 
@@ -177,7 +177,7 @@ class PositionServo:
     def follow(
         self, target: Float[np.ndarray, " joints"]
     ) -> tuple[ArmState, Float[np.ndarray, " joints"]]:
-        """Command the velocity that reaches the target within dt, or comes nearer to it.
+        """Command a velocity that reaches the target within dt, if the limits allow it.
 
         The caller lets dt pass before the next call.
 

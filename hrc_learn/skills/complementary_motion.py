@@ -30,12 +30,12 @@ from hrc_learn.skills.step_report import PersonFeedback
 
 # Longest step of the loop between two actions of the policy [s].
 _STEP = 0.01
-# A push ends at this distance from a joint limit, which leaves the rest to the policy [rad].
+# A push ends at this distance from a joint limit [rad]. Only the policy may move closer.
 _LIMIT_MARGIN = 0.05
-# Fraction of the limits of acceleration and jerk that the loop uses. The correction of the end
-# effector at the end of each step needs the rest.
+# Fraction of the limits of acceleration and jerk that the loop uses. The rest is for the
+# correction of the end effector at the end of each step.
 _EFFORT = 0.9
-# Time after which joints that find no way back in the null space return directly [s].
+# If the joints cannot return in the null space, they return directly after this time [s].
 _DIRECT_RETURN_AFTER = 5.0
 # Joints within this distance of the policy's posture count as being in that posture [rad].
 _SAME = 1e-6
@@ -115,7 +115,7 @@ class ComplementaryMotion:
         self.offset_velocity = still
         self._state = self._loop.initial_state(still)
         # Queue of the policy's postures and gripper openings; the present one comes first.
-        # While the motion waits, further ones gather behind it.
+        # While the motion waits, the queue grows.
         self._wishes: deque[tuple[Tensor, float]] = deque()
         self._progress = 0.0
 
@@ -180,7 +180,7 @@ class ComplementaryMotion:
         """Add a posture [rad] and a gripper opening [m] of the policy to the queue."""
         behind = len(self._wishes) > 1 and not self.waits
         if behind and float((wish - self._wishes[0][0]).norm()) < _MET_AGAIN:
-            # The policy has waited, too, or has ended: there is nothing to catch up.
+            # The policy has waited, too, or has ended: skip the queue.
             self._wishes, self._progress = deque([self._wished()]), 0.0
         self._wishes.append((wish, width))
 
@@ -230,7 +230,7 @@ class ComplementaryMotion:
             (self._wishes, self._progress), q = queue, joints
             state = self._stopped(state)
         if state.path.direct_return.blocked:
-            # The return is tried again later. Meanwhile the person can push the arm free.
+            # Try the return again later. Meanwhile the person can push the arm free.
             direct, none = DirectReturn.none(q), torch.zeros_like(state.path.waited)
             state = replace(state, path=replace(state.path, direct_return=direct, waited=none))
         back = float((q - self._wished()[0]).abs().max()) < _SAME and not state.aside
@@ -271,7 +271,7 @@ class ComplementaryMotion:
     def _comes_too_near(
         self, joints: Float[Tensor, " joints"], reached: Float[Tensor, " joints"]
     ) -> bool:
-        """True if a step reduces the clearance, and to less than the configured clearance.
+        """True if a step reduces the clearance, and the new one is below the configured one.
 
         Args:
             joints: Joint positions before the step [rad].

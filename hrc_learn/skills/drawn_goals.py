@@ -135,7 +135,7 @@ class DrawnGoalsState:
     drawing: Drawing = _NOTHING
     """Newest drawing."""
     active: Drawing = _NOTHING
-    """Drawing that replaces the planned region; empty: the plan holds."""
+    """Drawing that replaces the planned region; empty: the planned region is used."""
     away: bool = False
     """True if the active drawing is away from the planned region, so that the task waits."""
     changed: float = -math.inf
@@ -183,8 +183,8 @@ class DrawnGoals:
         drawing = Drawing(human.region, human.target)
         waited = time - state.changed >= self._config.settling
         if drawing != state.drawing:
-            # The first of several changes is applied immediately, and so is the removal of a
-            # drawing.
+            # The first of several changes, and the removal of a drawing, are applied
+            # immediately.
             state = replace(state, drawing=drawing, changed=time, checked=False)
             if waited or not drawing:
                 return self._checked(state, planned)

@@ -375,7 +375,7 @@ class Grasping:
         self._cell.move_straight(height, speed=DESCENT_SPEED)
         move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
-            # The fingers may have touched something else than the table: forget its height.
+            # The fingers may have touched an object instead of the table: forget its height.
             self._table = 0.0, self._size * _TABLE_RANGE
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Check that {item.name!r} is under its "

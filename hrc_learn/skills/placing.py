@@ -218,8 +218,8 @@ class PlacingSkill:
     joint: JointDMP
     """Motion of the joints."""
     pose: PoseDMP
-    """Motion of the end effector and, for arms that have one, of the arm angle: the posture in
-    the null space."""
+    """Motion of the end effector; for Franka's arms, also of the arm angle, which sets the
+    posture in the null space."""
     robot: Arm
     """Arm of the primitives."""
 
@@ -352,7 +352,7 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
         carried: Object in the gripper.
 
     Raises:
-        BlockedPathError: The plan leaves a limit or collides; the message says where.
+        BlockedPathError: The plan exceeds a limit or collides; the message says where.
     """
     limits, names = plan.chain.limits, plan.chain.joint_names
     path = torch.from_numpy(plan.path)

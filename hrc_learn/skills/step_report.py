@@ -73,8 +73,7 @@ class PersonFeedback:
     """Collects the feedback of each step to the person that guides an arm.
 
     Causes that keep the arm from following the person are collected over one step. Each cause
-    keeps a fraction of the motion that the previous causes have left; the arm follows the
-    product of all fractions.
+    reduces the motion by a factor; the product of all factors is the fraction that remains.
     """
 
     def __init__(self, chain: SerialChain):

@@ -80,8 +80,8 @@ class VisualServoConfig:
     probe_tolerance: float = 30.0
     """Distance of the feature from the target at which a probe begins its descent [px]."""
     probe_aside: float = 0.0
-    """Distance in the image by which all probes but the first are shifted, roughly towards its
-    middle [px]. Motions across the image and in depth together show the camera's tilt."""
+    """Distance by which all probes but the first are shifted, roughly towards the middle of the
+    image [px]. Motions across the image and in depth together show the camera's tilt."""
     max_probes: int = 6
     """Largest number of probes."""
     border: float = 80.0
@@ -179,7 +179,7 @@ class VisualServoConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoTarget:
-    """Pose that the end effector servos to, with all that determines its target pixel."""
+    """Pose that the end effector servos to, with the quantities that determine its pixel."""
 
     config: VisualServoConfig
     above: Pose
@@ -196,7 +196,7 @@ class ServoTarget:
     turn_range: tuple[float, float] = (0.0, 0.0)
     """Smallest and largest turn of the gripper about the vertical [rad]."""
     orientation: Float[Tensor, "4"] | None = None
-    """Orientation of the end effector, turned for the object; None: orientation of `above`."""
+    """Orientation of the end effector, aligned with the object; None: that of `above`."""
     rest: Float[Tensor, " joints"] | None = None
     """Posture to which the null space returns [rad]; None: the null space does not return."""
     raised: float = 0.0
@@ -249,7 +249,7 @@ class ServoTarget:
 
     @property
     def tool_orientation(self) -> Float[Tensor, "4"]:
-        """Orientation of the end effector: turned for the object, or else that of `above`."""
+        """Orientation of the end effector: aligned with the object, or that of `above`."""
         return self.above.orientation if self.orientation is None else self.orientation
 
 
@@ -543,8 +543,9 @@ class ServoStep:
         """
         target = self._oriented(state, target, state.goal_orientation)
         if state.arrived:
-            # A person's pull, or a turn for the object, may move the joints far from the
-            # posture. The approach must not start again then, even with the marker out of view.
+            # A person's pull, or a turn that aligns the gripper with the object, may move the
+            # joints far from the posture. The approach must not start again then, even with the
+            # marker out of view.
             target = replace(target, posture=None)
         planned = target.goals(state.camera, reading.pose, detected=state.detected)
         pushed = reading.effort.any()
@@ -638,8 +639,8 @@ class VisualServo:
             duration: Duration [s].
         """
         end = self._cell.time + duration
-        # The camera estimate keeps learning, but must not move the target during the hold. A
-        # turn by the person still moves the target.
+        # New images improve the camera estimate, but must not move the target during the hold.
+        # A turn by the person still moves the target.
         self._read()
         held = replace(target, kept_camera=self.state.camera)
         self.state = replace(
@@ -656,10 +657,10 @@ class VisualServo:
         return self._law.pixel_error(self.state, self._read(), target)
 
     def orientation(self, unturned: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
-        """Orientation of the end effector for the object, turned further by the person.
+        """Orientation of the end effector aligned with the object, turned by the person.
 
         Args:
-            unturned: Orientation of an end effector that is not turned for an object.
+            unturned: Orientation to use if the gripper is not aligned with an object.
         """
         wanted = self.state.wanted_orientation
         return quaternion.multiply(

@@ -90,8 +90,8 @@ class MarkerAngle:
             reference: Orientation of a tool that is not turned.
             now: Present turn of the tool [rad].
             turn_range: Smallest and largest turn [rad]. Turns that differ by half turns are
-                equivalent. Of those in the range, the turn nearest to `now` is chosen; if none
-                is in the range, the end of the range nearest to one of them.
+                equivalent. The equivalent turn nearest to `now` in the range is chosen; if none
+                is in the range, the end of the range nearest to an equivalent turn.
             chosen: Turn chosen before [rad]; None: none. Its equivalent is kept until it is
                 well outside the range: otherwise noise would turn the tool back and forth near
                 an end of the range.
@@ -138,7 +138,7 @@ class VisualServoSkill:
     """Approach direction; None if the demonstrations show no object."""
     angle: MarkerAngle | None = None
     """Demonstrated turn of the gripper; None if marker directions were not recorded: the
-    gripper then does not turn for the object."""
+    gripper then does not align with the object."""
     learned: EvidenceResult | None = None
     """Learned RBF centres, noise and prior; None if they were given."""
     landmarks: Landmarks | None = None

@@ -57,9 +57,9 @@ _LONGEST_LAG = 5.0
 # `_AVERAGED`: number of torque readings that are averaged. `_GETTING_UNDER_WAY`: number of
 # steps until the arm has overcome friction.
 _AVERAGED, _GETTING_UNDER_WAY = 5, 25
-# `_LEAVING`: time after a search for contact in which contacts are still expected [s], since
-# the fingers open and the gripper leaves. `_COMING_TO_REST`: longest time in which a stopped
-# arm comes to rest [s].
+# `_LEAVING`: time after a search for contact in which contacts are still expected [s]: the
+# fingers open and the gripper retreats. `_COMING_TO_REST`: longest time for a stopped arm to
+# come to rest [s].
 _LEAVING, _COMING_TO_REST = 1.0, 1.0
 _STILL = torch.zeros(6, dtype=torch.float64)
 
@@ -271,7 +271,7 @@ class WorkCell:
 
     @property
     def reading(self) -> CellReading:
-        """All that a law with a camera in the loop needs for its next step."""
+        """Measurements and requests that a law with a camera needs for its next step."""
         return CellReading(
             time=self.time,
             dt=self.config.dt,
@@ -394,7 +394,8 @@ class WorkCell:
 
         Args:
             goal: Pose at the end, if nothing is met.
-            speed: Mean speed [m/s]. Choose it low: the arm presses on until it has stopped.
+            speed: Mean speed [m/s]. Choose a low speed: after the contact, the arm presses
+                until it has stopped.
             force: Contact force against the motion that counts as a contact [N]. The force is
                 measured relative to its value after the arm got under way, because the estimate
                 also contains friction and an unknown load.
@@ -606,7 +607,7 @@ class WorkCell:
         self._give_up_after(float(self.pace.blocked_for), blocked, "clear its path")
         if self.loop_state.path.direct_return.blocked:
             raise BlockedPathError(
-                "path: the arm was pushed aside and finds no way back that is clear of its "
+                "path: the arm was pushed aside and cannot return without a collision with its "
                 "surroundings."
             )
 
@@ -615,7 +616,7 @@ class WorkCell:
 
         Args:
             waited: Time for which the task has waited [s].
-            blocked: What the task waited for, as the start of the message.
+            blocked: Reason of the wait, as the start of the message.
             cure: What a person can do about it.
         """
         if waited > self.config.longest_wait:

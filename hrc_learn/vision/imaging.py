@@ -77,7 +77,7 @@ class Lens:
     def __init__(self, model: CameraModel):
         self.model = model
         f = max(model.focal)
-        # Two pixels to spare for the interpolation at the edge.
+        # A margin of two pixels for the interpolation at the edge.
         half = f * np.abs(model.to_normalised(model.border())).max(axis=0) + 2.0
         width, height = (2 * np.ceil(half)).astype(int).tolist()
         self.pinhole = replace(
@@ -105,7 +105,7 @@ def pixel_rays(model: CameraModel) -> Float32[np.ndarray, "h w 2"]:
     return _rays((model.height, model.width), model.focal, model.principal, model.distortion)
 
 
-# Cameras of a study differ only in pose, and computing the rays takes half a second.
+# The cameras of a study differ only in pose: reuse the rays, which take half a second.
 @lru_cache(maxsize=4)
 def _rays(
     shape: tuple[int, int],

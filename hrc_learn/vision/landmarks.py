@@ -234,7 +234,7 @@ def match_view(view: Features, seen: Features, width: int) -> Finding | None:
         return None
     kept = inliers.ravel().astype(bool)
     scale = float(np.linalg.norm(map[:, 0]))
-    # One feature found several times is one match.
+    # A feature that was found several times counts once.
     if len({*image[kept].tolist()}) < _FEWEST_MATCHES or not _SCALES[0] < scale < _SCALES[1]:
         return None
     a, b = a[kept], b[kept]

@@ -209,8 +209,8 @@ def angle(corners: Float[np.ndarray, "4 2"]) -> float:
 def _refine(grey: np.ndarray, corners: Corners) -> Corners:
     """Corners moved to the saddle points of the grey levels.
 
-    The window covers the error of the rough corners, but not the next corner, a module away,
-    nor anything that covers the rim of the plate.
+    The search window covers the error of the rough corners. It excludes the next corner, a
+    module away, and objects that hide the rim of the plate.
     """
     import cv2
 

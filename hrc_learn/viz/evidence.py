@@ -22,11 +22,11 @@ class Clause:
     kept: str
     """Description of how the package meets it."""
     parameters: Sequence[Any]
-    """Settings, by the ends of their names; on a page, each with its values in the runs."""
+    """Ends of the names of settings. On a page, the settings with their values in the runs."""
     test: str
     """File of the test that checks it."""
     measured: Sequence[Any]
-    """Names of the metrics; on a page, the measurements of each run."""
+    """Names of the metrics. On a page, the measurements of each run."""
     outside: str
     """Part of the requirement that this package cannot meet."""
 
@@ -82,7 +82,7 @@ def _filled(clause: Clause, reports: Sequence[Report]) -> Clause:
 
 
 def _ending(settings: dict[str, Any], name: str) -> list[Any]:
-    """Values of the settings whose names end in `name`; only those of the work cell, if any."""
+    """Values of the settings whose names end in `name`, only of the work cell if it has any."""
     found = {key: value for key, value in settings.items() if f".{key}".endswith(f".{name}")}
     cell = [value for key, value in found.items() if "cell." in key]
     return cell or list(found.values())

@@ -39,7 +39,7 @@ _NARROW = 3.7
 """Width of a figure for a phone [inch]: 390 pixels, with text as large as the page's."""
 _TITLE = 50  # letters in a line of a title on a phone
 _AROUND = 0.65  # title, ticks and legend of a panel on a phone [inch]
-_SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
+_SURROUNDINGS = 0.22  # boxes are drawn up to this distance from the paths [m]
 
 
 def active_intervals(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:

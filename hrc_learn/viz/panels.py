@@ -36,7 +36,7 @@ class Plot:
     """Quantity with its unit: plots have no axis labels."""
     curves: tuple[Curves, ...]
     range: tuple[float, float] | None = None
-    """Range of the vertical axis; None: that of the data."""
+    """Range of the vertical axis; None: the range of the data."""
     legend: bool = False
     """Show a legend, because the title does not explain the colours."""
     rows: bool = False
@@ -191,7 +191,8 @@ def _primitive(run: RunRecording) -> Tab:
         joint_plot("joints", name, i, run.joint_position, demo, limits)
         for i, name in enumerate(run.joint_names)
     ]
-    # Only the first plot has a legend, which holds for all: the others are too small for one.
+    # The legend of the first plot is valid for all plots, which are too small for a legend
+    # each.
     plots[0] = replace(plots[0], legend=True)
     title = "Joints" if demo is None else "Primitive"
     return Tab(title=title, plots=tuple(plots), columns=2)

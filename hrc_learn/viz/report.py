@@ -209,7 +209,7 @@ def leading(
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
     """Measurements to show first, and the others, both in the order of the table.
 
-    All that missed their targets are shown first; those that met a target fill up the rest.
+    All missed targets come first. Met targets follow, up to `count` measurements.
 
     Args:
         table: All measurements.
@@ -447,7 +447,7 @@ def show_measurements(
     more: int = 0,
     elsewhere: str = "the report",
 ) -> None:
-    """Print measured values with their targets: all that missed, and the first of the others.
+    """Print measured values with their targets: all missed ones, and the first others.
 
     Args:
         table: The values.

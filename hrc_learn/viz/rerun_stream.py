@@ -43,7 +43,7 @@ def rrd_file(
         content = stream.binary_stream()
         try:
             if blueprint is not None:
-                # Active: a viewer in the browser does not show a layout that is only a default.
+                # The layout must be active: the viewer in the browser ignores a default layout.
                 stream.send_blueprint(blueprint)
                 begin(stream, title)
             yield stream

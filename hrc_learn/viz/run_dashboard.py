@@ -51,7 +51,7 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
-        # Frames the path only: with a distant camera in view, the robot would be small.
+        # Show only the path: if a distant camera were in view, the robot would be small.
         eye_controls=frame_view(run.position),
     )
     left: list[rrb.View] = [scene]
@@ -69,7 +69,7 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
     views = [tab_view(tab, span) for tab in tabs]
     right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=views, active_tab=0)]
     if run.phases:
-        # The text contains the time, too: other columns would only make the text narrower.
+        # The text contains the time: a column of times would only make the text narrower.
         text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
         right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
     tabs_and_text = rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)])
@@ -82,8 +82,8 @@ _PATH_RATE = 6.0  # rate at which the growing path is sent again [1/s]
 class RunStream:
     """Sends new data of a run, and its layout.
 
-    One call sends a finished run; repeated calls with longer recordings send a running one. The
-    result is the same.
+    One call sends a finished run; repeated calls with longer recordings send a run in progress.
+    The result is the same.
     """
 
     def __init__(self, stream: rr.RecordingStream, finished: bool = False):
