@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Unpack
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -41,7 +42,7 @@ from hrc_learn.dmp.orientation_error import (
 from hrc_learn.dmp.samples import check_samples, padded
 from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
 from hrc_learn.dmp.ude_formulation import UdePrimitive
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.model_files import SavedModel
 
 
@@ -269,26 +270,27 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         filtered: bool,
         goal_body: Vectors | None = None,
     ) -> tuple[DMPState, Tensor, Tensor]:
-        target, (P, B) = columns.target, self._others
-        if goal is not None:
-            position, rotation = self._parts("goal", goal)
-            moved = None if filtered else self._retarget_numbers(columns, frame, rotation)
-            if moved is None:
-                rotation = unit_quaternion(rotation, frame)
-                new = reference_of(self.motion.goal[..., self.error_columns], rotation)
-                new = new.expand_as(frame)
-                moved = self._to_reference(columns, frame, new, filtered), new
+        P, B = self._others
+        moved = None if filtered else self._retarget_numbers(columns, frame, goal)
+        if moved is not None:
             columns, frame = moved
+        elif goal is not None:
+            position, rotation = self._parts("goal", goal)
+            rotation = unit_quaternion(rotation, frame)
+            new = reference_of(self.motion.goal[..., self.error_columns], rotation)
+            new = new.expand_as(frame)
+            columns, frame = self._to_reference(columns, frame, new, filtered), new
             if position is not None:
-                position = checked_vector("position of goal", position, target[..., P])
-                target = _with_columns(target, P, position)
-        if goal_body is not None:
-            goal_body = checked_vector("goal_body", goal_body, target[..., B])
-            target = _with_columns(target, B, goal_body)
-        return columns, frame, target
+                position = checked_vector("position of goal", position, frame[..., :3])
+                target = _with_columns(columns.target, P, position)
+                columns = replace(columns, target=target)
+        if goal_body is None:
+            return columns, frame, columns.target
+        goal_body = checked_vector("goal_body", goal_body, columns.target[..., B])
+        return columns, frame, _with_columns(columns.target, B, goal_body)
 
     def _retarget_numbers(
-        self, columns: DMPState, frame: Tensor, rotation: Quaternions
+        self, columns: DMPState, frame: Tensor, goal: Value | None
     ) -> tuple[DMPState, Tensor] | None:
         """Columns and reference of one motion for a goal that jumps, computed without tensors.
 
@@ -296,20 +298,30 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             Columns and reference. None where PyTorch has to compute them, or if a value is
             wrong; the computation in PyTorch then reports it.
         """
-        E, motion, parts = self.error_columns, self.motion, (columns.position, columns.rate)
-        if frame.ndim != 1 or type(motion) is not JointDMP or not fits_numpy(frame, *parts):
+        E, motion, posed = self.error_columns, self.motion, isinstance(goal, Pose)
+        given = columns.position, columns.rate, columns.target
+        if goal is None or frame.ndim != 1 or posed != (E.start > 0):
             return None
-        q = to_tensor(rotation, frame.dtype, frame.device)
-        if q.shape != (4,) or not 0.5 < (norm := math.hypot(*q.tolist())) < math.inf:
+        if type(motion) is not JointDMP or not fits_numpy(frame, *given):
             return None
-        offset, q = motion.goal[..., E].tolist(), [x / norm for x in q.tolist()]
-        q = quaternion.product_of_components(exp_numbers(offset), q)
-        e, v = (x.tolist()[E] for x in parts)
-        turned = [x.numpy().copy() for x in parts]
-        for x, new in zip(turned, retarget_numbers(e, v, frame.tolist(), q), strict=True):
-            x[E] = new
-        position, rate = map(torch.from_numpy, turned)
-        return replace(columns, position=position, rate=rate), frame.new_tensor(q)
+        parts = (goal.orientation, goal.position) if posed else (goal,)
+        parts = [to_tensor(x, frame.dtype, frame.device) for x in parts]
+        if [x.shape for x in parts] != [(4,), (3,)][: len(parts)]:
+            return None
+        numbers = [number for x in parts for number in x.tolist()]
+        q, place = numbers[:4], numbers[4:]
+        norm = math.hypot(*q)
+        if not (0.5 < norm < math.inf and math.isfinite(sum(place))):
+            return None
+        offset = motion._buffers["goal"].tolist()[E]
+        q = quaternion.product_of_components(exp_numbers(offset), [x / norm for x in q])
+        y, rate, target = moved = [x.tolist() for x in given]
+        y[E], rate[E] = retarget_numbers(y[E], rate[E], frame.tolist(), q)
+        target[: E.start] = place
+        dtype = frame.numpy().dtype
+        y, rate, target = map(torch.from_numpy, np.array(moved, dtype))
+        columns = replace(columns, position=y, rate=rate, target=target)
+        return columns, torch.from_numpy(np.array(q, dtype))
 
     def _to_reference(
         self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool

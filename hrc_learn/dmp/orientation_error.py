@@ -118,14 +118,15 @@ def retarget_numbers(
 ) -> tuple[Numbers, Numbers]:
     """`retarget` for one motion in Python's numbers, in a fiftieth of the time."""
     angle, axis = _polar(error)
-    between = quaternion.product_of_components(goal, [old[0], *(-x for x in old[1:])])
+    w, x, y, z = old
+    between = quaternion.product_of_components(goal, [w, -x, -y, -z])
     turned = quaternion.product_of_components(between, exp_numbers(error))
     if turned < [0.0] * 4:  # the first component that is not zero becomes positive
         turned = [-part for part in turned]
     sine, own = _polar(turned[1:])
     short = 2 * math.atan2(sine, turned[0])
     own = own if short > _NO_AXIS else axis
-    along = sum(n * e for n, e in zip(own, error, strict=True)) - short
+    along = own[0] * error[0] + own[1] * error[1] + own[2] * error[2] - short
     half = short / 2 + math.pi * round(along / (2 * math.pi))
     # v is minus the angular velocity; see `drift_free_rate` and `axis_drift`.
     slant = (math.cos(angle) - 1) / angle if angle else 0.0
@@ -138,23 +139,27 @@ def retarget_numbers(
 
 def exp_numbers(v: Numbers) -> Numbers:
     """Unit quaternion of a rotation vector [rad]."""
-    angle, axis = _polar(v)
-    return [math.cos(angle / 2), *(math.sin(angle / 2) * n for n in axis)]
+    angle, (x, y, z) = _polar(v)
+    sine = math.sin(angle / 2)
+    return [math.cos(angle / 2), sine * x, sine * y, sine * z]
 
 
 def _polar(v: Numbers) -> tuple[float, Numbers]:
     """Length and direction of a vector; a zero vector has the direction zero."""
-    length = math.hypot(*v)
-    return length, [x / length for x in v] if length else v
+    x, y, z = v
+    length = math.hypot(x, y, z)
+    return length, [x / length, y / length, z / length] if length else v
 
 
 def _stretched(v: Numbers, axis: Numbers, across: float, turn: float) -> Numbers:
     """Scale the part of v perpendicular to a unit axis by `across`, and add turn (axis x v)."""
     (x, y, z), (a, b, c) = v, axis
     along = (1 - across) * (a * x + b * y + c * z)
-    cross = (b * z - c * y, c * x - a * z, a * y - b * x)
-    parts = zip(v, axis, cross, strict=True)
-    return [across * x + along * n + turn * k for x, n, k in parts]
+    return [
+        across * x + along * a + turn * (b * z - c * y),
+        across * y + along * b + turn * (c * x - a * z),
+        across * z + along * c + turn * (a * y - b * x),
+    ]
 
 
 def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4"]:

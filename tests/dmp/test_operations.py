@@ -1,0 +1,31 @@
+"""Operations that PyTorch carries out, which no load on the machine changes."""
+
+import math
+
+import pytest
+import torch
+from demo_motions import minimum_jerk
+from operations import count_operations
+from unchecked import shapes_unchecked
+
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.geometry import Pose, quaternion
+
+S = torch.linspace(0, 1, 200, dtype=torch.float64)
+COLUMNS = minimum_jerk(S)[:, None] * torch.tensor([0.4, -0.2, 0.1], dtype=torch.float64)
+TURNED = quaternion.exp(COLUMNS)
+ASIDE = torch.tensor([math.cos(0.1), 0.0, math.sin(0.1), 0.0], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", ["joint", "orientation", "pose"])
+def test_a_new_goal_adds_few_operations_to_a_step(kind):
+    dmp, goal = {
+        "joint": lambda: (JointDMP.fit(2 * S, COLUMNS, 20), COLUMNS[-1] + 0.1),
+        "orientation": lambda: (OrientationDMP.fit(2 * S, TURNED, 20), ASIDE),
+        "pose": lambda: (PoseDMP.fit(2 * S, COLUMNS, TURNED, 20), Pose(COLUMNS[-1], ASIDE)),
+    }[kind]()
+    with torch.no_grad(), shapes_unchecked():
+        state = dmp.step(dmp.initial_state(), 0.5)
+        without = count_operations(lambda: dmp.step(state, 1e-3))
+        new = count_operations(lambda: dmp.step(state, 1e-3, goal=goal))
+    assert new <= 1.4 * without
