@@ -23,10 +23,11 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from mujoco import MjData, MjModel, mj_stateSize, mjtState, rollout
 from rich.console import Console
 from rich.table import Table
@@ -34,6 +35,8 @@ from torch import Tensor, nn
 
 from hrc_learn import cli
 from hrc_learn.dmp import MotionHead
+from hrc_learn.viz import palette
+from hrc_learn.viz.figures import STYLE, WIDTH
 
 # MuJoCo's classes are compiled, and its stubs leave most of them out.
 # pyright: reportAttributeAccessIssue=false
@@ -317,12 +320,21 @@ def draw(
     curves: dict[str, Float[np.ndarray, "seeds points"]], args: Args, picture: Path
 ) -> None:
     """Learning curves with intervals of the mean."""
-    figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), layout="constrained")
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 2.8))
+        _draw_curves(figure, curves, args)
+        figure.savefig(picture, dpi=120)
+
+
+def _draw_curves(
+    figure: Figure, curves: dict[str, Float[np.ndarray, "seeds points"]], args: Args
+) -> None:
+    axes = figure.subplots(1, 2)
     for axis, kind, total in (
         (axes[0], "policy", args.iterations * args.episodes * STEPS),
         (axes[1], "CMA-ES", args.search_episodes * STEPS),
     ):
-        for name, color in (("MotionHead", "tab:blue"), ("ProDMP", "tab:orange")):
+        for name, color in (("MotionHead", palette.BLUE), ("ProDMP", palette.ORANGE)):
             runs = curves[f"{kind}, {name}"]
             steps = np.linspace(0, total / 1e6, runs.shape[1])
             middle = runs.mean(0)
@@ -331,14 +343,11 @@ def draw(
             axis.fill_between(steps, middle - width, middle + width, color=color, alpha=0.2)
         axis.set_xlabel("environment steps [million]")
         axis.set_ylabel("return [m]")
-        axis.grid(alpha=0.3)
-    axes[0].set_title("policy over all contexts, held-out contexts")
-    axes[1].set_title("CMA-ES, one context at a time, best so far")
+    axes[0].set_title("Policy, held-out contexts")
+    axes[1].set_title("CMA-ES, one context, best so far")
     low = min(runs.mean(0)[len(runs.T) // 20] for key, runs in curves.items() if "CMA" in key)
     axes[1].set_ylim(1.1 * low, 0)
     axes[0].legend(loc="lower right")
-    figure.savefig(picture, dpi=110)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

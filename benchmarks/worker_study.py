@@ -120,6 +120,8 @@ class Args:
     """Folder for the figures and the picture."""
     overwrite: bool = False
     """Replace that folder."""
+    figure: Path | None = None
+    """Receives the picture, as .png or .svg."""
     json: Path | None = None
     """Receives the figures as one flat object."""
 
@@ -161,6 +163,8 @@ def main(args: Args) -> int:
         with new_folder(args.out, asdict(args), args.overwrite) as folder:
             write_json(folder / "metrics.json", figures)
             draw(folder / "worker.png", study)
+    if args.figure is not None:
+        draw(args.figure, study)
     if args.json is not None:
         cli.write_json(args.json, figures)
     return int(

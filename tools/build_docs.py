@@ -19,6 +19,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+# Also found where a test loads this file.
+sys.path.append(str(Path(__file__).resolve().parent))
+import build_gallery  # pyright: ignore[reportMissingImports]
+
 ROOT = Path(__file__).resolve().parents[1]
 SITE = ROOT / "docs" / "site.yml"
 PACKAGE = "hrc_learn"
@@ -256,6 +260,8 @@ def stage(root: Path, folder: Path) -> list:
     }
     api = reference(root)
     texts |= {f"api/{name}.md": text for name, text in api.items()}
+    if (root / "docs" / "images").exists():
+        texts["gallery.md"] = build_gallery.page(root)
     for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, "utf-8")
@@ -273,6 +279,7 @@ def stage(root: Path, folder: Path) -> list:
     return [
         {"Home": "index.md"},
         {"Tutorial": "tutorial.md"},
+        *([{"Gallery": "gallery.md"}] if "gallery.md" in texts else []),
         {"How-to": section(root, "howto")},
         {"Concepts": section(root, "concepts")},
         {"Reference": packages},

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
+
 from hrc_learn.cli._run import has_screen, write_values
 from hrc_learn.cli.arguments import Report, Show, refuse_given
 from hrc_learn.store import write_text
@@ -77,8 +79,9 @@ def _record(args: Show, out: Path) -> int:
     from hrc_learn.learning.demonstration_dashboard import record_demonstrations
 
     out.parent.mkdir(parents=True, exist_ok=True)
-    shown = _shown(args)
-    seconds = record_demonstrations(out, shown)
+    with Console().status(f"Reading {args.dataset}"):
+        shown = _shown(args)
+        seconds = record_demonstrations(out, shown)
     print(out)
     write_values(args.json, {"episodes": len(shown.demos), "seconds": seconds})
     return 0

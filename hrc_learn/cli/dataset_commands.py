@@ -56,7 +56,8 @@ def import_recordings(args: Import) -> None:
         raise ValueError("name the folder of the new dataset (--out), or give --dry-run")
     template = args.dry_run and args.mapping is not None and not args.mapping.exists()
     options = _import_options(args, None if template else args.mapping)
-    plan = plan_import(args.files, options, _words(args.columns))
+    with Console().status("Reading"):
+        plan = plan_import(args.files, options, _words(args.columns))
     for line in plan.lines(args.actions):
         print(line)
     for warning in plan.meaning.warnings:
@@ -67,7 +68,8 @@ def import_recordings(args: Import) -> None:
     if args.dry_run or args.out is None:
         write_values(args.json, plan.counts())
         return
-    summary = write_plan(plan, args.out, args.robot_type, args.actions)
+    with Console().status(f"Writing {args.out}"):
+        summary = write_plan(plan, args.out, args.robot_type, args.actions)
     print(
         f"{args.out}: {summary['episodes']} demonstrations, {summary['frames']} frames, "
         f"{summary['seconds']:.1f} s"
@@ -118,7 +120,8 @@ def check(args: Check) -> int:
     if not args.dataset.is_dir():  # not an error in the data
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
     robot = ArmChoice(args.robot).arm() if args.robot else None
-    report = check_dataset(args.dataset, columns(args.mapping), args.units, robot)
+    with Console().status(f"Checking {args.dataset}"):
+        report = check_dataset(args.dataset, columns(args.mapping), args.units, robot)
     if report.contract is not None:
         print(*report.contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")
@@ -198,7 +201,8 @@ def repair(args: Repair) -> None:
 
 def merge(args: Merge) -> None:
     """Merge the datasets and print their differences."""
-    report = merge_datasets(args.datasets, args.out, fps=args.fps, videos=args.videos)
+    with Console().status(f"Merging {len(args.datasets)} datasets"):
+        report = merge_datasets(args.datasets, args.out, fps=args.fps, videos=args.videos)
     print(report)
     counts = {name: getattr(report, name) for name in ("episodes", "frames", "tasks")}
     write_values(args.json, counts | {"notes": len(report.notes)})
@@ -231,12 +235,8 @@ def curate(args: Curate) -> None:
         "episodes_cut": sum(d.verdict == "cut" for d in decisions.values()),
     }
     if args.write:
-        report = write_curated(
-            args.dataset,
-            args.folder,
-            decisions,
-            progress=partial(progress, description="Writing"),
-        )
+        writing = partial(progress, description="Writing")
+        report = write_curated(args.dataset, args.folder, decisions, progress=writing)
         values["frames"] = report.frames
         print(report)
     elif decisions:
@@ -302,7 +302,8 @@ def push(args: Push) -> int:
     Raises:
         ValueError: The dataset has errors.
     """
-    report = check_dataset(args.dataset)
+    with Console().status(f"Checking {args.dataset}"):
+        report = check_dataset(args.dataset)
     if report.errors and not args.unsound:
         text = f"{args.dataset} has errors: repair it, or upload it anyway (--unsound). First:"
         raise ValueError(f"{text} {report.errors[0]}")

@@ -58,7 +58,7 @@ def fit_primitives(args: FitPrimitives) -> None:
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(demos)} demonstrations"):
             fitted, metrics = _learn(args, demos, folder)
-        _draw(fitted, args, metrics, folder)
+            _draw(fitted, args, metrics, folder)
         _finish(args, metrics, folder)
     if (args.folder / PAGE).is_file():
         print(f"Report: {shlex.quote(str(args.folder / PAGE))}")

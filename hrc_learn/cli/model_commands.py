@@ -89,7 +89,8 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
         console.print(f"note: the {better} model predicts {channel} instead of the mean")
     for channel in channels:
         motions.require(channel)
-        errors[channel] = motions.error(channel, predict(model, channel, motions, demos))
+        with console.status(f"Predicting {channel} of {len(demos)} demonstrations"):
+            errors[channel] = motions.error(channel, predict(model, channel, motions, demos))
         figures |= errors[channel].summary(channel)
         console.print(_table(channel, demos, errors[channel]))
     if args.out is not None:
@@ -201,9 +202,9 @@ def smooth(args: Smooth) -> None:
         raise ValueError("give --checkpoint, or --limits to write only a file.")
     if args.dataset is None and not args.remove:
         raise ValueError("give --dataset: the limits are taken from its demonstrations.")
-    # LeRobot takes seconds to import.
-    from hrc_learn.lerobot.arm_values import ArmValues
-    from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
+    with Console().status("Importing LeRobot, which takes seconds"):
+        from hrc_learn.lerobot.arm_values import ArmValues
+        from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
 
     if args.remove and args.checkpoint is not None:
         others = ["dataset", "scale", "urdf", "calibration", "degrees", "limits"]
@@ -212,13 +213,9 @@ def smooth(args: Smooth) -> None:
         print(f"limits removed from {args.checkpoint}")
         return
     assert args.dataset is not None
-    limits = gathered_limits(
-        args.dataset,
-        scale=args.scale,
-        urdf=args.urdf,
-        calibration=args.calibration,
-        degrees=args.degrees,
-    )
+    given = {name: getattr(args, name) for name in ("scale", "urdf", "calibration", "degrees")}
+    with Console().status(f"Reading {args.dataset}"):
+        limits = gathered_limits(args.dataset, **given)
     if args.urdf is None and args.calibration is None:
         ends = zip(panda.limits.lower.tolist(), panda.limits.upper.tolist(), strict=True)
         limits = limits.within(dict(zip(ArmValues(panda).joints, ends, strict=True)))

@@ -62,7 +62,8 @@ def play(args: Play) -> int:
         print(f"failed: {error}", file=sys.stderr)
         return 1
     figures = _figures(motion)
-    with new_folder(args.folder, asdict(args), args.overwrite) as folder:
+    writing = Console().status(f"Writing {args.folder}")
+    with new_folder(args.folder, asdict(args), args.overwrite) as folder, writing:
         write_text(folder / "motion.csv", _table(model, robot, motion))
         write_json(folder / "metrics.json", figures)
         if robot is not None:
@@ -146,12 +147,10 @@ def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -
         details={"played by": "hrc play", "model": str(args.model.resolve())},
     ) as writer:
         writer.start_episode(f"played {args.model.name}")
-        for k in range(len(motion.time)):
+        columns = motion.joints, motion.position, motion.orientation, following
+        for q, p, R, command in zip(*columns, strict=True):
             writer.add_frame(
-                joint_position=motion.joints[k],
-                position=motion.position[k],
-                orientation=motion.orientation[k],
-                command_position=following[k],
+                joint_position=q, position=p, orientation=R, command_position=command
             )
         writer.save_episode()
 

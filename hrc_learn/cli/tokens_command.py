@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from rich.console import Console
 
 from hrc_learn.cli._run import with_settings, write_values
 from hrc_learn.cli.arguments import Tokens, refuse_given, sibling
@@ -95,14 +96,15 @@ def tokens(args: Tokens) -> None:
             raise ValueError("hrc tokens report needs --model, a folder of hrc tokens fit")
         tokenizer = MotionTokenizer.load(args.model / MODEL)  # refuses other models
         settings = TokenSettings(**read_made_by(args.model)["settings"])
-        figures = _measured(tokenizer, args.dataset, settings, every)
+        with Console().status("Encoding"):
+            figures = _measured(tokenizer, args.dataset, settings, every)
     else:
         refuse_given(args, ["model"], "belongs to hrc tokens report")
         settings = with_settings(args.config, TokenSettings())
         folder = args.out or sibling(args.dataset, "tokens")
-        with new_folder(
-            folder, asdict(args) | {"settings": asdict(settings)}, args.overwrite
-        ) as out:
+        made_by = asdict(args) | {"settings": asdict(settings)}
+        fitting = Console().status("Fitting a tokenizer")
+        with new_folder(folder, made_by, args.overwrite) as out, fitting:
             kept = [i for i in every if i not in held_out(every, settings.held_out)]
             tokenizer = fit(args.dataset, settings, kept)
             tokenizer.save(out / MODEL)

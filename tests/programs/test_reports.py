@@ -121,6 +121,21 @@ def test_pictures_and_tables_of_the_page_are_refreshed(runs, tmp_path, experimen
     assert picture.size == (1000, 500)
 
 
+def test_pictures_alone_leave_the_table(runs, tmp_path, experiments):
+    page = tmp_path / "page.md"
+    page.write_text(PAGE)
+    args = {"placing": runs[1], "page": page, "images": tmp_path / "images"}
+    experiments.main(experiments.Args(**args, pictures_only=True))
+    assert page.read_text() == PAGE
+    assert (tmp_path / "images" / "placing_paths.png").is_file()
+
+
+def test_pictures_are_those_of_all_pages_of_the_site(runs, tmp_path, experiments):
+    """The page of concepts shows those that the page of results does not."""
+    with pytest.raises(ValueError, match="'null_space_posture' of placing, but the report"):
+        experiments.main(experiments.Args(placing=runs[1], images=tmp_path))
+
+
 def test_lines_keep_their_colours_beside_a_photograph(experiments):
     rng = np.random.default_rng(0)
     photograph = rng.integers(150, 220, size=(300, 400, 3), dtype=np.uint8)

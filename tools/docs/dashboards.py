@@ -3,10 +3,10 @@
 Every recording is served as `hrc show --web` does, opened in a headless Chromium and
 photographed; of a run, each of its tabs.
 
-hrc run collaboration --pulls random --worker --out outputs/beside
-hrc show outputs/placing_demos --out outputs/demonstrations.rrd
-python tools/docs/dashboards.py --run outputs/beside/run.rrd \
-    --demonstrations outputs/demonstrations.rrd
+hrc demo
+python tools/docs/dashboards.py --run outputs/demo/run/run.rrd --tabs story person
+
+`tools/build_gallery.py` lists the commands of all pictures.
 """
 
 import sys
@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Literal
 
 from PIL import Image
 
@@ -39,12 +40,17 @@ REDRAWN = 30.0
 """Until another tab is shown where nothing draws but the CPU [s]."""
 
 
+type Tab = Literal["story", "servoing", "person", "primitive", "safety", "lyapunov"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Args:
     """Which recordings to show; the pictures of others stay as they are."""
 
     run: Path | None = None
     """Of `hrc run collaboration`."""
+    tabs: tuple[Tab, ...] = ("story", "person", "servoing", "safety")
+    """Tabs of the run to photograph."""
     demonstrations: Path | None = None
     """Of `hrc show DATASET --out FILE`."""
     fit: Path | None = None
@@ -65,7 +71,7 @@ def main(args: Args) -> None:
         if recording is None:
             continue
         for suffix, content in _pictures(
-            recording, args.load, TABS[: 6 * (name == "dashboard")]
+            recording, args.load, args.tabs if name == "dashboard" else ()
         ):
             file = args.out / f"{name}{suffix}.jpg"
             file.write_bytes(content)
@@ -73,7 +79,7 @@ def main(args: Args) -> None:
 
 
 def _pictures(
-    recording: Path, load: float, tabs: tuple[str, ...]
+    recording: Path, load: float, tabs: tuple[Tab, ...]
 ) -> Iterator[tuple[str, bytes]]:
     with (
         tempfile.TemporaryDirectory() as profile,
@@ -85,15 +91,18 @@ def _pictures(
         if not tabs:
             yield "", _picture(tab)
         left = float(LEFT)
-        for title in tabs:
-            width = MARGIN + LETTER * len(title)
+        for title in TABS if tabs else ():
+            width, name = MARGIN + LETTER * len(title), title.split()[0].lower()
+            if name not in tabs:
+                left += width
+                continue
             tab.mouse.click(left + width / 2, DOWN)
             # The viewer draws while something moves over it; else a scale stays half drawn.
             for place in ((LEFT + 200, 300), (LEFT + 400, 500), (LEFT / 2, SIZE[1] - 5)):
                 time.sleep(REDRAWN / 3)
                 tab.mouse.move(*place)
             time.sleep(REDRAWN / 3)
-            yield f"_{title.split()[0].lower()}", _picture(tab)
+            yield f"_{name}", _picture(tab)
             left += width
 
 

@@ -1,8 +1,8 @@
 """Refresh the pictures and tables of docs/benchmarks/experiments.md from the folders of runs.
 
-The page decides what is shown: each `images/KIND_NAME.png` in it is made from the picture NAME
-in the report of that kind of run, and the lines between `<!-- KIND measured -->` and
-`<!-- end -->` become the table of what that run measured.
+The pages of docs/ decide what is shown: each `images/KIND_NAME.png` in them is made from the
+picture NAME in the report of that kind of run, and the lines between `<!-- KIND measured -->`
+and `<!-- end -->` of the page become the table of what that run measured.
 
 python tools/docs/experiments.py --placing outputs/placing --grasping outputs/grasping
 
@@ -37,8 +37,10 @@ class Args:
     """Folder of `hrc run grasping`, likewise."""
     collaboration: Path | None = None
     """Folder of `hrc run collaboration`, likewise."""
+    pictures_only: bool = False
+    """Leave the tables of the page as they are."""
     page: Path = PAGE
-    """The page."""
+    """The page; pictures are those of all pages of docs/, or of another page alone."""
     images: Path = DOCS / "images"
     """Folder of the pictures."""
 
@@ -53,10 +55,12 @@ def main(args: Args) -> None:
     if not reports:
         raise ValueError("no run: give --placing, --grasping or --collaboration")
     text = args.page.read_text()
+    pages = sorted(DOCS.rglob("*.md")) if args.page == PAGE else [args.page]
+    shown = "\n".join(page.read_text() for page in pages)
     pictures: dict[str, bytes] = {}
     for kind, report in reports.items():
-        pictures |= shown_pictures(kind, report, text)
-        text = with_table(kind, report, text)
+        pictures |= shown_pictures(kind, report, shown)
+        text = text if args.pictures_only else with_table(kind, report, text)
     for name, content in pictures.items():
         path = args.images / name
         path.parent.mkdir(exist_ok=True)

@@ -127,16 +127,19 @@ def distribution(figure: Figure) -> None:
     ):
         mean, deviation = (x[:, 0].numpy() for x in belief.position(time))
         if belief is known:
-            axes.plot(time, demos.T, color=palette.DEMO, lw=0.8, alpha=0.8)
+            lines = axes.plot(time, demos.T, color=palette.DEMO, lw=0.8, alpha=0.8)
+            lines[0].set_label("demonstrations")
         else:
             samples = belief.sample(8, rng).rollout(time=time).position[..., 0].detach()
-            axes.plot(time, samples.T, color=colour, lw=0.7, alpha=0.6)
+            lines = axes.plot(time, samples.T, color=colour, lw=0.7, alpha=0.6)
+            lines[0].set_label("samples")
             axes.plot(*via, "*", color=palette.LIMIT, ms=12, zorder=6)
-        axes.fill_between(
-            time, mean - 2 * deviation, mean + 2 * deviation, color=colour, alpha=0.2, lw=0
-        )
-        axes.plot(time, mean, color=colour, lw=2)
+        low, high = mean - 2 * deviation, mean + 2 * deviation
+        spread = {"alpha": 0.2, "lw": 0, "label": "± 2 std. dev."}
+        axes.fill_between(time, low, high, color=colour, **spread)
+        axes.plot(time, mean, color=colour, lw=2, label="mean")
         axes.set(xlabel="time [s]", title=title)
+        axes.legend(loc="lower right")
     figure.axes[0].set_ylabel("joint [rad]")
 
 
@@ -162,6 +165,7 @@ def via_points(figure: Figure) -> None:
         axes.plot(*marks.T, "*", color=palette.LIMIT, ms=12, zorder=6)
         ends(axes, path[0], path[-1], palette.RUN)
         plane(axes, title)
+    left.set_ylim(top=0.31)  # the stars whole
 
 
 def context(figure: Figure) -> None:
