@@ -183,12 +183,10 @@ def commands(names: Sequence[str], root: Path) -> list[str]:
 def page(root: Path) -> str:
     """The gallery as Markdown: every picture of a checkout with its commands."""
     texts = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
-    alternative = {
-        file: " ".join(text.split())
-        for page in texts
-        if page.is_file()
-        for text, file in SHOWN.findall(page.read_text("utf-8"))
-    }
+    alternative: dict[str, str] = {}
+    for page in filter(Path.is_file, texts):
+        for text, file in SHOWN.findall(page.read_text("utf-8")):
+            alternative.setdefault(file, " ".join(text.split()))
     lines = ["# Gallery", ""]
     for program in PROGRAMS:
         there = [file for file in program.pictures if (root / IMAGES / file).is_file()]

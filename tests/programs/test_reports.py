@@ -171,6 +171,22 @@ def test_the_film_shows_a_hand_at_the_elbow_while_it_is_pulled():
     assert expert(29.0) == ([], False)  # gone
 
 
+def test_the_film_begins_with_the_person_who_pulls_beside_the_worker():
+    film = load(ROOT / "tools" / "docs" / "readme_film.py")
+    time = np.linspace(0.0, 30.0, 200)
+    push = np.full((200, 2, 3), np.nan)
+    push[(time > 9.9) & (time < 14.1)] = [0.15, 0.15, 0.56], [0.5, 0.0, 0.56]
+    nearest = np.zeros((200, 2, 3))
+    nearest[:, 1, 0] = 0.1 + np.abs(time - 13.0) + 2 * (time < 10.0)
+    times = np.linspace(0.0, 30.0, 61).tolist()
+    alone = sample_run(time=time, push=push, worker_nearest=None)
+    assert film.telling(alone, times) == pytest.approx(12.0, abs=0.5)
+    run = sample_run(time=time, push=push, worker_nearest=nearest)
+    assert film.telling(run, times) == pytest.approx(13.0, abs=0.2)
+    nearest[:, 1, 0] = 1 - 0.5 * (time < 5)  # nearest while nobody pulls
+    assert 9.5 < film.telling(run, times) < 14.5
+
+
 def test_the_film_is_a_picture_that_moves():
     film = load(ROOT / "tools" / "docs" / "readme_film.py")
     levels = [20, 90, 160, 230]

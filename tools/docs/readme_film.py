@@ -1,20 +1,21 @@
 """Film of the README: an expert takes the elbow of the arm while a worker reaches under it.
 
-The program runs the collaboration once and renders its recording: 15 pictures a second, the
-image of the camera first, a close-up of the shelf while the arm carries, and the measured place
-error as the end title. The expert is a force without a body in the simulation.
-The film draws a body whose hand is at the elbow where and while the force acts; worker and arm
-are those of the run.
+The program runs the collaboration once and renders its recording: a title over the most
+telling picture, 15 pictures a second, the image of the camera first, a close-up of the shelf
+while the arm carries, and the measured place error as the end title. The expert is a force
+without a body in the simulation. The film draws a body whose hand is at the elbow where and
+while the force acts; worker and arm are those of the run.
 
 hrc demo
 python tools/docs/readme_film.py --models outputs/demo
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +37,9 @@ from hrc_learn.viz.film import Picture, annotated, camera_inset
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 SIZE = 640, 400
 """Of the pictures [px]."""
-RATE, SECONDS, LAST = 15.0, 15.0, 2.0
-"""Pictures per second [1/s]; durations of the film and of its end title [s]."""
+RATE, SECONDS, FIRST, LAST = 15.0, 15.0, 1.0, 2.0
+"""Pictures per second [1/s]; durations of the film, and of its titles at both ends [s]."""
+TITLE = "A robot arm works with people"
 AFTER_RELEASE = 7.0
 """Time after the release at which the film ends [s]."""
 EYE, TOWARDS = (1.62, 1.42, 1.02), (0.10, 0.06, 0.27)
@@ -83,7 +85,11 @@ def main(args: Args) -> None:
 
 
 def frames(run: RunRecording, ending: str) -> Iterator[Picture]:
-    """Pictures of a run that placed its object, the last ones with an end title."""
+    """Pictures of a run that placed its object, titled at both ends.
+
+    The first one, which is all that some pages show, is from the time at which the person pulls
+    and the worker reaches.
+    """
     width, height = SIZE
     begun = {event.text: event.time for event in run.phases}
     shelf = run.position[np.searchsorted(run.time, begun["release"])]
@@ -95,26 +101,42 @@ def frames(run: RunRecording, ending: str) -> Iterator[Picture]:
     world = RecordedWorld(run)
     end = begun["release"] + AFTER_RELEASE
     with closing(OffscreenRenderer(world, width, height)) as renderer:
-        for time in np.linspace(run.time[0], end, round(RATE * SECONDS)):
+
+        def at(time: float) -> Picture:
             step = int(np.searchsorted(run.time, time))
             world.show(step)
-            body, holds = expert(float(time))
+            body, holds = expert(time)
             legend = [("a worker reaches under the arm", "#336B9E")] if near(run, step) else []
             if holds:
                 legend.append(("a person pulls the elbow aside", palette.PERSON))
             picture = renderer.render(view, body)
             if time < begun.get("home", begun["transfer"]):
-                corner = inset(step, float(time))
+                corner = inset(step, time)
             else:
                 shot = Image.fromarray(renderer.render(close, [])).crop(
                     ((width - height * 4 // 3) // 2, 0, (width + height * 4 // 3) // 2, height)
                 )
                 corner = np.asarray(shot.resize(small))
             clock = f"{time - run.time[0]:.0f} s   {(end - run.time[0]) / SECONDS:.1f} ×"
-            shown = annotated(picture, said(run, step), clock, legend, corner)
+            return annotated(picture, said(run, step), clock, legend, corner)
+
+        times = np.linspace(run.time[0], end, round(RATE * SECONDS)).tolist()
+        yield from repeat(titled(at(telling(run, times)), TITLE), round(RATE * FIRST))
+        for time in times:
+            shown = at(time)
             yield shown
-    for _ in range(round(RATE * LAST)):
-        yield titled(shown, ending)
+    yield from repeat(titled(shown, ending), round(RATE * LAST))
+
+
+def telling(run: RunRecording, times: Sequence[float]) -> float:
+    """Time at which the person pulls, the worker is nearest if one is there [s]."""
+    expert = expert_in(run)
+    pulled = [time for time in times if expert(time)[1]]
+    assert pulled, "somebody pulls in this run"
+    if run.worker_nearest is None:
+        return pulled[len(pulled) // 2]
+    gaps = np.linalg.norm(run.worker_nearest[:, 1] - run.worker_nearest[:, 0], axis=1)
+    return min(pulled, key=lambda time: gaps[np.searchsorted(run.time, time)])
 
 
 def said(run: RunRecording, step: int) -> str:
