@@ -127,7 +127,7 @@ class ArmLoop:
     def observe(
         self, state: ArmLoopState, reading: ArmReading
     ) -> tuple[ArmLoopState, tuple[Limitation, ...]]:
-        """First half of a step: take in a reading.
+        """First half of a step: process a reading.
 
         Args:
             state: State of the step before.

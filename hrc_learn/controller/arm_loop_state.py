@@ -101,7 +101,7 @@ class ArmReading:
     """True while a person pauses the task."""
     load: Float[Tensor, "*batch 3"] | None = None
     """Far end of a load in the frame of the end effector [m]. The cap on the tool's speed also
-    holds there. None: no load."""
+    applies to this point. None: no load."""
     people: WatchedPeople | None = None
     """People near the arm: they slow the arm down, and the safety filter keeps the arm at a
     distance. None: people are not tracked."""
@@ -131,7 +131,7 @@ class PathState:
     twist: Float[Tensor, "*batch 6"]
     """Velocity of `pose` along the path (linear [m/s], angular [rad/s])."""
     blocked: Bool[Tensor, "*batch"]
-    """True if the arm is off its path and would hit something if the path advanced."""
+    """True if the arm is off its path and would collide if the path advanced."""
     narrow_ahead: Bool[Tensor, "*batch"]
     """True if the path comes near a singularity within its stopping distance. The joints cannot
     leave the path near a singularity."""

@@ -137,8 +137,8 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     excess = torch.maximum(a, b)
     wanted = now.pending | (excess > _TOLERANCE)
 
-    # Direction towards the limit along which the active limits stay satisfied, and the rates at
-    # which their multipliers fall on the way.
+    # `z`: direction towards the limit along which the active limits remain satisfied. `lost`:
+    # rates at which their multipliers decrease along this direction.
     p = rows.shape[-2]
     c = side * _column(rows, index)
     passed = _combine(c, now.operators)
@@ -163,7 +163,7 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     square = torch.where(adds, zz, (v * v).sum(-1, keepdim=True))
     scale = torch.where(acts, 1 / torch.where(acts, square, 1.0), 0.0)
     # A rank-one update: the projector loses the direction of an added limit, or gains the
-    # direction of a dropped limit. Either way, the pseudo-inverse becomes orthogonal to it.
+    # direction of a dropped limit. In both cases, the pseudo-inverse becomes orthogonal to it.
     entering = torch.cat([z, lost - enters.to(c.dtype)], dim=-1)
     exiting = torch.cat([-v, _combine(v, now.operators[..., p:])], dim=-1)
     turn = scale * torch.where(adds, entering, exiting)

@@ -288,7 +288,7 @@ class Observation:
     arm. NaN (unknown): stop. None: no person is monitored."""
     load: Float[Tensor, "*batch 3"] | None = None
     """Far end of a load in the frame of the tool centre point [m]. The cap on the tool's speed
-    also holds there. None: no load."""
+    also applies to this point. None: no load."""
     distances: Distances | None = None
     """Distances of the arm from itself, the scene and people, kept by
     `SafetyConfig.constraints`; None: none."""

@@ -138,8 +138,8 @@ def may_not_return(
         error: Path minus joint positions [rad].
         alignment: `return_alignment` of that error.
         waited: True if the path has waited for the joints and they are no longer pushed. The
-            path then goes on only once the joints are well on their way back; otherwise, its
-            motion would move them away again.
+            thresholds are then stricter: if the path continued too early, its motion would move
+            the joints away again.
     """
     waited = torch.as_tensor(waited)
     farthest = torch.where(waited, _NEAR_AGAIN, FAR_ASIDE)
@@ -243,7 +243,7 @@ class DirectReturn:
     active: Bool[Tensor, "*batch"]
     """True while the joints return directly."""
     blocked: Bool[Tensor, "*batch"]
-    """True where the arm would hit something on the way to every sample."""
+    """True where the arm would collide during the return, whichever sample it returns to."""
 
     @classmethod
     def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:

@@ -194,7 +194,7 @@ class PathLaw:
     def _within_limits(
         self, q: Tensor, J: Tensor, task: Tensor, null: Tensor, margin: tuple[Tensor, Tensor]
     ) -> Tensor:
-        """Null-space velocity that leaves the task its margin before the joint limits."""
+        """Null-space velocity reduced so that the task keeps its margin before joint limits."""
         gives_way = null_space_giving_way(J, task, null, *margin)
         gives_way = apply_where(
             (gives_way - null).norm(dim=-1) > 0,

@@ -161,7 +161,7 @@ def saturate_in_null_space(
 
     Returns:
         The shifted velocity [rad/s], which may exceed bounds that the given velocity kept; or
-        the given velocity, if after clamping it comes at least as near to the twist.
+        the given velocity, if its twist after clamping is at least as near to `twist`.
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
     free = cut == task
@@ -230,8 +230,8 @@ def scale_null_space(
     """Scale the null-space velocity as a whole to keep the limits of single joints.
 
     Limiting single joints would move the tool. The factor is the largest from 0 to 1 that keeps
-    the limits. If no factor keeps them, because the task alone is too fast, we take the factor
-    that comes closest.
+    the limits. If no factor keeps them, because the task alone is too fast, we use the factor
+    with the smallest excess.
     (Factors outside this range would let the redundant joints give way to the task, but in
     measurements they drove the elbow fast into the limits near singularities.)
 

@@ -30,7 +30,7 @@ class WantedVelocity:
     """Time until the next step [s]."""
     load: Float[Tensor, "*batch 3"] | None = None
     """Far end of a load in the frame of the tool centre point [m]. The cap on the tool's speed
-    also holds there. None: no load."""
+    also applies to this point. None: no load."""
 
 
 class FilteredVelocity(NamedTuple):

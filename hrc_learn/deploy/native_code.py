@@ -236,7 +236,7 @@ def _units(program: ScalarProgram, *, wide: bool) -> dict[int, Unit]:
             and len({*names}) == 1
             and names[0] not in _SINGLE
             and len({program.boolean[x] for x in xs}) == 1
-            # Only operands with lower numbers: no unit depends on itself.
+            # All operands have lower numbers than the unit, so no unit depends on itself.
             and xs == tuple(range(xs[0], xs[0] + len(xs)))
             and xs[0] > max(map(max, parts))
             and units.keys().isdisjoint(xs)

@@ -73,8 +73,8 @@ class Field:
 class IOLayout:
     """Assignment of a dataclass's tensors to the rows of a vector (rows, *batch).
 
-    The batch axes come last, so that a row in memory is one quantity for all elements of the
-    batch, as vector instructions need it. All numbers have one dtype, and flags are 0 or 1.
+    The batch axes come last: a row in memory is one quantity for all elements of the batch, as
+    vector instructions require. All numbers have one dtype, and flags are 0 or 1.
     """
 
     def __init__(

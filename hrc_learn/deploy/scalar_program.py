@@ -1,10 +1,10 @@
 """Unroll a traced step into straight-line arithmetic on single numbers.
 
 Each element of a tensor gets a value number: the index of the instruction that computes it. So
-each tensor of the trace becomes a tensor of value numbers. On these, PyTorch itself carries out
-the operations that only move elements (views, slices, concatenations). All other operations
-become one instruction per element. Equal instructions are kept once, and instructions on
-constants are evaluated here.
+each tensor of the trace becomes a tensor of value numbers. PyTorch applies the operations that
+only move elements (views, slices, concatenations) to these tensors. All other operations become
+one instruction per element. Equal instructions are kept once, and instructions on constants are
+evaluated here.
 """
 
 import math

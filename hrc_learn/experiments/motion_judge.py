@@ -108,7 +108,7 @@ class CellJudge:
     def begin(self, trial: Trial) -> None:
         """Put the first object on the table, or into the gripper if it is to be placed.
 
-        The other objects of the trial are places, which the simulation does not need.
+        The other objects of the trial mark places, which the simulation does not need.
         """
         self._names, self._places = [*trial.objects], dict(trial.objects)
         if self._holds or not self._names:
@@ -243,7 +243,7 @@ def _function(text: str) -> Callable[[Any, Any], bool]:
     """Function named as MODULE:FUNCTION, from the current folder or an installed package.
 
     Raises:
-        ValueError: There is none.
+        ValueError: There is no such function.
     """
     sys.path.insert(0, str(Path.cwd()))
     try:

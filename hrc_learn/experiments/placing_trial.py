@@ -53,7 +53,7 @@ class SimulatedPlacing(CellRun):
     goal: Pose
     """True pose at which the end effector should release the object."""
     plan: Plan
-    """Plan to the measured pose at the goal."""
+    """Plan that ends at the pose that the arm should read at the goal."""
     object_pose: Float[np.ndarray, "4 4"]
     """Final pose of the object."""
     contacts: tuple[Touch, ...]
@@ -168,7 +168,7 @@ def taught_correction(
     for _ in range(_TEACHING_ITERATIONS):
         joints = world.arm.robot.inverse(measured, near=near).numpy()
         world.reset(joints - errors.encoder_offset)
-        # True pose of the tool, and its error from the guided one.
+        # True pose of the tool, and rotation from there to the guided pose.
         tool = Pose.from_matrix(world.arm.tcp_pose())
         back = quaternion.conjugate(tool.orientation)
         rotation = quaternion.multiply(back, guided.orientation)

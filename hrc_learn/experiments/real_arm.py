@@ -133,7 +133,7 @@ def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[Stop
 
     Raises:
         ValueError: If the site has no address.
-        DriverError: If the arm cannot be reached; says why.
+        DriverError: If the arm cannot be reached; the message gives the reason.
     """
     opened: Callable[[], StoppableArm]
     chain = chain or site.chain

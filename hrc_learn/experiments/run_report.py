@@ -1,6 +1,6 @@
 """Report of a run: sections, and figures like those of the paper's Experiments 2 and 3.
 
-Each figure takes the recording of the run and the time interval of each object, by its name.
+Each figure shows the recording of a run, with the time interval of each object by its name.
 """
 
 from collections.abc import Mapping, Sequence

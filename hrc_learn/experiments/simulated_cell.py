@@ -35,7 +35,8 @@ ArmDriver = Literal["sim", "franky", "franka"]
 
 PROTOCOL_DELAY = 0.003
 """Delay from a command to a driver until the servos receive it [s]: two cycles of the protocol,
-and one because the state that was read is one cycle old. Measured with commands every 10 ms.
+and a third because the state that was read is one cycle old. Measured with commands every 10
+ms.
 """
 
 

@@ -218,7 +218,7 @@ def _left_out(
     """Pairs of links, other than neighbours, that need no check."""
     last = len(chain.joint_names)
     links = sorted({capsule.link for capsule in capsules})
-    # The last link, the flange and the tool are one body; the link before is its neighbour.
+    # The last link, the flange and the tool are one body, a neighbour of the link before it.
     pairs = {
         (i, k) for i, k in combinations(links, 2) if k > last and i >= last - 1 and k - i > 1
     }

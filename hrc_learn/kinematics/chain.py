@@ -1,6 +1,6 @@
 """Serial arms: forward kinematics and geometric Jacobians.
 
-Both have two implementations. In eager mode, matrix products are fast. For compilers, the same
+There are two implementations. In eager mode, matrix products are fast. For compilers, the same
 kinematics are written out number by number: products with the zeros and ones of the arm's
 description are omitted, and each number is a tensor over the batch alone, so the compiler
 fuses everything into one loop over the batch.

@@ -129,7 +129,7 @@ TOOL_LINK = 9
 """Number of the tool centre point's frame, on which the hand is mounted."""
 
 LINK_CAPSULES = link_capsules(_TABLES["capsules"])
-"""Capsules of the links of either arm; the simulated arm is built from the same ones."""
+"""Capsules of the links of both arms; the simulated arm has the same capsules."""
 
 
 def _inertias() -> tuple[Float[np.ndarray, "4 4"] | None, ...]:

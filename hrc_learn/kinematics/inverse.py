@@ -1,9 +1,9 @@
-"""Inverse kinematics of any serial arm, and the redundancy that a pose leaves.
+"""Inverse kinematics of any serial arm, and the null-space posture of redundant arms.
 
 Poses are inverted in batches by damped least squares from many starts. The damping of the
 Levenberg-Marquardt method is the squared error, so that it vanishes at a solution (Sugihara
 2011, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method"). Each
-start of each pose is one row of a batch; rows that have arrived leave the batch. Every
+start of each pose is one row of a batch; converged rows are removed from the batch. Every
 iteration keeps the joint limits. Among the solutions of a pose, the one nearest to a wanted
 configuration is kept and moved further towards it in the null space.
 """
@@ -377,7 +377,8 @@ def _drawn_nearer(
 ) -> Tensor:
     """Solutions moved in the null space towards a wish.
 
-    A solution stays as it is if the motion loses the pose or does not come nearer to the wish.
+    A solution is unchanged if the motion would lose the pose or would not end nearer to the
+    wish.
     """
     moved = q
     for _ in range(15):  # each removes most of the distance that the null space can remove

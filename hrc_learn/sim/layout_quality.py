@@ -144,8 +144,8 @@ def marked_turns(
         for first in range(_HALF_TURN + 1):
             window = slice(first, first + _HALF_TURN + 1)
             seen, least = float(good[window].mean()), float(reached[window].amin())
-            # The fraction of poses with a view counts first, rounded to 1 %. Then the quality
-            # counts, less the distance of this half circle from the middle one.
+            # The first criterion is the fraction of poses with a view, rounded to 1 %. The
+            # second is the quality minus the distance of this half circle from the middle one.
             off_middle = abs(first - _HALF_TURN / 2) / _HALF_TURN
             score = (round(seen, 2), least - off_middle)
             if best is None or score > best[0]:

@@ -91,7 +91,7 @@ def _triple(vector: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-_FARTHEST = 100.0  # distances are measured up to here [m]
+_FARTHEST = 100.0  # largest distance that is measured [m]
 
 
 class NearestPair(NamedTuple):

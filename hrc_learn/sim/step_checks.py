@@ -55,7 +55,7 @@ class ContactMonitor:
         self._model = model
         mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
         self._mover, self._obstacle = mover, obstacle
-        # A table of pairs: one look-up for each contact is all that most steps need.
+        # A table of pairs, so that most steps need only one look-up for each contact.
         self.watched = np.outer(mover, obstacle) | np.outer(obstacle, mover)
         self.touches: list[Touch] = []
         self._running: dict[tuple[int, int], int] = {}

@@ -22,7 +22,7 @@ _HALF_STEP = 1e-4
 # Length of a walking step, as a fraction of the stature; two steps make a stride.
 STEP = 0.40
 HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
-"""Height above the bench of a hand that puts down or takes an object [m]."""
+"""Height above the bench of a hand that puts down or picks up an object [m]."""
 # Range of the distance of markers from the arm's working point, to either side [m].
 _BESIDE_GRIPPER = (0.11, 0.22)
 # Number of places tried for a marker: near an arm, only one in ten may be within reach.

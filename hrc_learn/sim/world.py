@@ -28,8 +28,8 @@ _PADS = ("finger_left_pad", "finger_right_pad")
 _TOUCHING = 1e-4
 # Cosine of the largest angle between the normals of a contact and of a flat face: 3 degrees.
 _FLAT = math.cos(math.radians(3.0))
-# Orientation of an object in the tool's frame: its x lies along the fingers' line of closing,
-# its top towards the gripper.
+# Orientation of an object in the tool's frame: its x axis is parallel to the closing direction
+# of the fingers, and its top points to the gripper.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 # Number of latest touches that `touched_since` searches: more than begin in any control step.
 _REMEMBERED = 64

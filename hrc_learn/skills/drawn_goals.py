@@ -169,7 +169,7 @@ class DrawnGoals:
     def read(
         self, state: DrawnGoalsState, human: HumanInput, planned: Goals, time: float
     ) -> tuple[DrawnGoalsState, str]:
-        """Take in the drawing of a person.
+        """Process the drawing of a person.
 
         Args:
             state: State after the last step.

@@ -164,8 +164,9 @@ class LatencyConfig:
     """Delay and loss of images between the camera and the controller."""
 
     delay: float = 0.0
-    """Time from the exposure of an image until its markers are available [s]. Markers found
-    earlier are held back. The age that a `TimedCamera` reports is a part of this time."""
+    """Time from the exposure of an image until its markers are available [s]. Markers detected
+    in a shorter time are delayed. The age that a `TimedCamera` reports is a part of this
+    time."""
     frame_loss: float = 0.0
     """Fraction of lost images."""
 

@@ -233,7 +233,7 @@ class PlacingSkill:
 
         Raises:
             FileNotFoundError: The folder holds no primitives.
-            ValueError: They are for another arm, or hold no poses.
+            ValueError: The primitives are for another arm, or lack a pose primitive.
         """
         joint = JointDMP.load(folder / "joint").double()
         names = robot.chain.joint_names

@@ -236,7 +236,7 @@ class SyntheticCamera:
         """
         R = self.model.pose[:3, :3].T @ pose[:3, :3]
         t = self.model.to_camera(pose[:3, 3])
-        # [R_x R_y t] takes points of the plate to rays; its inverse takes rays to the plate.
+        # [R_x R_y t] maps points of the plate to rays; its inverse maps rays to the plate.
         to_plate = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t]))
         density, middle = pixels / plate_size, (pixels + 1) / 2
         to_texture = np.array([[density, 0, middle], [0, -density, middle], [0, 0, 1]])

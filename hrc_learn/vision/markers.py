@@ -115,7 +115,7 @@ class MarkerDetector:
 
         self.ids = frozenset(ids)
         parameters = cv2.aruco.DetectorParameters()
-        # One threshold window of 13 px finds as much as the three default windows.
+        # A single threshold window of 13 px finds as many markers as the three default windows.
         parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
         # Lines fitted to the contour keep the rough corners within reach of the refinement.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR

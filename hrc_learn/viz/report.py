@@ -431,7 +431,7 @@ def show_command(path: str | os.PathLike[str]) -> str:
 
 
 def shortest(word: str) -> str:
-    """A word of a command, as a relative path if it names one below the current folder."""
+    """A word of a command; a path below the current folder becomes a relative path."""
     path = Path(word)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else word
 

@@ -213,7 +213,7 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     axis = end - start
     length = np.linalg.norm(axis, axis=1)
     direction = axis / np.maximum(length, 1e-12)[:, None]
-    # A rotation by pi about the bisector of z and the axis takes z to the axis: the quaternion
+    # A rotation by pi about the bisector of z and the axis maps z to the axis: the quaternion
     # is (0, bisector). The small x component chooses the bisector x if both are opposite.
     half = direction + np.array([1e-9, 0.0, 1.0])
     normal = half / np.linalg.norm(half, axis=1, keepdims=True)
