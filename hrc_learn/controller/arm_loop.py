@@ -50,7 +50,7 @@ from hrc_learn.geometry.numerics import everywhere, is_number, null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# If the constraint layer slows the task down by less than this fraction, that is rounding.
+# A smaller reduction of the task's speed by the constraint layer counts as rounding.
 _SLOWED = 1e-3
 # Norm of the whole twist below which the task counts as at rest [m/s and rad/s mixed].
 _AT_REST = 1e-3

@@ -408,7 +408,8 @@ def _limit_rows(
     basis: Tensor, gradient: Tensor | None, m: int, config: ConstraintConfig
 ) -> Tensor:
     """Argument `rows` of `least_change` (unknowns, limits). The columns are the limits of the
-    joints, of the task and of the distances. The last unknown is the distances' common excess.
+    joints, of the task and of the distances. The last unknown is the common excess of the
+    distances.
     """
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
     slower = torch.zeros_like(joints[..., :1])

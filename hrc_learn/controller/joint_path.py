@@ -38,7 +38,7 @@ NARROW = 0.07
 """Lower bound on the smallest singular value of the Jacobian: below it, the joints may not
 leave their path. The damping of the inverse Jacobian begins at 0.05."""
 
-# Distance of the joints from a path that has waited for them, at which it goes on [rad].
+# A path that has waited for the joints continues if their distance from it is below this [rad].
 _NEAR_AGAIN = 1.4
 # Distances from the path [rad]. Below the first, joints return whatever their alignment is.
 # Above the second, the alignment counts in full.
@@ -263,8 +263,8 @@ class DirectReturn:
         config: YieldingConfig,
         clearance: Clearance | None,
     ) -> DirectReturn:
-        """Plan a return to the sample at which the path waits, or, if the arm would hit
-        something on this way, to the nearest sample that it reaches without contact.
+        """Plan a return to the sample at which the path waits. If the arm would collide on this
+        way, plan a return to the nearest sample that it reaches without contact.
 
         Args:
             paths: Table of paths.

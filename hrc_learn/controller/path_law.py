@@ -332,8 +332,8 @@ class PathLaw:
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        # Joints on the path that lag without a push have touched something: they do not count
-        # as aside.
+        # Joints on the path that lag without a push are in contact with an object: they do not
+        # count as aside.
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)

@@ -276,7 +276,7 @@ class PoseDrift:
     jacobian: Float[Tensor, "*batch 6 n"]
     """Jacobian of the last step."""
     planned: Float[Tensor, "*batch 6"]
-    """Motion the task had planned for the last step (linear [m], angular [rad])."""
+    """Motion that the task had planned for the last step (linear [m], angular [rad])."""
     active: Bool[Tensor, "*batch"]
     """True if the drift was measured in the last step; otherwise the other fields may be
     outdated."""

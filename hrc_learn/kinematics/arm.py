@@ -1,7 +1,7 @@
 """A robot arm: its kinematics, limits, shape, gripper and inverse kinematics in one object.
 
 Link frames are those of `SerialChain`, with z along the joint axis. They may differ from the
-frames of the description by a constant rotation, which all mounted parts account for.
+frames of the description by a constant rotation, which is applied to all mounted parts.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class Arm(SerialChain):
 
     @property
     def null_space(self) -> NullSpace:
-        """Self-motion that a full pose of the tool leaves to the joints."""
+        """Self-motion of the joints while the tool keeps its pose."""
         if self.is_franka:
             return "arm angle"
         return "none" if self.joints <= 6 else "free"

@@ -451,7 +451,7 @@ def arm_angle_and_motion(
     direction = orthonormal_basis(jacobian)[..., -1]
     step = _STEP * direction
     angle, after, before = arm_angle(chain, torch.stack([q, q + step, q - step]))
-    # The shorter difference, should the angle wrap around between both ends.
+    # Take the shorter difference if the angle wraps around between both ends.
     difference = torch.remainder(after - before + torch.pi, 2 * torch.pi) - torch.pi
     rate = (difference / (2 * _STEP)).unsqueeze(-1)
     return angle, direction * rate / (rate * rate + _DAMPING)

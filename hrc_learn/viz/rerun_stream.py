@@ -208,7 +208,7 @@ def boxes(shapes: tuple[Box, ...]) -> rr.Boxes3D:
 
 
 def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
-    """Solid capsules, placed by transforms: Rerun's start at the origin and point along z."""
+    """Solid capsules, moved by transforms: in Rerun, capsules start at the origin, along z."""
     start, end = (np.array([getattr(s, at) for s in shapes]) for at in ("start", "end"))
     axis = end - start
     length = np.linalg.norm(axis, axis=1)
