@@ -47,7 +47,7 @@ class Metric[Run]:
     listed: bool = True
     """True if the table of the report has the row; the JSON file always has it."""
     detail: Callable[[Run], str] = lambda run: ""
-    """Detail for the reason when an essential bound was missed."""
+    """Detail that is added to the reason if a run misses an essential bound."""
 
     def __post_init__(self) -> None:
         if self.at_most is not None and self.at_least is not None:

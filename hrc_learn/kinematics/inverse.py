@@ -66,7 +66,7 @@ class InverseSolution:
 def task_error_and_jacobian(
     chain: SerialChain, q: Float[Tensor, "rows joints"], pose: Pose, task: TaskSpace = "pose"
 ) -> tuple[Float[Tensor, "rows task"], Float[Tensor, "rows task joints"]]:
-    """Error to a pose, and the Jacobian of the task with respect to the joints.
+    """Error relative to a pose, and the Jacobian of the task with respect to the joints.
 
     The first three rows are linear, in the base frame [m]. "pose" adds three angular rows in
     the base frame [rad]; "position+axis" adds two, about axes perpendicular to the wanted axis

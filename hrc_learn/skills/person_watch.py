@@ -100,7 +100,7 @@ class PersonWatch:
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
     ) -> WatchedPeople:
-        """People near the arm now; the arm brakes if an observation or its joints are unusable.
+        """People near the arm now; the arm brakes without a valid observation and valid joints.
 
         Args:
             time: Reading of the clock [s].
