@@ -19,7 +19,7 @@ import statistics
 import sys
 import tokenize
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -111,20 +111,27 @@ class Source:
         """All tokens of the file."""
         return list(tokenize.generate_tokens(io.StringIO(self.text).readline))
 
+    @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """All nodes of the tree."""
+        return list(ast.walk(self.tree))
+
     @property
     def is_face(self) -> bool:
         """True for a package's `__init__.py`."""
         return self.path.name == "__init__.py"
 
+    @cached_property
     def docstring_lines(self) -> set[int]:
         """Lines of docstrings: those of modules, classes, functions and attributes."""
-        return {line for node in walk_docstrings(self.tree) for line in lines_of(node)}
+        return {line for node in only_docstrings(self.nodes) for line in lines_of(node)}
 
     def docstrings(self) -> list[str]:
         """Texts of all docstrings."""
-        nodes = walk_docstrings(self.tree)
+        nodes = only_docstrings(self.nodes)
         return [node.value.value.strip() for node in nodes]  # pyright: ignore
 
+    @cached_property
     def code_lines(self) -> set[int]:
         """Lines that hold code."""
         code = {
@@ -133,11 +140,11 @@ class Source:
             if token.type not in LAYOUT_TOKENS
             for line in range(token.start[0], token.end[0] + 1)
         }
-        return code - self.docstring_lines()
+        return code - self.docstring_lines
 
     def import_lines(self) -> set[int]:
         """Lines of import statements."""
-        nodes = (n for n in ast.walk(self.tree) if isinstance(n, (ast.Import, ast.ImportFrom)))
+        nodes = (n for n in self.nodes if isinstance(n, (ast.Import, ast.ImportFrom)))
         return {line for node in nodes for line in lines_of(node)}
 
     def comments(self) -> int:
@@ -146,10 +153,10 @@ class Source:
 
     def long_functions(self) -> int:
         """Number of functions longer than `LONG_FUNCTION`."""
-        lines, prose = self.text.splitlines(), self.docstring_lines()
+        lines, prose = self.text.splitlines(), self.docstring_lines
         functions = (
             node
-            for node in ast.walk(self.tree)
+            for node in self.nodes
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
         )
         return sum(
@@ -163,7 +170,7 @@ class Source:
 
     def imported(self) -> Iterator[str]:
         """Modules, or names in modules, that it imports anywhere."""
-        for node in ast.walk(self.tree):
+        for node in self.nodes:
             if isinstance(node, ast.Import):
                 yield from (alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
@@ -184,9 +191,9 @@ def lines_of(node: ast.stmt) -> range:
     return range(node.lineno, (node.end_lineno or node.lineno) + 1)
 
 
-def walk_docstrings(tree: ast.AST) -> Iterator[ast.Expr]:
+def only_docstrings(nodes: Iterable[ast.AST]) -> Iterator[ast.Expr]:
     """Strings that stand as a statement of their own."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if (
             isinstance(node, ast.Expr)
             and isinstance(node.value, ast.Constant)
@@ -224,7 +231,7 @@ def read_package(root: Path) -> list[Source]:
 def measure(sources: list[Source]) -> Figures:
     """Measure one package."""
     modules = [source for source in sources if not source.is_face]
-    code = [len(source.code_lines()) for source in sources]
+    code = [len(source.code_lines) for source in sources]
     names = Counter(t.string for s in sources for t in s.tokens if t.type == tokenize.NAME)
     functions = [
         node.name for s in sources for node in s.tree.body if isinstance(node, ast.FunctionDef)
@@ -237,7 +244,7 @@ def measure(sources: list[Source]) -> Figures:
         modules=len(modules),
         code=sum(code),
         code_per_module=sum(code) / len(modules),
-        code_median=statistics.median(len(source.code_lines()) for source in modules),
+        code_median=statistics.median(len(source.code_lines) for source in modules),
         import_fraction=sum(len(source.import_lines()) for source in sources) / sum(code),
         comments_per_100=100 * sum(source.comments() for source in sources) / sum(code),
         functions=len(functions),
