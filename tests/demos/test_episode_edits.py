@@ -286,3 +286,28 @@ def test_rest_is_trimmed_but_for_a_tenth_of_a_second_and_what_else_moves():
     assert edits.trim(none) is none
     with pytest.raises(DatasetError, match="the arm rests all the time"):
         edits.trim(edit(np.zeros(100)))
+
+
+STUCK = np.where((np.arange(160) > 70) & (np.arange(160) < 74), 70, np.arange(160))
+
+
+@pytest.mark.parametrize(
+    "repair",
+    [
+        edits.trim,
+        edits.drop_repeats,
+        edits.drop_late,
+        edits.unwrap,
+        lambda given: edits.drop_bad_frames(given, True),
+        lambda given: edits.resample_to_grid(given, 48),
+    ],
+)
+def test_a_repair_does_not_depend_on_the_clock_of_the_recorder(repair):
+    """By stamps in 64ths of a second, which are exact."""
+    values, time = rest_and_motion(50, 50)[STUCK], np.arange(160) / 64
+    values[100:] += 2 * np.pi
+    early, late = (repair(edit(values, time=time + begun)) for begun in (0.0, 4096.0))
+    np.testing.assert_allclose(late.time - 4096, early.time, atol=1e-9)
+    np.testing.assert_array_equal(late.kept, early.kept)
+    np.testing.assert_array_equal(late.frames[STATE], early.frames[STATE])
+    assert late.changes == early.changes

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.sim.world import _PADS
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +138,31 @@ def test_only_a_grip_by_the_faces_across_the_x_axis_is_flat(workplace, yaw, flat
     world.advance(1.0)
     assert world.holds("box")
     assert world.holds_flat("box") == flat
+
+
+def test_a_flat_grip_does_not_depend_on_the_order_of_the_geoms(world):
+    """Outward normals at both sides of 3 degrees from the object's x axis."""
+    item, *pads = (world.model.geom(name).id for name in ("box", *_PADS))
+    axis, side, _ = world.object_pose("box")[:3, :3].T
+
+    def flat(*angles, reverse, dist=0.99e-4):
+        contacts = []
+        for pad, angle in zip(pads, np.deg2rad(angles), strict=False):
+            outward = np.cos(angle) * axis + np.sin(angle) * side
+            # A normal points from the first geom to the second.
+            pair, normal = ([pad, item], -outward) if reverse else ([item, pad], outward)
+            frame = np.concatenate([normal, np.zeros(6)])
+            contacts.append(SimpleNamespace(geom=np.array(pair), frame=frame, dist=dist))
+        seen = SimpleNamespace(contact=contacts)
+        known = {"model": world.model, "object_pose": world.object_pose}
+        return World.holds_flat(SimpleNamespace(data=seen, **known), "box")
+
+    for reverse in (False, True):
+        for angles in ((0, 180), (180, 0), (2.9, 177.1), (-2.9, 180)):
+            assert flat(*angles, reverse=reverse)
+            assert not flat(*angles, reverse=reverse, dist=1e-4)
+        for angles in ((0, 0), (180, 180), (0, 176.9), (3.1, 180), (62, 180), (0, 90), (0,)):
+            assert not flat(*angles, reverse=reverse)
 
 
 def test_an_object_let_go_above_a_board_comes_to_rest_on_it(world, workplace):
