@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import sampling
 import torch
+from unchecked import shapes_unchecked
 
 from hrc_learn.controller import ConstraintConfig, SafetyConfig, SeparationConfig
+from hrc_learn.controller.contact_limits import ContactSpeeds
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, GraspedBox, panda, separation
 from hrc_learn.protocols import PersonObservation
@@ -26,7 +28,11 @@ from hrc_learn.sim import (
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
-from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
+from hrc_learn.skills.person_watch import (
+    PersonWatch,
+    PersonWatchConfig,
+    watched_people,
+)
 
 WORKPLACE = Workplace()
 VISIT = random_visit(
@@ -373,6 +379,42 @@ def test_an_arm_that_touches_a_hand_goes_on_but_not_towards_it():
     assert 0 < hand.distances.contact_speed.min() < 0.1
     assert not ball(0.02, ("head",))[0].distances.known()
     assert not ball(0.02, ("hand",), mode="ssm")[0].distances.known()
+
+
+@pytest.mark.parametrize("first", [0.0, 0.4, 2.5])
+@pytest.mark.parametrize("speed", [-0.5, 0.0, 0.8])
+@shapes_unchecked()  # a stand-in for the distances
+def test_near_people_the_arm_is_slow_enough_for_a_contact_or_at_rest(first, speed):
+    """One pair, of a person who comes with a speed [m/s] and is seen late."""
+    config = PersonWatchConfig(acceleration=2.0, fastest=0.6)
+    age, reaction = 0.04, SEPARATION.reaction_time
+    contact = ContactSpeeds(*(torch.tensor([[x]]).double() for x in (first, first / 4)))
+    for distance in (0.0, 0.0299, 0.0301, 0.06, 0.1, 0.2, 0.4, 2.0):
+        pair = SimpleNamespace(
+            distance=torch.tensor([[distance]], dtype=torch.float64),
+            person_rate=lambda velocity: torch.tensor([[-speed]], dtype=torch.float64),
+            gradient_of=lambda urgent: torch.zeros(1, 7, dtype=torch.float64),
+        )
+        seen_for = torch.tensor(age, dtype=torch.float64)
+        velocity = torch.zeros(1, 2, 3, dtype=torch.float64)
+        found = watched_people(pair, velocity, seen_for, SEPARATION, config, contact)
+        # A person who goes away may turn round at once; all accelerate until they arrive.
+        gap, coming = max(distance - 0.03, 0.0), max(speed, 0.0)
+        arrival = max(np.roots([config.acceleration / 2, coming, -gap]).real)
+        scale = np.clip((arrival - age - reaction) / 0.15, 0.0, 1.0)
+        gained = config.acceleration * (age + reaction)
+        if first == 0.0:
+            assert found.speed_scale == pytest.approx(scale, abs=1e-9)
+            assert found.speed_cap == math.inf
+        else:
+            assert found.speed_scale == 1.0
+            slow = max(first - coming - gained, 0.6 * scale) if scale < 1 else math.inf
+            assert found.speed_cap == pytest.approx(slow)
+        # A contact that has begun may last.
+        touching = distance < 0.03
+        assert found.distances.contact_speed == pytest.approx(first / 4 if touching else first)
+        assert bool(found.distances.known()) == (first > 0 or not touching)
+        assert found.nearest == distance
 
 
 def test_a_hand_on_the_table_is_met_as_slowly_as_one_that_cannot_yield():
