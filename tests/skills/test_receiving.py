@@ -13,7 +13,7 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import ObjectConfig
-from hrc_learn.skills.receiving import MovementWatch, Receiving, ReceivingConfig
+from hrc_learn.skills.receiving import MovementWatch, Receiving, ReceivingConfig, _eased
 from hrc_learn.skills.work_cell import MissedGraspError
 
 pytestmark = pytest.mark.simulation
@@ -285,3 +285,85 @@ def test_command_waits_for_an_arm_that_lags_behind(model):
     receiving(cell, model).receive(ITEM)
     # 4 cm, and what one step adds at 0.5 m/s.
     assert 0.03 < cell.lag < 0.04 + 0.5 * cell.config.dt + 1e-3
+
+
+TOWARDS = torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3
+
+
+@pytest.mark.parametrize(
+    ("distance", "speed"),
+    [
+        (1.0, 0.5),  # the speed asked for
+        (0.2601, 0.5),
+        (0.16, 0.4),  # slow enough to stop: v^2 = a d
+        (0.04, 0.2),
+        (0.0025, 0.025),  # a fifth of the distance in each step of 20 ms
+        (0.0, 0.0),
+    ],
+)
+def test_the_hand_nears_its_goal_at_a_speed_at_which_it_can_stop(distance, speed):
+    config, dt = ReceivingConfig(acceleration=1.0), 0.02
+    at, zero = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64), torch.zeros(3).double()
+    goal = at + distance * TOWARDS
+    expected = speed * TOWARDS
+    kept = _eased(at, expected, goal, 0.5, config, dt)
+    torch.testing.assert_close(kept, expected, atol=1e-9, rtol=0)
+    # From rest or from another direction, the change is that of the acceleration at most.
+    for velocity in (zero, 0.3 * TOWARDS.flip(0)):
+        change, wanted = _eased(at, velocity, goal, 0.5, config, dt) - velocity, expected
+        size = float((wanted - velocity).norm())
+        asked = (wanted - velocity) * min(1.0, 0.02 / max(size, 1e-300))
+        torch.testing.assert_close(change, asked, atol=1e-9, rtol=0)
+
+
+def test_the_hand_comes_to_rest_at_its_goal():
+    config, dt = ReceivingConfig(acceleration=0.8), 0.02
+    at, velocity = torch.zeros(3).double(), torch.zeros(3).double()
+    speeds, goal = [], 0.4 * TOWARDS
+    for _ in range(150):
+        velocity = _eased(at, velocity, goal, 0.3, config, dt)
+        at = at + dt * velocity
+        speeds.append(float(velocity.norm()))
+        assert at @ TOWARDS < 0.4 + 2e-3
+        assert float((at - (at @ TOWARDS) * TOWARDS).norm()) < 1e-12
+    assert max(speeds) == pytest.approx(0.3, abs=0.02)
+    assert np.abs(np.diff(speeds)).max() <= 0.8 * dt + 1e-12
+    assert float((at - goal).norm()) < 1e-4
+    assert speeds[-1] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("away", "sway", "rests"),
+    [
+        (0.0, 0.0, True),
+        (0.089, 0.0, True),
+        (0.091, 0.0, False),
+        (0.0, 0.044, True),
+        (0.0, 0.046, False),
+        (0.05, 0.04, True),
+    ],
+)
+def test_fingers_close_once_a_hand_rests_about_its_place(model, away, sway, rests):
+    """By images each eighth of a second: half a second of them has five."""
+    cell = Cell([(-1.0, 0.5, REST)], brings=False)
+    offset = np.array([0.1, 0.2, -0.1])
+    middle = START.numpy() + offset + away * np.array([0.6, 0.0, 0.8])
+    shown = []
+
+    def read():
+        k = int(cell.time * 8 + 1e-9)
+        # Every other image to one side and to the other, by the same distance.
+        side = (0.0 if k == 0 else 1.0) * sway * (1 if k % 2 else -1)
+        shown.append(k / 8)
+        return seen(k / 8, middle + np.array([0.0, side, 0.0]))
+
+    cell.read = read
+    taker = receiving(cell, model, near=0.09, still=0.5)
+    if rests:
+        taker._await_hand(offset, 3.0)
+        assert shown[-1] == 0.5
+        assert torch.equal(cell.pose.position, START)
+    else:
+        with pytest.raises(MissedGraspError, match="did not reach the gripper"):
+            taker._await_hand(offset, 3.0)
+        assert 3.0 <= cell.time < 3.05
