@@ -1,5 +1,8 @@
 """A person who leads the body of a LeRobot arm while actions lead its hand."""
 
+from dataclasses import astuple
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -156,6 +159,67 @@ def test_what_the_person_does_is_recorded_in_columns_of_its_own(pulled, tmp_path
 
 def test_a_person_who_is_not_recorded_adds_nothing(pulled):
     assert list(pulled(PULL).get_observation()) == [*JOINTS, GRIPPER]
+
+
+@pytest.mark.parametrize("kind", ["scripted", "page", "gamepad", "keyboard", "none"])
+@pytest.mark.parametrize("record", [False, True])
+def test_the_persons_values_are_observed_if_there_is_one_and_wanted(kind, record):
+    names = PersonConfig(kind=kind, record=record).names(panda)
+    assert names == ((*NULLSPACE_INPUTS, *OFFSETS) if record and kind != "none" else ())
+
+
+def test_each_kind_of_person_has_a_device_and_only_the_page_is_shown(monkeypatch):
+    served = []
+
+    class RobotPage:
+        def __init__(self, *given, **how):
+            served.append((given, how))
+            self.page = SimpleNamespace(human="at the page")
+
+    monkeypatch.setattr(person, "RobotPage", RobotPage)
+    for name in ("Gamepad", "TerminalKeyboard"):
+        device = SimpleNamespace(open=lambda chain, name=name: (name, chain))
+        monkeypatch.setattr(f"hrc_learn.teleoperation.devices.{name}", device)
+    guide = "hrc_learn.teleoperation.hand_guiding.LinkGuide"
+    monkeypatch.setattr(guide, lambda device, chain: ("link", device, chain))
+    arm = SimpleNamespace(chain=panda)
+    for kind, name in {"gamepad": "Gamepad", "keyboard": "TerminalKeyboard"}.items():
+        opened = person.open_device(PersonConfig(kind=kind), arm)
+        assert opened == (("link", (name, panda), panda), None)
+    script, page = person.open_device(PersonConfig(kind="scripted"), arm)
+    assert page is None
+    state = SimpleNamespace(time=1.0, joint_position=panda.ready.numpy())
+    assert not script.read(state).nullspace_input.any()
+    human, page = person.open_device(PersonConfig(kind="page", host="h", port=7), arm)
+    assert human == "at the page"
+    assert isinstance(page, RobotPage)
+    (((shown, host, port, _), how),) = served
+    assert (shown, host, port, how) == (arm, "h", 7, {"guides": False})
+    listed = "none, scripted, page, gamepad, keyboard, but is "
+    for kind in ("none", "robot"):
+        with pytest.raises(ValueError, match=f"person.kind must be one of {listed}'{kind}'"):
+            person.open_device(PersonConfig(kind=kind), arm)
+
+
+def test_a_page_shows_the_world_or_the_arm_alone_as_it_is_read():
+    placed, reset = [], []
+    page = object.__new__(person.RobotPage)
+    page.page = SimpleNamespace(place=placed.append)
+    page._ghost = SimpleNamespace(reset=lambda *at, **with_: reset.append((at, with_)))
+    page.show(None, "world")  # its driver is not read
+    assert (placed, reset) == (["world"], [])
+    state = SimpleNamespace(joint_position=np.ones(7), gripper_width=0.03)
+    page.show(SimpleNamespace(read=lambda: state), None)
+    assert placed[1] is page._ghost
+    assert reset == [((state.joint_position,), {"gripper_width": 0.03})]
+
+
+def test_pulls_belong_to_their_seed():
+    def drawn(seed):
+        return [astuple(pull) for pull in person.scripted_pulls(seed)]
+
+    assert drawn(3) == drawn(3)
+    assert len({repr(drawn(seed)) for seed in range(20)}) > 15
 
 
 @pytest.mark.realtime
