@@ -1,9 +1,10 @@
 """Make or extend datasets of version 3.0 from recordings, even from interrupted recordings.
 
-A recording is a folder `NAME.recording/`. Its file `recording.json` holds an identifier and, if
-the recording extends a dataset, the number of episodes of this dataset. The finished dataset
-keeps the identifier of its recording. If a program finishes the dataset but stops before it
-removes the recording, the equal identifiers show that the dataset holds the recorded episodes.
+A recording is a folder `NAME.recording/`. Its file `recording.json` holds an identifier. If the
+recording extends a dataset, the file also holds the number of episodes that the dataset had
+before. The finished dataset keeps the identifier of its recording. If a program finishes the
+dataset but stops before it removes the recording, the equal identifiers show that the dataset
+already holds the recorded episodes.
 """
 
 import itertools
@@ -50,8 +51,9 @@ def assemble(
     Args:
         paths: Files written by `write_episode`, in order.
         target: Folder of the new dataset.
-        earlier: Dataset to which the episodes are appended, written by this package. The new
-            dataset gets links to its files, or copies; the earlier dataset is not changed.
+        earlier: Dataset to which the episodes are appended, written by this package. Its files
+            are linked into the new dataset, or copied if links are impossible. The earlier
+            dataset is not changed.
         videos: Video segments of each episode; their files are copied. None for the videos that
             were recorded with the episodes; these are linked where possible.
         tasks: Task texts that already have an index, in order of the index.
@@ -66,7 +68,7 @@ def assemble(
     if earlier is not None:
         tables.append(_carry_over(earlier, listed, cameras))
         # The new dataset keeps the contract and the reference frames of the earlier dataset. It
-        # also keeps the details, except those that the recording gives again.
+        # also keeps the earlier details; a detail of the recording replaces one of equal name.
         before = read_sidecar(earlier)
         details = before.details | sidecar.details
         kept = {"contract": before.contract, "frames": before.frames}
@@ -87,14 +89,14 @@ def assemble(
 
 
 class _EpisodeList:
-    """Counts of a growing dataset, and the row of each episode in `meta/episodes`.
+    """Counters of a dataset under construction; makes the rows of `meta/episodes`.
 
     Attributes:
         target: Folder of the new dataset.
         tasks: Task texts in the order of their indices.
         data_files: Number of data files of the earlier dataset.
-        episodes: Number of episodes.
-        frames: Number of frames.
+        episodes: Number of episodes so far.
+        frames: Number of frames so far.
         videos: Camera -> number of its video files in the earlier dataset.
     """
 
@@ -136,7 +138,7 @@ class _EpisodeList:
     def _place_video(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
         """Put the video file of a segment into the dataset, and return the segment's columns.
 
-        A file with the videos of several episodes is put there once.
+        A file with the videos of several episodes is put into the dataset only once.
         """
         placed = self._placed.setdefault(key, {})
         if segment.file not in placed:
@@ -336,13 +338,11 @@ def finish(root: Path, claim: store.Claim) -> None:
                 raise DatasetError("no episode was saved, so there is no dataset", file=root)
             return
         if episodes is not None and (now := len(open_folder(root).episodes)) != episodes:
-            text = (
-                f"holds {now} episodes, but {episodes} when it was to be extended: put it back"
-            )
+            text = f"holds {now} episodes, but {episodes} when the recording began: restore it"
             raise DatasetError(f"{text}, or move {staging} away", file=root)
         if episodes is None and os.path.lexists(root):
             text = f"{root} already exists: remove {staging} if both hold the same recording"
-            raise FileExistsError(f"{text}, or move {root} away to make a dataset of it")
+            raise FileExistsError(f"{text}, or move {root} away to finish the recording")
         paths = recorded.staged_paths(staging, episodes or 0)
         with store.replacing(
             claim, store.DATASET, overwrite=episodes is not None, source=header.id
@@ -412,7 +412,7 @@ def recover_all(path: str | Path) -> list[str]:
 
 def discard(staging: Path) -> None:
     """Remove the folder of a recording; if foreign files remain in the folder, rename it."""
-    # The header is removed last: if the removal is interrupted, it still marks the folder.
+    # The header is removed last: after an interruption, it still identifies the folder.
     store.delete_files(staging, _FILES)
     if not store.delete_files(staging, [_RECORDING]):
         kept = (staging.with_name(f"{staging.name}.kept{n or ''}") for n in itertools.count())

@@ -1,4 +1,4 @@
-"""Arm and curves of a dataset, in its own units, for dashboards and web pages."""
+"""Arm of a dataset, and curves in the dataset's own units, for dashboards and web pages."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class DatasetArm:
         fingers = [f for f in self.arm.shape.gripper if f.kind == "prismatic"]
         travel = sum(abs(f.opened - f.closed) for f in fingers)
         width = _FRANKA_WIDTH if self.arm.is_franka else travel
-        width *= self.gripper.si_unit == "m"  # of an angle, the data tell
+        width *= self.gripper.si_unit == "m"  # the largest angle counts as open
         return np.clip(demo.gripper / (width or max(demo.gripper.max(), 1e-9)), 0.0, 1.0)
 
 
@@ -114,7 +114,7 @@ class Chart(NamedTuple):
 
 
 def own_unit(units: Mapping[str, UnitDecision], role: str, column: int) -> tuple[str, float]:
-    """Unit of a column in the dataset, and the factor that converts it to the reader's unit."""
+    """Unit of a column in the dataset, and the factor that converts its values to SI units."""
     decision = units.get(role)
     if decision is None:
         return ("m" if role == "gripper" else "rad"), 1.0

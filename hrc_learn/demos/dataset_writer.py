@@ -64,7 +64,7 @@ class DatasetWriter:
 
         Args:
             root: Folder of the dataset; it must not exist, except with `append`.
-            fps: Frame rate [1/s]. If frames give `time`, their true stamps are kept, too.
+            fps: Frame rate [1/s]. The true stamps are stored as well if frames have a `time`.
             robot_type: Name of the robot in LeRobot's metadata.
             joint_names: Joints, in the order of the values of all joint quantities.
             features: Further features: key, such as "observation.shelf" -> component names.
@@ -213,7 +213,7 @@ class DatasetWriter:
             text = (
                 f"the demonstration's joints {demonstration.joint_names} are not the dataset's"
             )
-            advice = "select_joints(names) brings them in order"
+            advice = "select_joints(names) reorders them"
             raise ValueError(f"{text} {self.joint_names}: {advice}")
         episode = {name: getattr(demonstration, name) for name in demonstration.recorded}
         episode["time"] = demonstration.time + demonstration.start_time
@@ -352,7 +352,7 @@ class DatasetWriter:
             if theirs.get(key) != features.get(key):
                 raise ValueError(
                     f"cannot append to {self.root}: {key} is {theirs.get(key)} there, but "
-                    f"{features.get(key)} here; record the same quantities, or a new dataset"
+                    f"{features.get(key)} here; record the same quantities or a new dataset"
                 )
         known = {column.role: column for column in columns if column.role is not None}
         sidecar = replace(

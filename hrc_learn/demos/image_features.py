@@ -163,8 +163,8 @@ def extract_features(
     Args:
         path: The dataset.
         name: Name of the feature, such as "marker_3".
-        detector: Function that makes a detector for each episode, so that a detector that
-            tracks the feature from image to image starts afresh.
+        detector: Function that makes a new detector for each episode. A detector may
+            therefore track the feature from image to image.
         camera: Name of the camera ("front") or key of its feature; None for the only camera.
         progress: Function that iterates over the episodes to search and shows the progress.
 
@@ -227,8 +227,8 @@ def camera_key(keys: Sequence[str], camera: str | None) -> str:
 def attach_features(demos: DemonstrationSet, name: str | None = None) -> DemonstrationSet:
     """Demonstrations with a feature that `extract_features` found in their videos.
 
-    `load_demos` and `open_demos` do this themselves if the dataset has no image feature of its
-    own and exactly one was extracted.
+    `load_demos` and `open_demos` attach the feature automatically if no column of the dataset
+    holds an image feature and exactly one feature was extracted.
 
     Args:
         demos: Demonstrations read from a dataset.
@@ -242,5 +242,5 @@ def attach_features(demos: DemonstrationSet, name: str | None = None) -> Demonst
     if len(chosen) != 1:
         what = "name the feature" if name is None else f"there is no feature {name!r}"
         names = ", ".join(cache.name for cache in known) or "none"
-        raise DatasetError(f"{what}; extracted are {names}", file=demos.source)
+        raise DatasetError(f"{what}; extracted features: {names}", file=demos.source)
     return demos.map(chosen[0].attach)

@@ -219,7 +219,7 @@ def camera_images(
         segment = reader.segment(demo.episode, camera)
         try:
             encoded = None if segment is None else videos.encoded_samples(segment)
-            if encoded is not None:  # a video runs at the nominal rate, the robot at its stamps
+            if encoded is not None:  # videos have the nominal rate, robots have true stamps
                 nominal = (
                     np.linspace(0, reader.entry(demo.episode).length - 1, len(demo)) / demo.fps
                 )

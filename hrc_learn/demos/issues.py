@@ -32,7 +32,7 @@ def plain_text(text: str, longest: int = _LONGEST_TEXT) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things in words, such as "1 warning" and "2 warnings"."""
+    """A number and a noun in singular or plural, such as "1 warning" or "2 warnings"."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 

@@ -355,7 +355,7 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
     for name in demo.recorded[1:]:
         values = getattr(demo, name)
         if name == "feature" and demo.feature_visible is not None:
-            # It need not be finite where it is not visible.
+            # The pixel of an invisible feature need not be finite.
             sound = np.isfinite(values) | demo.feature_visible[:, None]
             values = np.where(sound, values, 0.0)
         if name in _SMOOTH:
@@ -423,7 +423,8 @@ def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demons
     Args:
         demo: The demonstration.
         delays: Field -> time from its measurement to its stamp [s], such as {"feature": 0.04}.
-            The end of the demonstration, for which no later frame exists, is cut off.
+            The demonstration is shortened by the longest delay, because its last values would
+            be stamped after its end.
 
     Raises:
         ValueError: A field is not recorded, or a delay is negative or too long.
@@ -431,7 +432,7 @@ def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demons
     for name, delay in delays.items():
         if name not in demo.recorded[1:]:
             recorded = ", ".join(demo.recorded[1:])
-            raise ValueError(f"{name} is not recorded; there are {recorded}")
+            raise ValueError(f"{name} is not recorded; recorded fields: {recorded}")
         if not 0 <= delay < demo.duration:
             bounds = f"between 0 and {demo.duration:.4g} s"
             raise ValueError(f"the delay of {name} must be {bounds}, got {delay}")
@@ -453,9 +454,10 @@ def warp(
 
     D[i, j] = cost[i, j] + min(D[i-1, j-1], D[i-1, j], D[i, j-1])
 
-    Entries of an anti-diagonal depend on earlier anti-diagonals only and are computed together.
-    This is exact and takes about 0.1 s for 1000 by 1000 samples. `dtaidistance` accepts no cost
-    matrix, and `tslearn` needs numba, scikit-learn and statsmodels.
+    Entries of an anti-diagonal depend only on earlier anti-diagonals, so they are computed
+    together. The result is exact and takes about 0.1 s for 1000 by 1000 samples. No library is
+    used: `dtaidistance` accepts no cost matrix, and `tslearn` needs numba, scikit-learn and
+    statsmodels.
 
     Args:
         cost: Cost of pairing sample i of the first with sample j of the second; infinite for
@@ -495,13 +497,13 @@ _VELOCITY_WINDOW = 0.1
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of a reference, the one of median duration.
+    """Warp every demonstration to the timing of the demonstration of median duration.
 
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled
     likewise. Afterwards, all demonstrations have the times of the reference, and frame k of
-    each shows the same phase of the task. Recorded joint velocities are replaced by estimates,
-    and commanded ones scaled to the new timing.
+    each shows the same phase of the task. Recorded joint velocities are replaced by estimates.
+    Commanded joint velocities are scaled to the new timing.
 
     Args:
         demos: At least one demonstration; all must record the quantity that is compared.
@@ -545,7 +547,7 @@ def _follow(
         else:
             squares += cdist(a / scale, b / scale, "sqeuclidean")
     lead = np.linspace(0, 1, len(reference))[:, None] - np.linspace(0, 1, len(demo))
-    # A difference of one frame is always allowed: without it, there may be no path.
+    # A difference of one frame is always allowed, as there might be no path otherwise.
     widest = max(_BAND, 1 / max(min(squares.shape) - 1, 1))
     allowed = np.abs(lead) <= widest + 1e-12
     first, second = warp(np.where(allowed, np.sqrt(squares), np.inf))

@@ -33,7 +33,7 @@ class RecordedColumn:
     """One recorded quantity and its place in the dataset."""
 
     given: str
-    """Keyword that gives the quantity: a field of `Demonstration`, or a feature key."""
+    """Keyword of the quantity in a frame: a field of `Demonstration`, or a feature key."""
     role: str | None
     """Role under which readers find the quantity; None for a user-defined feature."""
     key: str
@@ -298,7 +298,7 @@ def staged_paths(folder: Path, first: int = 0) -> list[Path]:
     for index, path in enumerate(paths, start=first):
         expected = episode_path(folder, index)
         if path != expected:
-            text = "is missing from the recording; rename the later ones if it is lost"
+            text = "is missing from the recording; rename the later files if it is lost"
             raise DatasetError(text, file=expected, episode=index)
     return paths
 

@@ -201,7 +201,7 @@ def _numbers(
         one: Messages of the topic.
         places: Indices of the messages, sorted by time, without repeated times.
         order: Joints in the order of the robot's description.
-        notes: Receives what is left out.
+        notes: Receives a note on everything that is left out.
     """
     if len({value.shape for value in one.values}) > 1:
         notes.append(f"{name} is left out: its messages differ in size")
@@ -237,7 +237,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     steady = [main, *(n for n, one in fields.items() if one.kind in ("image", "encoded"))]
     times = {n: fields[one.clock].numbers()[:, 0] for n, one in clocked.items()}
     if np.median(np.diff(times[main])) < _BURST:
-        text = "its messages have no times of their own and were written at once"
+        text = "its messages have no stamps and were all written at the same time"
         notes.append(f"{main}: {text}")
         bare = {n: replace(fields[n], clock="") for n in clocked}
         return [replace(whole, fields=bare, streams=False, notes=tuple(notes))]
@@ -250,7 +250,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
             parts = [p for a, b in parts for p in ((a, min(b, left)), (max(a, right), b))]
             if start < left < stop:
                 text = f"silent for {right - left:.2f} s at {left - times[main][0]:.2f} s"
-                notes.append(f"{name} is {text}: divided there")
+                notes.append(f"{name} is {text}: the bag is divided there")
     parts = [(a, b) for a, b in parts if b - a >= _SHORTEST]
     if not parts:
         raise whole.error(f"{', '.join(steady)} are never present together for {_SHORTEST} s")
@@ -262,7 +262,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     whole = replace(whole, fields=fields, notes=tuple(notes))
     if parts == [(start, stop)]:
         return [whole]
-    shown = whole.notes  # of the whole bag, once
+    shown = whole.notes  # they concern the whole bag: only the first part shows them
     return [
         replace(whole, label=f"part {k}", fields=_during(fields, a, b), notes=shown * (not k))
         for k, (a, b) in enumerate(parts)

@@ -1,6 +1,6 @@
-"""Clocks of recordings: stamps of the state in seconds, and the frame of each field at them.
+"""Clocks of recordings: the stamps of the state [s], and the frame of each field at each stamp.
 
-The state is the field of joints or poses that determines the frames of the episode.
+The state is the field of joints or poses whose stamps determine the frames of the episode.
 """
 
 from collections.abc import Mapping
@@ -36,8 +36,8 @@ def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOption
     what its sensors will measure. Frames at either end are cut where a field has no value.
 
     Raises:
-        DatasetError: Stamps are missing or do not increase, or a field covers another time or
-            has a gap.
+        DatasetError: Stamps are missing or do not increase. Or the stamps of a field have a
+            gap, or do not overlap with those of the state.
     """
     place = f"{recording.file.name} {recording.label}".strip()
     time, notes = _stamps_of_state(recording, meaning, options)
@@ -72,7 +72,7 @@ def _thinned(
     fps: float | int | None,
     notes: list[str],
 ) -> Int64[np.ndarray, " _rows"]:
-    """Rows of a state that is faster than the cameras or than the wanted rate.
+    """Rows to keep of a state that is recorded faster than the cameras or the wanted rate.
 
     Args:
         time: Stamps of the state [s].
@@ -148,10 +148,8 @@ def _latest(
     elif abs(length - len(time)) == 1:  # a last observation without an action, or the reverse
         return np.minimum(np.arange(len(time)), length - 1)
     else:
-        text = (
-            f"arrays differ in their numbers of frames: it has {length}, the state {len(time)}"
-        )
-        raise recording.error(f"{text}, and it has no stamps of its own", name)
+        text = f"has {length} frames, but the state {len(time)}; without stamps, the numbers"
+        raise recording.error(f"{text} of frames must be equal", name)
     # The tolerance is for stamps that were rounded.
     index = np.searchsorted(stamps, time + 1e-6, side="right") - 1
     old = time - stamps[np.maximum(index, 0)] > longest_hold(stamps)

@@ -25,7 +25,8 @@ UNNAMED = "array"
 _SMALLEST_IMAGE = 16
 """Smallest height and width of an array that counts as an image [px]."""
 _SKIPPED = 100
-"""Largest number of images that are read only to skip them; else the stream is opened again."""
+"""Largest number of images that are skipped by reading them. To skip more, the stream is opened
+again."""
 _EPISODE = re.compile(r"(?:[a-z]+[_\- ]?)*\d+", re.IGNORECASE)
 """Names of groups that hold one episode each: demo_0, episode_12, traj_3, 7."""
 _EPISODE_ENDS = ("episode_ends", "traj_ends", "trajectory_ends")
@@ -173,13 +174,13 @@ def read_stamps(
     rate: float | int | None = None,
     likely: str = "",
 ) -> Float64[np.ndarray, " _frames"]:
-    """Stamps of a field [s]. Their unit is given or declared, or their name or size tells it.
+    """Stamps of a field [s]. Their unit is given, declared, or inferred from name or size.
 
     Args:
         recording: The episode.
         name: The field.
         unit: Unit from the caller; "" if none is given.
-        rate: Frame rate [1/s] by which a count of frames becomes a time.
+        rate: Frame rate that converts counted frames to times [1/s].
         likely: Unit of stamps whose unit would otherwise be in doubt.
 
     Raises:
@@ -326,7 +327,9 @@ def split_episodes(
 
 
 def _layer(whole: Recording, name: str, field: Field, number: int, count: int) -> Field:
-    """One demonstration of a three-dimensional array; other arrays belong to every one."""
+    """One demonstration from a three-dimensional array. Other arrays, which all demonstrations
+    have in common, are returned as they are.
+    """
     if field.kind != "other" or len(field.shape) != 3:
         return field
     if field.frames not in (1, count):
@@ -387,14 +390,14 @@ def _ends(whole: Recording) -> list[int] | None:
             ends = field.numbers()[:, 0].astype(int)
             longest = max(f.frames for f in whole.fields.values())
             if not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] > longest:
-                text = f"must increase up to the {longest} frames there are"
+                text = f"must increase, and not exceed the {longest} frames of the arrays"
                 raise whole.error(f"{text}, got {ends[:5].tolist()} ...", name)
             return ends.tolist()
         if _EPISODE_COLUMN.fullmatch(last):
             numbers = field.numbers()[:, 0]
             changes = np.flatnonzero(np.diff(numbers)) + 1
             if len(changes) + 1 != len(np.unique(numbers)):
-                raise whole.error("numbers the episodes, but comes back to earlier ones", name)
+                raise whole.error("numbers the episodes, but repeats an earlier number", name)
             return [*changes.tolist(), len(numbers)]
         if last in _ENDINGS:
             flags.append(field.numbers()[:, 0] > 0)

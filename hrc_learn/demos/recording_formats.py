@@ -65,7 +65,7 @@ def open_recordings(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
 
 def _reader_of(path: Path) -> Callable[..., list[Recording]]:
     if path.is_dir() and (path / "meta" / "info.json").is_file():
-        text = "is a LeRobot dataset already: `hrc check`, `repair` and `merge` take it"
+        text = "is a LeRobot dataset already: use `hrc check`, `hrc repair` or `hrc merge`"
         raise DatasetError(text, file=path)
     if not path.is_dir() and not path.is_file():
         raise DatasetError("not found", file=path)
@@ -73,11 +73,11 @@ def _reader_of(path: Path) -> Callable[..., list[Recording]]:
         return reader or _read_folder
     name = path.name.lower()
     if name.endswith(_VIDEOS):
-        raise DatasetError("is a video: name the folder that holds its states, too", file=path)
+        raise DatasetError("is a video: give the folder of the video and its states", file=path)
     if name.endswith(_PICKLES):
         text = "is a pickle, which can run any program when it is opened: save it as .npz"
         raise DatasetError(text, file=path)
-    raise DatasetError(f"is of no kind that is read here: {', '.join(READERS)}", file=path)
+    raise DatasetError(f"has none of the known formats: {', '.join(READERS)}", file=path)
 
 
 def _known_reader(path: Path) -> Callable[..., list[Recording]] | None:
@@ -119,7 +119,7 @@ def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
 
 
 def _numpy_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and arrays of a .npz or .npy file; the content tells the format, not the suffix."""
+    """Names and arrays of a .npz or .npy file; the content tells the format, not the name."""
     name = None
     with path.open("rb") as stream:
         single = stream.read(6) == b"\x93NUMPY"
@@ -170,7 +170,7 @@ def read_hdf5(path: Path) -> list[Recording]:
             elif not isinstance(node, h5py.Dataset):
                 continue  # a named type holds no numbers
             elif node.external or node.is_virtual:
-                raise DatasetError("is kept in another file: not opened", file=path, key=place)
+                raise DatasetError("is in another file, and not read", file=path, key=place)
             elif node.shape == ():
                 _attributes({place.rpartition("/")[2]: node[()]}, details)
             elif node.shape and 0 not in node.shape and not node.dtype.names:
@@ -351,7 +351,8 @@ READERS: dict[str, Callable[..., list[Recording]]] = {
 def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
     """Episodes of a folder: numbered files are one episode each, other files together form one.
 
-    If there are several files, the name of a video must begin with the name of its file.
+    If there are several files of arrays, the name of a video must begin with the name of the
+    file to which it belongs.
     """
     entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     entries.sort(key=lambda entry: natural(entry.name))
@@ -384,11 +385,11 @@ def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
             for v in shown
         }
         if own and len(found) > 1:
-            raise DatasetError("holds several episodes, and the videos are of one", file=table)
+            raise DatasetError("holds several episodes, but its videos show one", file=table)
         episodes += [replace(one, fields=one.fields | own) for one in found]
     if unused and episodes:
         names = ", ".join(video.name for video in unused)
-        text = f"videos left out, as their names begin with the name of no other file: {names}"
+        text = f"videos left out, as no other file's name begins their names: {names}"
         episodes[0] = replace(episodes[0], notes=(*episodes[0].notes, text))
     return episodes
 

@@ -151,8 +151,8 @@ def plan_import(
     recordings = [one for path in paths for one in open_recordings(path, columns)]
     read = {name.rpartition("/")[2] for one in recordings for name in one.fields}
     if columns and read.isdisjoint(columns):
-        text = "name no columns of the files, which name their own"
-        raise ValueError(f"{', '.join(columns)} (--columns) {text}: leave them out")
+        text = "the files already name their columns, and none of these names"
+        raise ValueError(f"--columns {', '.join(columns)}: {text}: leave the option out")
     if not recordings:
         raise DatasetError("holds no episodes", file=paths[0])
     meaning = understand(recordings, options, hinted=bool(columns))
@@ -168,7 +168,7 @@ def write_plan(
         plan: The recordings.
         out: Folder of the dataset, which must not exist.
         robot_type: Robot type stored in the dataset.
-        actions: Take the next state as action where no commands were recorded.
+        actions: Use the next state as action where no commands were recorded.
 
     Returns:
         Numbers of `episodes` and `frames`, total duration `seconds` [s] and `fps` [1/s].
@@ -206,7 +206,7 @@ def write_plan(
 
 
 def _with_next_states(demo: Demonstration) -> Demonstration:
-    """Use joints, pose or state of the next frame as the action; the last frame has its own."""
+    """Use joints, pose or state of the next frame as the action; the last frame uses itself."""
     following = np.minimum(np.arange(len(demo)) + 1, len(demo) - 1)
     if demo.joint_position is not None:
         return replace(demo, command_position=demo.joint_position[following])
@@ -261,8 +261,8 @@ def _images(images: Field, index: Int64[np.ndarray, " frames"]) -> Iterator[Imag
             if images.kind == "encoded":
                 image = decode_image(bytes(image))
             elif image.dtype != np.uint8:
-                # Images of real numbers range from 0 to 1 or from 0 to 255. Black ones, which
-                # may come first, do not tell.
+                # Images of real numbers range from 0 to 1 or from 0 to 255. Black images, which
+                # may come first, do not show the range.
                 if not scale and (largest := float(batch.max())) > 0:
                     scale = 255.0 if largest <= 1.0 else 1.0
                 image = np.clip(np.rint(image * scale), 0, 255).astype(np.uint8)

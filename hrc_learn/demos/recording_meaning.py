@@ -127,7 +127,7 @@ def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
 
 
 def _shapes(recording: Recording, names: Sequence[str]) -> list[str]:
-    """Those of the fields that exist, with the number of components if they hold numbers."""
+    """Names of the existing fields, with the number of components of fields of numbers."""
     fields = ((name, recording.fields[name]) for name in names if name in recording.fields)
     return [f"{n} ({one.width})" if one.kind == "number" else n for n, one in fields]
 
@@ -163,8 +163,8 @@ def _by_name(
     states = {"joint_position", "position", *ORIENTATION_ROLES}
     if not meaning.selections.keys() & states and "observation.state" not in meaning.kept:
         there = ", ".join(name for name, one in first.fields.items() if one.kind == "number")
-        text = "name the arrays of joints or poses (joints, position); it holds"
-        raise first.error(f"{text} {there}")
+        text = "name the arrays of joints or poses (joints, position); there are"
+        raise first.error(f"{text} {there or 'none'}")
     if options.time:
         meaning.time = first.places(options.time, "time")[0][0]
     elif options.duration is None:
@@ -179,7 +179,7 @@ def _explicit(first: Recording, options: ImportOptions) -> dict[str, list[Place]
     for role, tokens in options.columns.items():
         words = [tokens] if isinstance(tokens, str) else tokens
         places = [place for word in words for place in first.places(word, role)]
-        # The number of columns tells which encodings of an orientation are no quaternion.
+        # Orientations of three, six or sixteen columns are no quaternions.
         others = {3: "rotation_vector", 6: "rotation_6d", 16: "pose_matrix"}
         is_turn = role.startswith("quaternion")
         explicit[others.get(len(places), role) if is_turn else role] = places
@@ -190,7 +190,7 @@ def _selection(first: Recording, role: str, places: Sequence[Place]) -> ColumnSe
     """Columns that the caller names for a quantity."""
     width = ROLES[role].width
     if width is not None and len(places) != width and (role, len(places)) != ("gripper", 2):
-        raise first.error(f"{role} takes {width} columns, not {len(places)}", role)
+        raise first.error(f"{role} needs {width} columns, not {len(places)}", role)
     numbered = any(first.fields[n].width > 1 and not first.fields[n].names for n, _ in places)
     labels = tuple(map(joint_of, column_names(first, places)))
     return ColumnSelection(role=role, columns=tuple(places), labels=labels, numbered=numbered)
@@ -202,7 +202,7 @@ def _add_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str])
         places = first.places(name, "state")
         if name == UNNAMED and not meaning.selections:
             meaning.notes.append(
-                "nothing names the columns: taken for joints (--columns names them)"
+                "the columns have no names: taken for joints (--columns names them)"
             )
             joints = _selection(first, "joint_position", places)
             meaning.selections["joint_position"] = replace(joints, numbered=True)
@@ -213,7 +213,7 @@ def _add_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str])
             meaning.left_out[name] = "a state of unknown content; to keep it: observation.NAME"
         else:
             meaning.kept["observation.state"] = (tuple(places), column_names(first, places))
-            meaning.notes.append(f"{name} is kept as recorded: its name tells no content")
+            meaning.notes.append(f"{name} is kept as recorded: its name states no content")
 
 
 def _add_fingers(meaning: Meaning, search: FieldSearch) -> None:
@@ -300,7 +300,7 @@ def _decide_units(
         doubt = None if stated else decision.doubt
         largest = _largest(first, selections[role], (3, 7, 11) if role == "pose_matrix" else ())
         if role == "pose_matrix" and not stated and largest > _REACH:
-            doubt = f"{role} in m or mm? It reaches {largest:.4g}: say --units {role} mm, or m"
+            doubt = f"{role} in m or mm? It reaches {largest:.4g}: give --units {role} mm, or m"
         if doubt is not None:
             doubt = doubt.partition(", or leave columns")[0]  # an option of other commands
             if role == "joint_position" and "gripper" not in selections:
@@ -317,7 +317,7 @@ def _decide_units(
 
 
 def _gripper_among(first: Recording, joints: ColumnSelection) -> list[str]:
-    """Question about the last columns, if these are unnamed and behave like a gripper."""
+    """One question if the last columns are unnamed and behave like a gripper; else none."""
     values = read_columns(first, joints.columns)
     if len(values) < 2:
         return []
@@ -345,7 +345,7 @@ def _decide_commands(
     options: ImportOptions,
     actions: Sequence[str],
 ) -> None:
-    """Take a recorded action for commands of the joints if the joints follow it.
+    """Interpret a recorded action as commands of the joints if the joints follow it.
 
     Args:
         meaning: Receives the commands.
@@ -445,7 +445,7 @@ def _followed(
     state: Sequence[Place],
     rate: float | int,
 ) -> bool:
-    """True if the joints, at a rate [1/s], move as the command does, in the same unit."""
+    """True if the joints follow the command in the same unit; `rate`: frame rate [1/s]."""
     votes = []
     for one in recordings[:: max(1, len(recordings) // _CHECKED_EPISODES)]:
         given, measured = _matched(one, command, state)

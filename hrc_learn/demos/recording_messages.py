@@ -46,7 +46,7 @@ class Topic:
     """Times in the messages [s]; 0 where they have none."""
     values: list[np.ndarray] = field(default_factory=list)
     sample: Any = None
-    """First message; for images, it tells their format."""
+    """First message; for images, its attributes name their format."""
 
     def add(self, received: int, stamp: float, value: np.ndarray, names: Any) -> None:
         """Add the numbers of a message, reordered to the names of the first message."""
@@ -108,8 +108,9 @@ def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
-    """Poses in the base frame of tools and of frames without children, from `/tf` topics. Times
-    at which a moving frame on the way has been silent for too long are left out.
+    """Poses of tools and of frames without children in the base frame, from `/tf` topics.
+
+    Times are left out at which a frame between base and tool has been silent for too long.
     """
     parents = {child: parent for parent, child in edges}
     moving = {c for (_, c), rows in edges.items() if np.ptp([r[2] for r in rows], axis=0).any()}

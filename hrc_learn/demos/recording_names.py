@@ -48,8 +48,8 @@ class ImportOptions:
     joint_names: tuple[str, ...] = ()
     """Joint names."""
     fps: float | int | None = None
-    """Frame rate [1/s]. It gives the times where there are no stamps. Otherwise, it is stored
-    with the dataset, and topics with a higher rate are thinned to it."""
+    """Frame rate [1/s]. Without stamps, it determines the times. With stamps, it is stored in
+    the dataset, and topics with a higher rate are thinned to it."""
     duration: float | int | None = None
     """Duration of each episode [s] where there are no stamps."""
     task: str | None = None
@@ -202,7 +202,7 @@ class FieldSearch:
         """Name that datasets use for a whole field."""
         if one.shape[1:] == (4, 4) or (one.width == 16 and "pose" in key):
             if _OTHER_FRAME.search(name.lower()):
-                self.left_out[name] = "transforms of another frame than the hand's"
+                self.left_out[name] = "transforms of a frame other than the hand"
             return "tcp_pose"
         if one.shape[1:] == (3, 3) and re.search(r"rot|orient|^r$|mat", key):
             return "eef_rotation_matrix"

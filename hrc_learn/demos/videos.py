@@ -200,8 +200,8 @@ def decode(
     gaps = np.flatnonzero(np.diff(numbers) > max(1, round(_SKIP_SECONDS * fps)))
     try:
         with av.open(str(segment.file)) as container:
-            # PyAV's threads work on one image by default. Threads that read ahead may log while
-            # the container closes; both would then wait for Python's lock.
+            # By default, all threads of PyAV decode the same image. Threads that decode ahead
+            # may log while the container closes; both would then wait for Python's lock.
             stream = container.streams.video[0]
             for number, run in enumerate(np.split(numbers, gaps + 1)):
                 wanted, start = {*run.tolist()}, segment.start + run[0] / fps
@@ -261,8 +261,8 @@ def rgb_image(image: Any, size: tuple[int, int] | None = None) -> Image:
     from av.video.reformatter import VideoReformatter
 
     height, width = size or (image.height, image.width)
-    # PyAV caches a reformatter. A process that is forked after its first use, such as a data
-    # loader, lacks its threads and would wait for them forever: make a new one.
+    # PyAV caches a reformatter with threads. A process that is forked later, such as a data
+    # loader, lacks these threads and would wait for them forever. So make a new reformatter.
     return VideoReformatter().reformat(image, width, height, "rgb24").to_ndarray()
 
 
@@ -339,7 +339,7 @@ class CameraRecorder:
             self._videos[camera].add(np.ascontiguousarray(image))
 
     def finish(self, episode: int) -> Statistics:
-        """Close the videos of the episode and give them their names.
+        """Close the videos of the episode and rename them to their final names.
 
         Returns:
             Statistics of the images, by feature.

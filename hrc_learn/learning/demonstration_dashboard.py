@@ -184,7 +184,7 @@ def _limits(shown: ShownDataset) -> JointRanges | None:
     lower, upper = np.full(count, np.nan), np.full(count, np.nan)
     for joint, column in enumerate(shown.arm.columns):
         unit, factor = own_unit(shown.units, "joint_position", column)
-        if unit in ("rad", "deg"):  # the limits of fractions of a range are known from the unit
+        if unit in ("rad", "deg"):  # a fraction of the joint's range needs no limit curves
             lower[column] = float(shown.arm.arm.limits.lower[joint]) / factor
             upper[column] = float(shown.arm.arm.limits.upper[joint]) / factor
     return JointRanges(lower=lower, upper=upper)

@@ -104,8 +104,8 @@ class FittedModel:
         fits = [kind for kind, n in counts.items() if n == len(values) and given in ("", kind)]
         if not fits or not bool(values.isfinite().all()):
             raise ValueError(
-                f"{option} {' '.join(words)}: {self.folder} takes {forms}, all finite, or "
-                "the word episode and its number."
+                f"{option} {' '.join(words)}: {self.folder} needs {forms}, all finite, or "
+                "the word episode and the number of an episode."
             )
         if len(fits) > 1:
             raise ValueError(
@@ -166,7 +166,8 @@ def arm_for(model: FittedModel, name: str) -> Arm:
     if model.joint is not None and {*model.joint_names} != {*names}:
         raise ValueError(
             f"{model.folder} moves the joints {', '.join(model.joint_names)}, but {name} has "
-            f"{', '.join(names)}: choose the arm of its demonstrations, or fit --joint-names."
+            f"{', '.join(names)}: choose the arm of its demonstrations, or use hrc fit "
+            "--joint-names."
         )
     if model.joint is None or model.pose is None:
         return robot

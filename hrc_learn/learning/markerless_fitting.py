@@ -5,8 +5,8 @@ pixels are matched across frames of all demonstrations. The pixels of one featur
 a track. A point fixed to a link of the arm moves with the known kinematics of that link, and
 one unknown camera sees all points. Therefore a camera fitted to one track (`fit_camera`)
 predicts the tracks of all other points of the same link. The camera that explains most tracks
-is chosen, and the explained tracks give the points of the tool. The object is what differs in
-position between demonstrations and lies ahead of the tool when a demonstration ends.
+is chosen, and the explained tracks give the points of the tool. The object lies ahead of the
+tool when a demonstration ends, at a different position in each demonstration.
 """
 
 from __future__ import annotations

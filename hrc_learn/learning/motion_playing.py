@@ -1,4 +1,4 @@
-"""Play a fitted model to a goal: in the model's own coordinates, or on an arm in its limits."""
+"""Play a fitted model to a goal: in the model's own coordinates, or on an arm within limits."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MISSED = 1e-3
 
 
 class BeyondLimitsError(RuntimeError):
-    """The motion violates a limit, whatever its duration."""
+    """The motion violates a limit at any duration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +56,7 @@ class PlayedMotion:
     orientation: Float[np.ndarray, "samples 4"] | None = None
     """Unit quaternions (w, x, y, z)."""
     planned_duration: float
-    """Requested duration [s]; the motion takes longer if the arm's limits require a longer one.
-    """
+    """Requested duration [s]; the motion takes longer if the arm's limits require it."""
     slowed_by: str = ""
     """First limit that made the motion slower; empty if none did."""
     goal_errors: Mapping[str, float]
@@ -103,7 +102,7 @@ def play_path(
             time=time, joints=joints.numpy(), planned_duration=lasting, goal_errors=error
         )
     pose = _pose_path(model, start, goal, lasting)
-    if kind == "position":  # its orientation is not part of the motion
+    if kind == "position":  # a primitive of positions does not move the orientation
         goal = Target(position=goal.position)
     return PlayedMotion(
         time=time,
@@ -214,7 +213,7 @@ def _times(duration: float) -> Float[Tensor, " samples"]:
 def _joint_path(
     model: FittedModel, start: Tensor | None, goal: Tensor, duration: float
 ) -> Float[Tensor, "samples joints"]:
-    """Joint positions, starting at rest, that the best model predicts, in the model's unit."""
+    """Path of the joints from rest that the best model predicts, in the model's unit."""
     joint = model.joint
     assert joint is not None
     start = joint.start if start is None else start
@@ -225,7 +224,10 @@ def _joint_path(
 
 @torch.no_grad()
 def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration: float) -> Pose:
-    """Poses of the end effector from rest; a model of positions has the goal's orientation."""
+    """Poses of the end effector, starting at rest.
+
+    A model of positions has the goal's orientation throughout, or else no rotation.
+    """
     time, pose = _times(duration), model.pose
     assert goal.position is not None
     if pose is None:
@@ -242,7 +244,7 @@ def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration:
 
 
 def _completed(target: Target | None, usual: Pose) -> Pose:
-    """Pose of a target; what the target does not give is taken from the usual pose."""
+    """Pose of a target; position or orientation that it lacks come from the usual pose."""
     if target is None or target.position is None:
         return usual
     turned = usual.orientation if target.orientation is None else target.orientation
@@ -255,8 +257,9 @@ def _joints_along(
 ) -> Float[Tensor, "samples joints"]:
     """Joint positions [rad] along the model's poses, starting at the joints `first` [rad].
 
-    In the null space, the arm moves towards the model's joints at its goal; an arm of fewer
-    than six joints moves towards joints that turn the tool to the goal's orientation.
+    In the null space, the arm moves towards the joint positions of the model's goal. An arm of
+    fewer than six joints moves towards joint positions that turn the tool to the goal's
+    orientation.
     """
     begin = robot.forward(first)
     start = Target(position=begin.position, orientation=begin.orientation)
@@ -357,7 +360,7 @@ def _distance(
     """Largest distance of any joint of a motion from a path, regardless of time [rad]."""
     between = torch.linspace(0, 1, 5, dtype=path.dtype)[:-1, None, None]
     fine = torch.cat([torch.lerp(path[:-1], path[1:], between).flatten(0, 1), path[-1:]])
-    # In parts: the distances of all pairs of a motion of minutes need gigabytes.
+    # Computed in parts: for a motion of minutes, all distances at once need gigabytes.
     parts = torch.from_numpy(joints).split(256)
     return max(float(torch.cdist(part, fine, p=torch.inf).amin(1).max()) for part in parts)
 

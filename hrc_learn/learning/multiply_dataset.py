@@ -39,7 +39,7 @@ _TOOL = ("position", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw")
 _LEFT_OUT = ("feature", "feature_visible", "human_effort", "joint_effort", "time")
 # A column with at most this many distinct values is a switch, which is not interpolated.
 _LEVELS = 5
-# Deviation of recorded tool positions from the joints that passes as noise [m].
+# Largest distance of recorded tool positions from forward kinematics that counts as noise [m].
 _APART = 5e-3
 
 type Place = tuple[str, int]
@@ -67,8 +67,8 @@ class MultipliedColumns:
             source: Demonstrations.
             taught: Arm of the demonstrations.
             robot: Arm of the new motions.
-            objects: By name of an object, the columns of its pose as FEATURE[FIRST:LAST]; only
-                needed where the names of the columns do not reveal them.
+            objects: Name of an object -> columns of its pose as FEATURE[FIRST:STOP]; only
+                needed for objects that the names of the columns do not reveal.
 
         Raises:
             ValueError: Columns in `objects` do not exist, or do not form a pose.
@@ -130,12 +130,12 @@ class MultipliedColumns:
             arm, root = self._taught.arm.name, self._source.folder.root
             raise ValueError(
                 f"{root}: the recorded tool is {1000 * apart:.0f} mm from where the joints of "
-                f"{arm} move it: give both in its base frame (hrc check finds wrong zeros)"
+                f"{arm} move it: record it in its base frame (hrc check finds wrong zeros)"
             )
         return found if found.norm() > _APART else torch.zeros_like(found)
 
     def _refuse_changes(self) -> None:
-        """Check that actions named as the tool's position hold positions, no changes of it."""
+        """Check that actions named like the tool's position hold positions, not changes."""
         for key, i, role, n in self._next:
             (shown, k), parts = self._places[role][n], self._frames
             apart = np.concatenate([p[key][:-1, i] - p[shown][1:, k] for p in parts])

@@ -186,7 +186,7 @@ def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
 
 
 def frame_of(objects: Mapping[str, Pose], name: str, like: Pose) -> Pose:
-    """Poses of the frame `name` in the base frame; the base frame gets the batch of `like`."""
+    """Poses of the frame `name` in the base frame; for the base frame, as many as in `like`."""
     still = torch.zeros_like(like.orientation)
     still[..., 0] = 1.0
     if name == BASE:
@@ -318,7 +318,8 @@ class MotionSource:
     obstacles: Float[Tensor, "boxes 6"]
     """Boxes to avoid: centre and half edges [m]."""
     ending: float = 0.0
-    """Last fraction of the last segment in which a motion comes to rest; 0: it ends at rest."""
+    """Last fraction of the last segment in which a motion comes to rest; 0: the demonstrations
+    already end at rest."""
 
     @classmethod
     def fit(
@@ -340,8 +341,9 @@ class MotionSource:
             segmentation: Segments and their frames.
             robot: Arm of the new motions.
             near: Joint positions along each demonstration [rad] if `robot` was demonstrated:
-                the new motions keep the demonstrated posture. Else postures at the first pose
-                [rad]: the first one is taken from which the arm follows a demonstration freely.
+                the new motions keep the demonstrated posture. Otherwise, candidate postures at
+                the first pose [rad]. The posture is used from which the arm reaches most frames
+                of the first demonstration, preferably without a collision.
             obstacles: Boxes to avoid: centre and half edges [m].
 
         Raises:

@@ -60,10 +60,11 @@ def fit_visual_servo(
         neurons: Neurons of the network. Default: around the demonstrated poses.
         config: Noise, prior and key frames for the network, which learns the residual of the
             fitted camera.
-        learning: Settings for learning neurons, noise and prior. These are not learned if it
-            is None or there are fewer than `learning.hold_out` demonstrations.
+        learning: Settings for learning neurons, noise and prior. These are not learned if
+            `learning` is None or there are fewer than `learning.hold_out` demonstrations.
         on_round: Called with the number and result of each round of learning.
-        landmarks: Landmarks whose pixels are the image features; None: they are of markers.
+        landmarks: Landmarks whose pixels are the image features. None: the image features are
+            pixels of markers.
 
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
@@ -152,7 +153,11 @@ class _End(NamedTuple):
 
 
 def _ends(demos: Demonstrations, *, partial: bool = False) -> list[_End]:
-    """Ends of demonstrations that show an object: of all of them unless `partial`."""
+    """Ends of the demonstrations that show an object.
+
+    Raises:
+        ValueError: Only some demonstrations show an object, without `partial`.
+    """
     ends, without = [], []
     for demo in demos:
         if OBJECT_FEATURE in demo.extra:

@@ -45,7 +45,7 @@ EPISODE = 1.0
 
 
 class Device:
-    """Mix-in for devices without calibration; precedes LeRobot's own class among the bases."""
+    """Mix-in for devices without calibration; list it before LeRobot's class as a base."""
 
     _connected, is_calibrated = False, True
 
@@ -220,7 +220,7 @@ class ArmRobot(Device, Robot):
         initial_configurations: Number of resets of the scene; only a simulation can be reset.
         complement: Combination with the person's input, while connected; None: there is no
             person.
-        judged: True if the arm's motion may be recorded: warnings of poor quality are given.
+        judged: True if the arm's motion may be recorded. Poor recordings then cause warnings.
     """
 
     in_real_time = True
@@ -357,7 +357,7 @@ class ArmRobot(Device, Robot):
     def clearance(
         self, joint_position: Float[Tensor, "*batch joints"]
     ) -> Float[Tensor, "*batch"]:
-        """Distance of the arm from known obstacles [m]: from itself alone for a real arm."""
+        """Distance of the arm from known obstacles [m]; for a real arm, only from itself."""
         return self.work_arm.whole.self_distance(joint_position)
 
     def _invite(self, config: PersonConfig) -> None:

@@ -156,7 +156,7 @@ def add_camera_watch(
         image_size: Width and height of the camera's images [px].
         correct: True to correct the pixels of the marker, and of an object if there is one. The
             object's pixel must be known in the first frame of each episode, and the tool must
-            be lowest where it takes the object.
+            be lowest where it grasps the object.
 
     Returns:
         Reference of the camera in the demonstrations.
@@ -164,7 +164,7 @@ def add_camera_watch(
     Raises:
         FileNotFoundError: The folder holds no preprocessor.
         ValueError: The dataset lacks a column, which the message names, or the object was not
-            taken from where it was seen.
+            grasped where it was seen.
     """
     path = checkpoint / PREPROCESSOR
     content = read_pipeline(path, without=(CAMERA_WATCH,))

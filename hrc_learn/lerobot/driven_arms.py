@@ -69,12 +69,12 @@ class DrivenArmConfig(ArmRobotConfig):
 
 
 class DrivenArm(ArmRobot):
-    """An arm commanded by positions, through a driver that takes velocities.
+    """An arm commanded by positions, through a driver that accepts velocities.
 
     An action passes four stages on its way to the arm. `MotionFilter` keeps the limits of the
     joints' motion. The safety filter caps the speed of the tool. A watchdog, in a separate
-    process together with the driver, stops the arm if the loop sends nothing. The driver ends
-    every velocity by itself. Keep the stop button in hand.
+    process together with the driver, stops the arm if the loop sends nothing. The driver stops
+    the arm if it receives no new velocity in time. Keep the stop button in hand.
 
     Attributes:
         arm: The driver's process, while connected.
@@ -139,7 +139,7 @@ class DrivenArm(ArmRobot):
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float
     ) -> Float[np.ndarray, " joints"]:
-        self._arm.feed()  # its answer tells of a stop while the policy computed the action
+        self._arm.feed()  # the answer reports a stop while the policy computed the action
         if self._arm.trips != self._trips:
             self._trips = self._arm.trips
             self._servo.restart()  # the arm is at rest, which the servo does not know

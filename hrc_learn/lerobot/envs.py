@@ -40,7 +40,8 @@ class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
     fps: int = 50
     """Frame rate of the training dataset [Hz]."""
     episode_length: int | None = None
-    """Actions after which an episode has failed; None: a quarter more than a demonstration."""
+    """Number of actions after which an episode has failed; None: a quarter more than in a
+    demonstration."""
 
     def __post_init__(self) -> None:
         robot = MujocoArmRobot(self.robot_config())
@@ -129,7 +130,7 @@ class ArmEnv(gym.Env):
     def step(
         self, action: Float[np.ndarray, " values"]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Send an action, and let 1/fps pass. The reward is 1 once the task is done, else 0."""
+        """Send an action, and advance time by 1/fps. The reward is 1 once the task is done."""
         values = np.asarray(action).tolist()
         self._robot.send_action(dict(zip(self._actions, values, strict=True)))
         self._done = self._done + 1 if self._robot.run.succeeded() else 0

@@ -89,7 +89,7 @@ def test_poses_are_imported_in_centimetres(tmp_path):
         (["--joints", "p", "--time", "t"], "pour.npz, joint_position: there is no column 'p'"),
         (["--joints", "q"], None),
         (["--joints", "q", "--time", "t", "--joint-names", "a"], "1 joint names for 7 columns"),
-        (["--position", "q", "--time", "t"], "position takes 3 columns, not 7"),
+        (["--position", "q", "--time", "t"], "position needs 3 columns, not 7"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, arguments, message):

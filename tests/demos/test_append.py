@@ -195,9 +195,7 @@ def test_a_dataset_that_was_shortened_meanwhile_is_not_extended(tmp_path):
     write_curated(root, one, {0: Decision(verdict="reject", length=40)})
     root.rename(both)
     one.rename(root)
-    with pytest.raises(
-        DatasetError, match="holds 1 episodes, but 2 when it was to be extended"
-    ):
+    with pytest.raises(DatasetError, match="holds 1 episodes, but 2 when the recording began"):
         recover_dataset(root)
     assert_holds(root, [1], ["reach"])
     root.rename(one)

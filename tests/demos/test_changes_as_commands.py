@@ -340,7 +340,7 @@ def test_changes_have_the_scale_of_the_motion_they_make(scale, unit):
     assert [*found] == ["command_position"]
     command = found["command_position"]
     assert (command.unit, command.units, command.guessed) == (unit, (), True)
-    text = f"the joints follow its sum ({scale:.2g} rad per unit, R2 0.95), so that it holds"
+    text = f"the joints follow the sum of the commands ({scale:.2g} rad per unit, R2 0.95), so"
     assert command.evidence.startswith(text)
     assert command.steps.all()
 

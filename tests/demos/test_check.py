@@ -359,7 +359,7 @@ ODD = {
     ),
     "index column gone": (
         lambda r: rewrite(r / DATA, lambda table: table.drop_columns(["frame_index"])),
-        "the column is missing: LeRobot cannot open this",
+        "the column is missing: LeRobot cannot open this file",
         (None, None, "frame_index"),
     ),
 }
@@ -473,7 +473,7 @@ def test_a_rotation_near_half_a_turn_may_be_turned_over(tmp_path, turn, errors):
         place = joint_path(60, 3) + 0.01 * rng.normal(size=3)
         episodes.append({STATE: np.hstack([place, vector])})
     report = check_dataset(write_folder(tmp_path / "set", episodes, names))
-    found = [e for e in report.errors if "other sign" in e.message]
+    found = [e for e in report.errors if "opposite sign" in e.message]
     assert len(found) == errors
     assert all(e.episode == 2 and "ee.wy" in e.message for e in found)
 

@@ -87,7 +87,7 @@ def test_a_joint_has_the_other_sign_where_negated_it_is_like_the_others(
     tmp_path, usual, odd, told
 ):
     episodes = [*(three(usual, i) for i in range(ODD)), three(odd, ODD)]
-    issues = found(tmp_path / "set", episodes, "has the other sign")
+    issues = found(tmp_path / "set", episodes, "has the opposite sign")
     assert [(i.episode, i.components) for i in issues] == (
         [(ODD, ("elbow.pos",))] if told else []
     )
@@ -111,7 +111,7 @@ def test_an_episode_runs_backwards_if_all_of_it_does(tmp_path, forwards, backwar
 
     names = [f"joint{i}.pos" for i in range(len(forwards))]
     episodes = [*(episode(forwards, i) for i in range(ODD)), episode(backwards, ODD)]
-    issues = found(tmp_path / "set", episodes, "runs the other way", names)
+    issues = found(tmp_path / "set", episodes, "runs in the reverse direction", names)
     assert [issue.episode for issue in issues] == ([ODD] if told else [])
 
 

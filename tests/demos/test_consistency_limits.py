@@ -249,7 +249,7 @@ def gripper(start, goal, span=1.0):
 @pytest.mark.parametrize(
     ("start", "goal", "span", "text"),
     [
-        (0, 0, 0, "b stays, it switches in the other episodes"),
+        (0, 0, 0, "b does not switch, unlike in the other episodes"),
         (1, 0, 1, "b switches the other way than in the other episodes"),
         (0.91, 0.09, 1, "b switches the other way than in the other episodes"),
         (0.89, 0.0, 1, None),
@@ -345,11 +345,11 @@ NEGATED = tuple(-np.array([0.95, 0.5, 0.05, 0, 1]))
 
 
 def test_the_other_sign_is_found_by_the_negated_figures():
-    text = "has the other sign than in the other episodes: a"
+    text = "has the opposite sign of the other episodes: a"
     assert compared((NEGATED, FALLING, ARCH)) == [(4, ("a",), text)]
     for shift, told in ((0.07, True), (-0.07, True), (0.08, False)):
         found = compared((moved(NEGATED, shift), FALLING, ARCH))
-        assert [t.startswith("has the other sign") for *_, t in found] == [told]
+        assert [t.startswith("has the opposite sign") for *_, t in found] == [told]
 
 
 def turned(column):
@@ -359,7 +359,7 @@ def turned(column):
 
 def test_an_episode_that_runs_the_other_way():
     usual = (RISING, FALLING, (5.0, 5.4, 5.9, 5.0, 5.9))
-    text = "runs the other way than the other episodes"
+    text = "runs in the reverse direction of the other episodes"
     ((episode, _, found),) = compared([turned(column) for column in usual], usual)
     assert (episode, found) == (4, text)
     one = [turned(RISING), FALLING, usual[2]]

@@ -88,7 +88,7 @@ def test_a_millimetre_and_a_tick_of_noise_do_not_matter(model):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda q: q * [1, 1, -1, 1, 1, 1], "elbow_joint with the other sign"),
+        (lambda q: q * [1, 1, -1, 1, 1, 1], "elbow_joint with opposite sign"),
         (
             lambda q: q * [1, -1, 1, -1, 1, 1],
             "shoulder_lift_joint, wrist_1_joint with the other",
@@ -195,7 +195,7 @@ def test_without_a_pose_the_unit_is_assumed_and_the_line_says_so(tmp_path):
 
 def test_a_joint_that_counts_the_other_way_is_asked_about(model, tmp_path):
     root, _ = write(tmp_path / "set", model, lambda q: q * [1, 1, -1, 1, 1, 1])
-    with pytest.raises(DatasetError, match=r"mm only with elbow_joint with the other sign"):
+    with pytest.raises(DatasetError, match=r"mm only with elbow_joint with opposite sign"):
         open_demos(root, refuse_doubt=True)
     demos = open_demos(root, units={"joint_position": "rad"}, refuse_doubt=True)
     assert len(demos) == 3

@@ -417,7 +417,10 @@ GRIPPER = Demonstration(time=np.arange(60) / 50, gripper=np.zeros(60), fps=50)
             r"joint_velocity must be between 0 and 1.18 s, got -0.1",
         ),
         (lambda: compensate_delay(ALONE, {"joint_velocity": 1.2}), r"0 and 1.18 s, got 1.2"),
-        (lambda: compensate_delay(ALONE, {"gripper": 0.1}), "gripper is not recorded; there"),
+        (
+            lambda: compensate_delay(ALONE, {"gripper": 0.1}),
+            "gripper is not recorded; recorded",
+        ),
         (
             lambda: align(DemonstrationSet([GRIPPER, GRIPPER])),
             "alignment needs joints or poses recorded in all",

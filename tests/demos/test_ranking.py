@@ -24,7 +24,7 @@ def qualities(name, values):
 @pytest.mark.parametrize(
     ("name", "usual", "own", "text"),
     [
-        ("distance", 1.0, 2.01, "moves unlike all others: 2.0 times as far"),
+        ("distance", 1.0, 2.01, "moves unlike the other episodes: 2.0 times the usual"),
         ("distance", 1.0, 1.99, None),
         ("duration", 5.0, 6.15, "takes 6.2 s, 5.0 s are usual"),
         ("duration", 5.0, 6.09, None),

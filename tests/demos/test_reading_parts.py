@@ -275,7 +275,7 @@ FEATURES = {
         ("pose", [("group/pose", k) for k in range(3)]),
         ("pose[0]", [("group/pose", 0)]),
         ("d", "'d' for position is ambiguous: write one of observation.state/d, group/pose/d"),
-        ("bare[2]", "which is no range of its 2 components"),
+        ("bare[2]", "is no range of the 2 components"),
         ("bare[1:1]", "which is no range"),
         ("bare[0:3]", "which is no range"),
         ("bare[x]", "which is no range"),

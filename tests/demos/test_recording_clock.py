@@ -198,7 +198,7 @@ def test_a_field_without_stamps_may_lack_one_frame(frames):
     one = recording(q=q, u=np.arange(float(frames)))
     known = meaning(command_position="u", **JOINTS)
     if abs(frames - 10) > 1:
-        text = f"it has {frames}, the state 10, and it has no stamps of its own"
+        text = f"has {frames} frames, but the state 10; without stamps"
         with pytest.raises(DatasetError, match=text):
             clock(one, known, fps=10)
         return

@@ -225,7 +225,7 @@ def test_an_hdf5_file_gives_what_its_nodes_hold(tmp_path):
     np.testing.assert_array_equal(one.fields["arm/q"].read(3, 7), Q[3:7])
     with h5py.File(path, "a") as file:
         file.create_virtual_dataset("copy", layout)
-    with pytest.raises(DatasetError, match=r"a\.h5, copy: is kept in another file"):
+    with pytest.raises(DatasetError, match=r"a\.h5, copy: is in another file"):
         open_recordings(path)
     with h5py.File(path, "a") as file:
         del file["copy"]
@@ -414,7 +414,7 @@ def test_a_video_belongs_to_the_episode_whose_name_it_begins_with(tmp_path):
     (folder / "other.mp4").write_bytes(video)
     assert cameras() == [["run_1"], ["left"]]
     notes = [part.notes for part in open_recordings(folder)]
-    text = "videos left out, as their names begin with the name of no other file: other.mp4"
+    text = "videos left out, as no other file's name begins their names: other.mp4"
     assert notes == [(text,), ()]
 
 
@@ -422,17 +422,17 @@ def test_a_file_of_several_episodes_takes_no_video(tmp_path):
     write_video_and_table(tmp_path / "run")
     (tmp_path / "run/run.csv").unlink()
     np.save(tmp_path / "run/run.npy", np.stack([Q, Q]))
-    with pytest.raises(DatasetError, match=r"run\.npy: holds several episodes, and the videos"):
+    with pytest.raises(DatasetError, match=r"run\.npy: holds several episodes, but its"):
         open_recordings(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("a.MP4", "is a video: name the folder that holds its states, too"),
+        ("a.MP4", "is a video: give the folder of the video and its states"),
         ("a.PKL", "is a pickle, which can run any program"),
-        ("a.docx", r"is of no kind that is read here: \.csv, \.tsv"),
-        ("a.bag.active", "is of no kind that is read here"),
+        ("a.docx", r"has none of the known formats: \.csv, \.tsv"),
+        ("a.bag.active", "has none of the known formats"),
     ],
 )
 def test_files_that_are_not_opened(tmp_path, name, text):

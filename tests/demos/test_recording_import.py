@@ -109,7 +109,7 @@ def test_a_preview_counts_and_names_ranges_of_fields():
 def test_names_of_columns_that_no_file_takes_are_refused(tmp_path):
     np.savez(tmp_path / "own.npz", qpos=Q, time=np.arange(len(Q)))
     named = ImportOptions(fps=10)
-    with pytest.raises(ValueError, match=r"x, y \(--columns\) name no columns of the files"):
+    with pytest.raises(ValueError, match=r"--columns x, y: the files already name"):
         plan_import([tmp_path / "own.npz"], named, ["x", "y"])
     np.save(tmp_path / "bare.npy", Q)
     files = [tmp_path / "bare.npy"]

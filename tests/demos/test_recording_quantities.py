@@ -62,12 +62,12 @@ def test_joints_at_rest_are_compared_by_their_distance():
 def test_a_state_of_unknown_content_is_kept_and_left_out_next_to_joints():
     found = understood(state=Q)
     assert found.kept["observation.state"][1] == ("state_0", "state_1", "state_2")
-    assert found.notes == ["state is kept as recorded: its name tells no content"]
+    assert found.notes == ["state is kept as recorded: its name states no content"]
     found = understood(state=Q, qpos=Q)
     text = "a state of unknown content; to keep it: observation.NAME"
     assert found.left_out == {"state": text}
     found = understood(array=Q)
-    assert found.notes == ["nothing names the columns: taken for joints (--columns names them)"]
+    assert found.notes == ["the columns have no names: taken for joints (--columns names them)"]
     assert found.joint_names == ("joint1", "joint2", "joint3")
 
 
@@ -89,13 +89,13 @@ def test_columns_that_the_caller_names_have_a_width():
         columns = {"joint_position": "q", "quaternion_wxyz": "r"}
         given = understood({"columns": columns}, q=Q, r=turn)
         assert role in given.selections
-    with pytest.raises(DatasetError, match="position takes 3 columns, not 2"):
+    with pytest.raises(DatasetError, match="position needs 3 columns, not 2"):
         understood({"columns": {"position": "p[0:2]"}}, p=Q)
     two = understood(
         {"columns": {"gripper": "g", "joint_position": "q"}}, q=Q, g=Q[:, :2] * 0.03
     )
     assert len(two.selections["gripper"].columns) == 2
-    with pytest.raises(DatasetError, match="gripper takes 1 columns, not 3"):
+    with pytest.raises(DatasetError, match="gripper needs 1 columns, not 3"):
         understood({"columns": {"gripper": "g", "joint_position": "q"}}, q=Q, g=Q)
 
 
@@ -174,7 +174,7 @@ def test_transforms_beyond_the_reach_of_an_arm_may_be_in_millimetres(flat):
         return understood(options, units=units, ee_pose=values)
 
     assert ask(4.9).decisions["pose_matrix"].unit == "m"
-    with pytest.raises(DatasetError, match=r"in m or mm\? It reaches 5\.1: say --units") as c:
+    with pytest.raises(DatasetError, match=r"in m or mm\? It reaches 5\.1: give --units") as c:
         ask(5.1)
     assert c.value.key == "ee_pose"
     assert ask(5.1, {"units": {"pose_matrix": "mm"}}).decisions["pose_matrix"].unit == "mm"
@@ -262,7 +262,7 @@ def test_fields_that_are_not_taken_are_listed_with_the_reason():
         "waves": "no frames",
         "reward": "a counter, or data of a learner or the next frame",
         "next_obs/qpos": "a counter, or data of a learner or the next frame",
-        "camera_pose": "transforms of another frame than the hand's",
+        "camera_pose": "transforms of a frame other than the hand",
         "other": "not understood; to keep it: observation.NAME",
     }
     assert found.main == "qpos"

@@ -137,7 +137,7 @@ def test_a_gap_of_more_than_a_fifth_of_a_second_divides(gap, parts):
     assert len(found) == parts
     if parts == 2:
         assert [one.label for one in found] == ["part 0", "part 1"]
-        assert found[0].notes == ("q is silent for 0.25 s at 1.00 s: divided there",)
+        assert found[0].notes == ("q is silent for 0.25 s at 1.00 s: the bag is divided there",)
         assert found[1].notes == ()
         times = [one.fields["q/stamp"].numbers()[:, 0] for one in found]
         assert times[0][-1] == pytest.approx(1.0)
@@ -190,4 +190,4 @@ def test_messages_written_at_once_have_no_times(step, at_once):
     (one,) = divided(q=time)
     assert one.streams != at_once
     assert (one.fields["q"].clock == "") == at_once
-    assert any("written at once" in note for note in one.notes) == at_once
+    assert any("written at the same time" in note for note in one.notes) == at_once

@@ -105,7 +105,7 @@ def test_durations_and_rates_are_positive(tmp_path, name, value):
 @pytest.mark.parametrize(
     ("arrays", "columns", "message"),
     [
-        ({"x": Q}, {}, "name the arrays of joints or poses.*it holds x"),
+        ({"x": Q}, {}, "name the arrays of joints or poses.*there are x"),
         (
             {"q": Q},
             {"joint_position": "p"},
@@ -123,7 +123,7 @@ def test_durations_and_rates_are_positive(tmp_path, name, value):
         ({"q": Q * np.nan, "t": TIME}, {"joint_position": "q"}, "q: is nan at frame 0"),
         ({"q": Q, "t": TIME[::-1]}, {"joint_position": "q"}, "time must increase.*frame 0"),
         ({"o": np.ones((40, 4)), "q": Q, "t": TIME}, Q_AND_O, "of length 2"),
-        ({"o": Q[:, :2], "q": Q, "t": TIME}, Q_AND_O, "quaternion_wxyz takes 4 columns"),
+        ({"o": Q[:, :2], "q": Q, "t": TIME}, Q_AND_O, "quaternion_wxyz needs 4 columns"),
         ({"q": 1000 * np.arange(40), "t": TIME}, {"joint_position": "q[1:3]"}, "no range"),
         ({"q": Q, "t": np.arange(40)}, {}, "t: steps by 1: a count of frames"),
         ({"q": Q, "t": 200 * TIME}, {}, "t: steps by .*: s, ms, us or ns"),
@@ -166,7 +166,7 @@ def saved(save, *arrays, **named):
         ("a.npy", b"junk", "cannot be read"),
         ("a.npz", b"junk", "cannot be read"),
         ("a.mat", b"junk", "cannot be read"),
-        ("a.doc", b"junk", "is of no kind"),
+        ("a.doc", b"junk", "has none of the known formats"),
         ("a.csv", b"", "is empty"),
         ("a.csv", b"t,q\n", "no numbers"),
         ("a.csv", b"t,q\n0,1\n0.1\n", "line 3 does not hold 2 numbers"),
@@ -285,18 +285,21 @@ def dataset(path):
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (dataset, "is a LeRobot dataset already: `hrc check`"),
+        (dataset, "is a LeRobot dataset already: use `hrc check`"),
         (lambda path: (path / "notes.txt.bak").touch(), "holds no recording that is read here"),
-        (kept_elsewhere, "a.h5, q: is kept in another file: not opened"),
+        (kept_elsewhere, "a.h5, q: is in another file, and not read"),
         (
             buffer(episode_ends=np.array([10, 50])),
-            r"up to the 40 frames there are, got \[10, 50",
+            r"exceed the 40 frames of the arrays, got \[10, 50",
         ),
-        (buffer(episode_ends=np.array([20, 20, 40])), r"must increase up to the 40 frames"),
-        (buffer(episode_ends=np.array([0, 40])), r"must increase up to the 40 frames"),
+        (
+            buffer(episode_ends=np.array([20, 20, 40])),
+            "and not exceed the 40 frames",
+        ),
+        (buffer(episode_ends=np.array([0, 40])), "and not exceed the 40 frames"),
         (
             buffer(episode=np.repeat([0, 1, 0, 2], 10)),
-            "numbers the episodes, but comes back to earlier ones",
+            "numbers the episodes, but repeats an earlier number",
         ),
         (
             buffer(q=np.stack([Q] * 3), u=np.stack([Q] * 2)),
@@ -309,7 +312,7 @@ def dataset(path):
         ),
         (
             clocks(gripper=np.full(30, 0.01)),
-            "it has 30, the state 40, and it has no stamps of its own",
+            "has 30 frames, but the state 40; without stamps",
         ),
     ],
 )

@@ -316,7 +316,7 @@ def test_an_interrupted_recording_that_is_not_whole_is_named(tmp_path, kind):
     assert len(staged) == 3
     if kind == "missing":
         staged[1].unlink()
-        fault = "is missing from the recording; rename the later ones"
+        fault = "is missing from the recording; rename the later files"
     else:
         pq.write_table(pq.read_table(staged[1]).replace_schema_metadata({}), staged[1])
         fault = "no episode of a recording"

@@ -75,8 +75,8 @@ def check_dataset(
         path: Folder of the dataset.
         mapping: Columns of quantities that are not found by name, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`.
-        robot: Arm of the dataset, with whose kinematics joints and positions are compared; None
-            for that of the robot type.
+        robot: Arm of the dataset. Its forward kinematics are compared with recorded positions.
+            None for the arm of the dataset's robot type.
 
     Raises:
         DatasetError: `mapping` or `units` name an unknown quantity, column or unit.
@@ -228,7 +228,7 @@ def _is_sound(frames: RawFrames, mapping: ColumnMapping) -> bool:
 
 
 def _meaning(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> Iterator[Issue]:
-    """Report guesses, quantities of other joints, and missing joints and poses."""
+    """Report guesses, quantities whose joints do not match, and missing joints and poses."""
     for note in (*mapping.notes, *(decision.note for decision in decisions.values())):
         if note:
             yield warning(message=note)

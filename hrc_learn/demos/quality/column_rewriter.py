@@ -54,7 +54,8 @@ def write_copy(
         out: Folder of the new dataset, which must not exist.
         episodes: The episodes, all with the same header.
         tasks: Task texts in order of their indices.
-        notes_of: Dataset whose card, licence and metadata of other programs are copied.
+        notes_of: Dataset from which the card, the licence and the metadata of other programs
+            are copied.
 
     Raises:
         DatasetError: There are no episodes.

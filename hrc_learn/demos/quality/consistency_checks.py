@@ -40,7 +40,7 @@ _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
 _OFFSET = 0.1
 """Smallest distance between command and state at rest that is reported, relative to the joint's
-range. Hobby servos under load stop a few degrees away."""
+range. Hobby servos under load stop a few degrees from their command."""
 
 
 def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
@@ -150,7 +150,7 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
         for number in np.flatnonzero(~alike).tolist():
             name = feature.names[component]
             if span[number, component] == 0:
-                text = f"{name} stays, it switches in the other episodes"
+                text = f"{name} does not switch, unlike in the other episodes"
             elif opposite[number, :, component].all():
                 text = f"{name} switches the other way than in the other episodes"
             else:
@@ -231,12 +231,12 @@ def _moved(
     turned = np.abs(-own[[2, 1, 0, 3, 4]] - usual).mean(0) / scale
     negated = np.flatnonzero((off > _FAR_OFF) & (turned < 1.5) & (turned < 0.25 * off))
     if len(negated):
-        text = "has the other sign than in the other episodes"
+        text = "has the opposite sign of the other episodes"
         return "error", f"{text}: {listed(names, negated)}"
     # Compare all components together: a single component may look alike in both directions.
     back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
     if off.mean() > 2 and back.mean() < 0.4 * off.mean():
-        return "warning", "runs the other way than the other episodes"
+        return "warning", "runs in the reverse direction of the other episodes"
     moved, shift = np.flatnonzero(off > 3 * _FAR_OFF), own - usual
     # A moved zero shifts all five figures by the same amount.
     alike = np.ptp(shift, axis=0) < 0.2 * np.abs(shift.mean(0))
@@ -252,7 +252,7 @@ def _moved(
 
 
 def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
-    """Mask of the components of orientations that can change their sign without a rotation.
+    """Mask of components whose sign can change while the orientation stays the same.
 
     These are quaternions, and rotation vectors near half a turn in any episode.
     """
@@ -267,7 +267,7 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
 def command_tracking(
     command: ColumnSelection, profiles: Sequence[EpisodeProfile]
 ) -> Iterator[Issue]:
-    """Report episodes whose states follow their commands differently than in the others.
+    """Report episodes whose states follow their commands differently than in other episodes.
 
     Args:
         command: Columns of the commands.
@@ -369,8 +369,8 @@ def joint_zeros(
         if offset
     ]
     if found:
-        text = "the zeros of joints are off: the forward kinematics give the position with"
-        yield warning(message=f"{text} {', '.join(found)}", key="joint_position")
+        text = "zeros of joints are off: forward kinematics give the recorded positions with"
+        yield warning(message=f"{text} {', '.join(found)} added", key="joint_position")
 
 
 def _component_tracking(

@@ -50,7 +50,7 @@ def finite_values(
             text = (
                 f"{folder.features[key].component(component)} is {values[frame, component]} "
                 f"({len(bad)} values are not finite); hrc repair --drop bad-frames (or "
-                f"bad-episodes) makes a copy without"
+                f"bad-episodes) makes a copy without them"
             )
             yield entry.fault(text, frame=frame, key=key)
 
@@ -128,7 +128,7 @@ def stamps(
         text = "LeRobot's stamps count from the start of the episode"
         yield entry.warning(f"begins at {time[0]:.6g} s, not at 0: {text}", frame=0, key=key)
     if (np.abs(steps * fps - 1) < _REGULAR).all():
-        return  # within all tolerances below, which take far longer to compute
+        return  # within all tolerances below; the checks below are far slower
     # The median step ignores gaps and repetitions.
     usual = float(np.median(steps))
     if abs(usual * fps - 1) > _RATE_TOLERANCE:

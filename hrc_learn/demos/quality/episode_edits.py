@@ -340,14 +340,14 @@ def fix_signs(edit: EpisodeEdit) -> EpisodeEdit:
 def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     """Resample every column to a regular grid that begins at the first frame.
 
-    Joints, joint velocities, positions and quaternions follow cubic splines, other columns
-    straight lines; integers, switches and hands take the nearest frame. Joints, commands and
-    Euler angles that jump by whole turns are unwrapped. Rotation vectors are interpolated as
-    they are: unwrap them first. Stamps must increase.
+    Joints, joint velocities, positions and quaternions follow cubic splines. Integers, switches
+    and hands have the values of the nearest frame. All other columns follow straight lines.
+    Joints, commands and Euler angles that jump by whole turns are unwrapped. Rotation vectors
+    are interpolated as they are: unwrap them first. Stamps must increase.
 
     Raises:
-        DatasetError: The episode is shorter than a period, or it holds changes per step or
-            transforms, which cannot be interpolated entry by entry.
+        DatasetError: The episode is shorter than a period. Or it holds commands that are
+            changes per step, or poses as matrices, which cannot be interpolated.
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 
@@ -367,7 +367,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     smooth, seen = fix_signs(_unwrapped_all(edit)), None
     if {"feature", "feature_visible"} <= edit.selections.keys():
         seen = edit.quantities["feature_visible"] > 0
-        pixels = edit.quantities["feature"]  # it need not be finite where it is not visible
+        pixels = edit.quantities["feature"]  # they need not be finite while it is not visible
         sound = np.where(np.isfinite(pixels) | seen, pixels, 0.0)
         smooth = smooth.with_quantity("feature", sound)
     frames = {

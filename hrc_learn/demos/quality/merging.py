@@ -1,4 +1,4 @@
-"""Merge datasets: match columns by name, convert to the units of the first, copy videos."""
+"""Merge datasets: match columns by name, convert units to those of the first, copy videos."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -92,7 +92,7 @@ class _Source:
         meanings: Component -> its quantity and joint, for components that hold a quantity.
         units: Component -> its unit, for the same components.
         places: Feature -> components of this dataset in the order of the first dataset.
-        factors: Feature -> factors from these components to the units of the first dataset.
+        factors: Feature -> factors that convert these components to the first dataset's units.
     """
 
     def __init__(self, dataset: OpenedDataset):
@@ -261,7 +261,7 @@ class _Merge:
         for key, feature in features.items():
             others = [source.folder.info["features"].get(key, {}) for source in self.sources]
             if any(other.get("info") != feature.get("info") for other in others):
-                # It describes the videos; LeRobot reads it from the files.
+                # `info` describes the videos; LeRobot reads it from the video files.
                 feature.pop("info", None)
         old = own.sidecar
         columns = {role: c for role, c in old.columns.items() if c.key in features}

@@ -1,4 +1,4 @@
-"""Ranking of a dataset's episodes by how doubtful they are, and the decisions on them.
+"""Ranking of a dataset's episodes by how doubtful they are, and decisions on the episodes.
 
 A ranking decides nothing: it tells a person which episodes to look at first, and why. Decisions
 are kept next to the dataset, and a curated copy follows them.
@@ -155,7 +155,7 @@ def _demonstrations(
     """Readable episodes, one at a time; the errors of all others are added to their doubt."""
     dataset = open_dataset(root)
     entries = dataset.folder.episodes
-    # Faults are ignored here: the check reports episodes with units unlike the rest.
+    # Faults are ignored here: the check reports episodes whose units differ from the rest.
     decisions, _ = dataset.decide_units(entries, {})
     demos = DemonstrationSource(dataset, entries, decisions).each()
     for entry, demo in zip(progress(entries) if progress else entries, demos, strict=True):
@@ -173,7 +173,7 @@ def _measure(
     """Measure an episode.
 
     Returns:
-        Joints or position, and gripper, as columns; None if nothing of this is recorded.
+        Joints or position, and gripper, as columns; None if none of these is recorded.
     """
     steps = np.diff(demo.time)
     quality.measures = {
@@ -369,8 +369,8 @@ def write_curated(
 ) -> RepairReport:
     """Write the accepted and cut episodes into a new dataset of version 3.0.
 
-    Values stay as they are. Videos are copied, and cut by their times in the list of episodes.
-    The old dataset is not changed.
+    Values stay as they are. Video files are copied whole. The times in the list of episodes
+    select the part of a video that a cut episode shows. The old dataset is not changed.
 
     Args:
         path: The dataset.

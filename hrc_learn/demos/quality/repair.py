@@ -1,4 +1,4 @@
-"""Repaired copies of datasets, even of those that a killed recorder of LeRobot left."""
+"""Repaired copies of datasets, even of datasets whose recorder (LeRobot's) was killed."""
 
 import shutil
 from collections import Counter
@@ -400,7 +400,7 @@ class _Repair:
                 edit = getattr(edits, name)(edit)
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
         if len(stalled):
-            text = "stamps must increase; have late frames dropped (drop_late), or leave the"
+            text = "stamps must increase; drop the late frames (drop_late), or leave the"
             text += " episode out (drop_bad_episodes)"
             raise edit.fault(text, frame=int(stalled[0]) + 1)
         return edit if options.fps is None else edits.resample_to_grid(edit, options.fps)

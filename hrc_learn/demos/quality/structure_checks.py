@@ -1,7 +1,7 @@
 """Checks of metadata and files: missing parts and contradictions.
 
 `read_metadata` and `read_sound_episodes` read as much of a broken dataset as possible and
-report the faults on the way; the other functions are checks, listed in `check`.
+report its faults. The other functions are checks, which `check_dataset` calls.
 """
 
 from collections import Counter
@@ -114,7 +114,7 @@ def _column_faults(
             yield Issue(message=text, file=file, key=key)
         # All files come from the same recorder: report the first one only.
         elif not any(issue.key == key for issue in report.warnings):
-            text = "the column is missing: LeRobot cannot open this, hrc repair adds it"
+            text = "the column is missing: LeRobot cannot open this file, hrc repair adds it"
             yield warning(message=text, file=file, key=key)
 
 
@@ -263,4 +263,4 @@ def offsets(folder: DatasetFolder) -> Iterator[Issue]:
             end = before.start + before.length
             if entry.start != end:
                 text = f"begins at row {entry.start}, but episode {before.index} ends at {end}"
-                yield entry.fault(f"{text}: offsets and lengths contradict")
+                yield entry.fault(f"{text}: offsets and lengths do not agree")

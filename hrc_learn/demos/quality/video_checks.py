@@ -44,7 +44,7 @@ def check_videos(folder: DatasetFolder, report: ValidationReport) -> None:
         if not any(file.exists() for file in files):
             text = (
                 "the video is declared, but no file of it is here; joints and poses can be "
-                "read, but LeRobot needs it"
+                "read, but LeRobot needs the video"
             )
             report.add(warning(message=text, file=f"videos/**/{key}", key=key))
             continue

@@ -1,7 +1,7 @@
-"""Find the columns of a dataset that hold each quantity: declared, named or given ones.
+"""Find the columns of a dataset that hold each quantity.
 
-Nothing is taken for a quantity by its position alone. The caller's mapping comes first, then
-the contract or sidecar kept with the dataset, then the naming conventions of `naming`.
+The caller's mapping comes first, then the contract or sidecar kept with the dataset, then the
+naming conventions of `naming`. No column is assigned to a quantity by its position alone.
 """
 
 import re
@@ -72,7 +72,7 @@ class ColumnMapping:
     notes: tuple[str, ...]
     """Guesses and omissions, one sentence each."""
     unmatched: dict[str, str]
-    """Role -> note, for quantities of other joints than `joint_names`."""
+    """Role -> note, for quantities whose joints differ from `joint_names`."""
 
 
 def map_columns(
@@ -124,7 +124,7 @@ def _with_units(selection: ColumnSelection, features: Mapping[str, Feature]) -> 
 
 
 def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str:
-    """Note on a quantity of other joints than the rest, with the remedy."""
+    """Note on a quantity whose joints differ from those of the rest, with the remedy."""
     if set(joints) < set(names):
         advice = ""
     elif len(joints) == len(names):
@@ -193,7 +193,7 @@ def column_places(
     "key[3]"), or a component ("NAME" or "key/NAME").
 
     Args:
-        role: Quantity that takes the columns.
+        role: Quantity to which the columns are assigned, for messages.
         text: The text.
         features: Features by key.
         file: File that declares the features, for messages.
@@ -221,7 +221,7 @@ def column_places(
         stop = int(bounds[3] or width) if bounds and bounds[2] else first + 1
     if not first < stop <= width:
         text = (
-            f"{role} takes {text!r}, which is no range of its {width} components: write "
+            f"{text!r} for {role} is no range of the {width} components: write "
             f"[first:stop] or [index], counted from 0"
         )
         raise DatasetError(text, file=file, key=key)
@@ -285,7 +285,7 @@ class _Conventions:
         return by_component | whole
 
     def _whole_feature(self, feature: Feature) -> list[ComponentMeaning | None] | None:
-        """Meanings of the components if the key of the feature tells them; else None."""
+        """Meanings of the components if the key of the feature states them; else None."""
         role, width = naming.role_of_key(feature.key), feature.width
         if role is None or (_is_command(feature) and role not in _COMMANDS):
             return None
@@ -343,7 +343,7 @@ class _Conventions:
     def _joint(
         self, feature: Feature, name: str, meaning: ComponentMeaning | None
     ) -> ComponentMeaning | None:
-        """Meaning of a component as a joint; None if names tell that it is no joint.
+        """Meaning of a component as a joint; None if names show that it is no joint.
 
         An action names the joints that move: a component that only the state has is no joint.
         """
@@ -371,7 +371,7 @@ class _Conventions:
                 slots.setdefault(meaning.slot, index)
         for role, side in [*groups]:
             if role == "pose_matrix" and len(groups[role, side]) in _CARTESIAN:
-                # Numbered components of a pose: their number tells the encoding.
+                # The components of a pose are only numbered: their count shows the encoding.
                 slots = groups.pop((role, side))
                 encoding, content = _CARTESIAN[len(slots)]
                 self._notes.append(f"{feature.key}: assumed to be {content}")
@@ -395,7 +395,7 @@ class _Conventions:
             width = ROLES[role].width
             if width is not None and len(slots) != width:
                 self._notes.append(
-                    f"{feature.key}: {len(slots)} components look like {role}, which takes "
+                    f"{feature.key}: {len(slots)} components look like {role}, which needs "
                     f"{width}; left among the extra columns"
                 )
                 continue

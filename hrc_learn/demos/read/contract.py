@@ -157,8 +157,8 @@ class Contract:
         """This contract with the names and roles of an older one, which may have been edited.
 
         A component that is now read as another quantity keeps its new role. A component of a
-        quantity keeps its unit: the units of this contract were read with the older one. Every
-        other component gets its unit from the older contract.
+        quantity keeps its unit, which was already decided with the older contract. Every other
+        component gets its unit from the older contract.
         """
         known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:

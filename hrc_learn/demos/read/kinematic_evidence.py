@@ -40,7 +40,7 @@ class Agreement:
     residual: float
     """Root mean square distance [m]."""
     other: float
-    """Residual of the joints as recorded, read as rad or as deg, whichever is less [m]."""
+    """Residual of the joints as recorded, in rad or in deg, whichever fits better [m]."""
     change: str = ""
     """Signs or order that differ from the record, in words."""
 
@@ -109,7 +109,7 @@ def _changes(
         for turned in itertools.combinations(range(count), size):
             signs = np.ones(count)
             signs[[*turned]] = -1
-            yield f"{', '.join(names[i] for i in turned)} with the other sign", joints * signs
+            yield f"{', '.join(names[i] for i in turned)} with opposite sign", joints * signs
     for a, b in itertools.combinations(range(count), 2):
         order = [*range(count)]
         order[a], order[b] = b, a
@@ -145,9 +145,10 @@ def _left(
 def zero_offsets(
     arm: Arm, q: Float64[np.ndarray, "frames joints"], position: Float64[np.ndarray, "frames 3"]
 ) -> Float64[np.ndarray, " joints"]:
-    """Offsets [rad] which, added to the joints, make forward kinematics give the positions.
+    """Offsets of joints [rad] with which forward kinematics give the recorded positions.
 
-    Offsets below 0.5 degrees are set to 0. All offsets are 0 if they do not explain the error.
+    The offsets must be added to the joints. Offsets below 0.5 degrees are set to 0. All offsets
+    are 0 if they do not explain the error of the positions.
 
     Args:
         arm: The arm.

@@ -42,7 +42,8 @@ _SAME_UNIT, _LATE = np.log(2.0), 0.75
 """`_SAME_UNIT`: largest logarithm of the slope (a factor of 2) for a state that follows
 commanded positions. `_LATE`: largest delay of such a state [s]."""
 PROMPT = 0.2
-"""Delay within which an arm follows [s]; at longer delays, a slow motion resembles its rate."""
+"""Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion, delayed by
+more, resembles its rate."""
 RATE_WINDOW = 0.2
 """Time over which joint rates, and commands that they are compared with, are averaged [s]: a
 change from frame to frame is mostly noise."""
@@ -115,8 +116,8 @@ class EpisodeProfile:
     tracking: dict[str, Tracking] = field(default_factory=dict)
     """Relations by name. `command_position`: joint positions that follow position commands.
     `command_velocity`: joint rates that follow velocity commands. `rates`: joint rates that
-    follow position commands, unless the joints promptly follow these as positions. Rates are
-    means over `RATE_WINDOW`."""
+    follow position commands, only known if the joint positions do not promptly follow these
+    commands. Rates are means over `RATE_WINDOW`."""
 
 
 def profile_columns(

@@ -57,7 +57,7 @@ def demonstration_fields(
     quantities: Mapping[str, Float64[np.ndarray, "frames _columns"]],
     factors: Mapping[str, float | Float64[np.ndarray, " _columns"]],
 ) -> dict[str, Any]:
-    """Fields of a `Demonstration` in SI units, all but its time.
+    """Fields of a `Demonstration` in SI units, except its time.
 
     Args:
         quantities: Quantities in the units on disk, by role.
@@ -115,7 +115,7 @@ _DECODERS: dict[str, Callable[[Tensor], Tensor]] = {
     "rotation_matrix": lambda m: quaternion.from_matrix(_rotations(m.reshape(-1, 3, 3))),
     "pose_matrix": lambda m: quaternion.from_matrix(_rotations(transforms(m)[:, :3, :3])),
 }
-"""Encoding of an orientation -> function that makes quaternions of its components."""
+"""Encoding of an orientation -> function from its components to quaternions."""
 
 
 def transforms(values: Float64[Tensor, "frames 16"]) -> Tensor:
@@ -151,7 +151,7 @@ def _normalized(q: Tensor) -> Tensor:
     if len(wrong):
         k = int(wrong[0])
         text = f"quaternion of length {float(q[k].norm()):.4g} at frame {k}"
-        raise ValueError(f"{text}: the columns hold no quaternion, or it was lost there")
+        raise ValueError(f"{text}: the columns hold no quaternion, or tracking was lost there")
     return quaternion.normalize(q)
 
 

@@ -48,7 +48,8 @@ _POSES = 5
 _COMMAND = "command_position"
 _WHOLE_STEP, _SPEED = (0.1, 1.5), (2 / 3, 1.5)
 """Ranges of the joint motion per unit of a command. `_WHOLE_STEP`: motion in one step, for
-commands that give the whole step. `_SPEED`: motion in one second, for possible velocities."""
+commands that are the change of one step. `_SPEED`: motion in one second, for commands that may
+be velocities."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,7 @@ class OpenedDataset:
     own_feature: bool = False
     """True if the image feature is a column of the dataset, or the mapping decides on it."""
     robot: Arm | None = None
-    """Arm that the caller names; None for that of the robot type."""
+    """Arm that the caller names; None for the arm of the dataset's robot type."""
 
     @classmethod
     def of(cls, folder: DatasetFolder, mapping: MappingSpec | None = None) -> "OpenedDataset":
@@ -163,7 +164,7 @@ class OpenedDataset:
         given: Mapping[str, str],
         sample: Collection[int] | None = None,
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
-        """Decide on units as `units_from_episodes`; also find commands that are changes."""
+        """Decide on units as `units_from_episodes` does, and find commands that are changes."""
         fps, trackings, poses = self.folder.fps, [], []
         asked = _COMMAND in self.columns.selections.keys() - {*self.declared_units, *given}
 
@@ -214,7 +215,7 @@ class OpenedDataset:
         text = f"the forward kinematics of {arm.name} give the position within"
         text += f" {1e3 * found.residual:.2g} mm"
         if found.change:
-            left = f"{1e3 * found.other:.2g} mm are left"
+            left = f"the error is {1e3 * found.other:.2g} mm"
             text += f" only with {found.change}; as recorded, {left}"
         units = [joints.unit_of(i) for i in range(values.shape[1])]
         for column in columns:
@@ -244,7 +245,7 @@ def _meaning_of_commands(
     scale = float(np.nanmedian(slope)) / fps
     # A lagging controller performs only a part of each step.
     factor = "" if _WHOLE_STEP[0] < scale < _WHOLE_STEP[1] else f"{scale:.2g} "
-    # A gripper that is not named as one comes last.
+    # If no name marks the gripper, it is the last column.
     hands = [is_hand(label) for label in selection.labels[:-1]]
     hands.append(selection.numbered or is_hand(selection.labels[-1]))
     units = tuple(
@@ -252,8 +253,8 @@ def _meaning_of_commands(
         for i, (no, hand) in enumerate(zip(np.isnan(slope), hands, strict=True))
     )
     evidence = (
-        f"the joints follow its sum ({scale:.2g} {command.unit} per unit, R2 {fit:.2f}), "
-        f"so that it holds changes, not positions"
+        f"the joints follow the sum of the commands ({scale:.2g} {command.unit} per unit, R2 "
+        f"{fit:.2f}), so that they are changes, not positions"
     )
     if _SPEED[0] < scale * fps < _SPEED[1]:
         evidence += f" (velocities in {command.unit}/s: map them to command_velocity)"
@@ -309,7 +310,7 @@ def load_demos(
     """Read the demonstrations of a LeRobot dataset (version 2.0, 2.1 or 3.0) into memory.
 
     Columns are found by name; videos are not needed. Guesses are listed in the result's
-    `notes`; a guessed unit that changes values or is doubtful raises a `UnitsWarning`.
+    `notes`. A guessed unit that changes values or is doubtful causes a `UnitsWarning`.
 
     Args:
         path: Folder of the dataset, or an open `LeRobotDataset`, whose own selection of
@@ -319,8 +320,9 @@ def load_demos(
             -> feature ("observation.qpos"), range of a feature ("observation.state[0:7]") or
             list of components. Roles are the keys of `demos.ROLES`; None leaves a role out.
         units: Units on disk by role, such as {"joint_position": "deg", "position": "mm"};
-            they take precedence over the dataset's sidecar and over guesses. For joints
-            that LeRobot stored as -100..100, its calibration file of the arm gives the angles.
+            they take precedence over the dataset's sidecar and over guesses. For joints that
+            LeRobot stored as -100..100, give the path of LeRobot's calibration file (.json) of
+            the arm instead of a unit.
         joint_names: Joints wanted, in the order wanted; None takes all in their order.
         tasks: Read only episodes that show one of these tasks.
         where: Read only episodes for which this is true; it receives their `index`, `length`
@@ -362,8 +364,8 @@ def open_demos(
         refuse_doubt: Raise an error instead of a warning if a guessed unit is doubtful.
 
     Raises:
-        DatasetError: The metadata are damaged, an argument names what does not exist, or a
-            guessed unit is doubtful and `refuse_doubt` is given.
+        DatasetError: The metadata are damaged, an argument names an episode, task, column or
+            joint that does not exist, or a guessed unit is doubtful with `refuse_doubt`.
     """
     if isinstance(path, str | Path):
         root = path

@@ -1,4 +1,4 @@
-"""Evidence for the units of values: their size, their steps, and the robot that made them."""
+"""Evidence for the units of values: their size, their steps, and the type of the robot."""
 
 import math
 import re
@@ -28,12 +28,13 @@ _BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES
 _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
-# Unit, and step of an encoder in it. LeRobot divides a turn by 4095.
+# Unit, and one step of an encoder in this unit. LeRobot divides a turn by 4095.
 STEP_IN_DEGREES = 360 / 4095
 _ENCODERS = (("deg", STEP_IN_DEGREES), ("deg", 360 / 4096), ("rad", math.tau / 4096))
 _FEWEST_STEPS, _FEWEST_ENCODERS = 10, 3
 _RANGED = (0.045, 0.2)
-"""Steps of an encoder of 4096 steps in -100..100, for ranges of a quarter turn to a turn."""
+"""Bounds of one encoder step in values from -100 to 100, for an encoder of 4096 steps a turn
+and joint ranges from a whole turn to a quarter turn."""
 _DYNAMIXEL = re.compile("koch|omx|aloha|widowx|viperx", re.IGNORECASE)
 """Robot types with motors that reverse themselves; LeRobot reverses those of other makers."""
 _SLIDE = 0.12
@@ -41,14 +42,14 @@ _SLIDE = 0.12
 # Old datasets of LeRobot name the columns of joints and of poses alike.
 _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
 _REVOLUTIONS = 0.5
-"""Reach of unnamed joints below which they may count revolutions: half a radian is little."""
+"""Largest value of unnamed joints that may count revolutions: few arms stay within half a
+radian."""
 FEWEST_JOINTS, _POSE_AND_FINGERS = 5, 8
 """`FEWEST_JOINTS`: number of joints of the smallest usual arms.
 `_POSE_AND_FINGERS`: number of columns of a pose and two fingers."""
-# LeRobot clips normalised positions at exactly 100.
 _CLIP, _CLIPPED = 100.0, 0.002
-"""`_CLIP`: this value.
-`_CLIPPED`: fraction of the frames at this value above which a column counts as clipped."""
+"""`_CLIP`: value at which LeRobot clips normalised positions. `_CLIPPED`: fraction of frames at
+exactly this value above which a column counts as clipped."""
 GUESSED_BY_SIZE = tuple(SIZES)
 """Quantities other than joints whose unit is guessed from the size of their values."""
 _UNIT_LENGTH = 2e-3
@@ -71,7 +72,7 @@ class Sizes(NamedTuple):
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
     step: Float64[np.ndarray, " components"] = np.zeros(1)
-    """Step of an encoder: all differences of values are its multiples. 0 if there is none."""
+    """Step of an encoder, of which all differences of values are multiples; 0 if none fits."""
 
 
 class Guess(NamedTuple):
@@ -158,7 +159,7 @@ def calibrated_units(
 ) -> tuple[str, ...]:
     """Unit of each joint that LeRobot stored as -100..100 of its calibrated range.
 
-    LeRobot's degrees count from the middle of the range, too.
+    Both these values and LeRobot's degrees are zero in the middle of the range.
 
     Args:
         file: The calibration of the arm that was recorded.
@@ -182,7 +183,7 @@ def calibrated_units(
         text = f"{labels[int(beyond.argmax())]} reaches {sizes.peak.max():.4g}: in deg, not %?"
         raise DatasetError(f"does not fit: {text}", file=file)
     if other.sum() > 1:
-        text = f"the steps of {', '.join(np.array(labels)[other])} are not those of its ranges"
+        text = f"the steps of {', '.join(np.array(labels)[other])} contradict its ranges"
         raise DatasetError(f"does not fit: {text}: another arm, or values in deg?", file=file)
     turned = [known[n][1] and not _DYNAMIXEL.search(robot_type) for n in names]
     degrees = np.where(turned, -1, 1) * spans / 200 * STEP_IN_DEGREES

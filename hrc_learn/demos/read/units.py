@@ -95,7 +95,7 @@ class UnitDecision:
         ways = " or ".join(f"--units {self.role} {unit}" for unit in candidates)
         return (
             f"{self.role} is in {' or '.join(candidates)}? {self.evidence} (taken for "
-            f"{self.unit}, {100 * self.confidence:.0f} % sure): say {ways}, or leave columns "
+            f"{self.unit}, {100 * self.confidence:.0f} % sure): give {ways}, or leave columns "
             f"out with --mapping {self.role} COLUMNS|none"
         )
 
@@ -276,7 +276,7 @@ def _guess_joint_units(
     labels = selection.labels
     hand = np.array([is_hand(label) for label in labels])
     hand &= not hand.all()
-    # A gripper that is not named as one comes last.
+    # If no name marks the gripper, it is the last column.
     hand[-1] |= sizes.opening[-1] and not sizes.opening.all()
     stated = np.array([bool(unit) for unit in named])
     guess = unit_evidence.guess_joints(sizes, ~hand & ~stated, labels, robot_type)

@@ -157,7 +157,7 @@ def matched_columns(
 TWO_LEVEL = 0.9
 """A column counts as two-level if its variance is more than this fraction of the largest
 variance possible between its minimum and maximum (Bhatia and Davis 2000, "A better bound on the
-variance"). The fraction is 1 for a column that takes no other values.
+variance"). The fraction is 1 for a column without values in between.
 """
 
 

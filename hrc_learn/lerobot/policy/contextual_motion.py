@@ -200,7 +200,7 @@ def _fit_each(
 
 
 def _error(motion: ContextualMotion, difference: Float[Tensor, "n K"]) -> float:
-    """Root mean square error of motions that differences of the vectors x cause."""
+    """Root mean square difference of motions whose vectors x differ by `difference`."""
     # The motion is linear in all of x but the duration, which shifts the motion in time.
     per_coordinate = difference[:, :-1].unflatten(-1, (motion.width, -1)).clone()
     per_coordinate[..., :-3] *= motion.response.spring.stiffness

@@ -270,7 +270,8 @@ def write_closed_form_policy(
         actions.
 
     Raises:
-        ValueError: The dataset cannot be read or holds nothing to learn a policy from.
+        FileNotFoundError: The folder holds no dataset.
+        ValueError: The dataset cannot be read, or lacks actions or numeric observations.
     """
     from lerobot.datasets import LeRobotDatasetMetadata  # not needed to run a policy
 

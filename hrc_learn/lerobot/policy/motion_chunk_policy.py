@@ -89,12 +89,12 @@ class MotionChunkConfig(MotionPolicyConfig):
     training loads a second frame of all inputs."""
     state_noise: float = 0.0
     """Noise on observation.state in training, relative to its spread. With 0.15, plans return
-    to the demonstrations from nearby states. This helps where demonstrations hardly vary, such
-    as scripted ones; human variation has the same effect, and noise would blur the intent.
+    to the demonstrations from nearby states. This helps with demonstrations that hardly vary,
+    such as scripted ones. Human demonstrations vary enough; noise would blur their intent.
     """
     n_plans: int = 3
-    """Number of plans for each observation: the largest number of distinct ways that the
-    demonstrations may show from one place. The most likely plan is executed."""
+    """Number of plans for each observation. From one state, the demonstrations may continue in
+    at most as many distinct motions. The most likely plan is executed."""
     two_level_actions: list[int] | None = None
     """Indices of the action's components that jump between two levels, such as a gripper that
     is open or closed; None: detected from the dataset's statistics."""

@@ -152,8 +152,8 @@ DIFFERENCE = 0.02
 FARTHEST = 10.0
 """Bound of whitened inputs: larger ones are probably wrong, and are clamped."""
 LEFT_OVER = 0.05
-"""Weight of the mean error of all plans in the loss; the nearest plan has the other part. With
-this weight, all plans learn.
+"""Weight of the mean error of all plans in the loss, so that all plans learn. The error of the
+nearest plan has the remaining weight.
 """
 
 
@@ -311,7 +311,7 @@ class ContinuedMotion:
         self.chunk = None
 
     def after(self, steps: int | Int[Tensor, "B"]) -> MotionChunk | None:
-        """Remainder of the last chunk after some steps; at its end, the motion stands still."""
+        """Remainder of the last chunk after some steps; beyond its end, the motion rests."""
         if self.chunk is None:
             return None
         states = self.chunk.states
@@ -338,7 +338,8 @@ class ContinuedMotion:
     def left_over(self, actions: Float[Tensor, "*one n A"]) -> MotionChunk | None:
         """Remainder of the last chunk from the first of its leftover actions.
 
-        The result is None if the actions are not from the last chunk: the velocity is unknown.
+        The result is None if the actions are not from the last chunk, as their velocity is then
+        unknown.
         """
         if self.chunk is None:
             return None

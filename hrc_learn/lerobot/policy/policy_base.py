@@ -112,7 +112,7 @@ class MotionPolicyConfig(PreTrainedConfig):
             )
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
-        """Take the names of components from a dataset; LeRobot calls this.
+        """Read the names of components from a dataset; LeRobot calls this method.
 
         Raises:
             ValueError: The policy was trained for other actions, on other states, or on states
@@ -183,7 +183,7 @@ class MotionPolicy(PreTrainedPolicy):
         )
         if config.vision_weights is not None:
             self.encoder.load_vision(Path(config.vision_weights))
-            config.vision_weights = None  # a checkpoint brings its own
+            config.vision_weights = None  # a checkpoint holds the weights itself
         (width,) = (config.output_features or {})[ACTION].shape
         names = config.action_feature_names
         states = config.state_names if OBS_STATE in widths else None

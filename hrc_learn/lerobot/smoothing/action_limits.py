@@ -256,7 +256,7 @@ def urdf_limits(
 def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, Range]:
     """Ranges through which a robot's motors were moved when LeRobot calibrated the robot.
 
-    Commands of the motor `gripper` are 0 to 100, in degrees as in percent.
+    Commands of the motor `gripper` are always 0 to 100, even with `degrees`.
 
     Args:
         calibration: File that LeRobot keeps in `calibration/robots/TYPE/ID.json`.

@@ -31,8 +31,8 @@ PREPROCESSOR = "policy_preprocessor.json"
 POSTPROCESSOR = "policy_postprocessor.json"
 
 _JUMP = 5.0
-"""A robot that moved faster than this multiple of the velocity limit counts as put elsewhere,
-for example for a new episode."""
+"""If the robot moved faster than this multiple of the velocity limit, it was not moved by
+actions, but for example by a person before a new episode."""
 _SAME = 1e-6
 """Changes of an action up to this value count as rounding."""
 
@@ -125,9 +125,9 @@ class SmoothActionsStep(ProcessorStep):
     This step belongs at the end of the postprocessor, where actions have their units. It takes
     one action at a time, (batch, values), as lerobot-rollout and lerobot-eval pass them on, or
     whole chunks (batch, steps, values). A motion starts with the measured position and
-    velocity, and restarts when the robot is put elsewhere. A chunk starts at the point of the
-    previous chunk that is nearest to the robot. A value is held until it is measured for the
-    first time. Later, it continues its motion while its measurement is not finite.
+    velocity, and restarts after the robot was moved by other means. A chunk starts at the point
+    of the previous chunk that is nearest to the robot. A value is held until it is measured for
+    the first time. Later, it continues its motion while its measurement is not finite.
 
     Attributes:
         limits: Limits of the actions.

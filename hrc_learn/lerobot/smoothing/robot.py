@@ -120,7 +120,7 @@ class ActionUpsampler:
         self._newest, self._phase = position, 0.0
 
     def push(self, action: Float[np.ndarray, "*batch D"]) -> None:
-        """Take the next action; the phase of `setpoint` counts from now on.
+        """Append the next action; the phase of `setpoint` then counts from this action.
 
         Values that are not finite are replaced by the previous ones.
 
@@ -137,7 +137,7 @@ class ActionUpsampler:
         self._newest = action
 
     def repeat(self) -> None:
-        """Take the newest action again; without other actions, the motion comes to rest."""
+        """Append the newest action again; after some repetitions, the motion comes to rest."""
         self.push(self._newest)
 
     def setpoint(self, phase: float) -> Float[np.ndarray, "*batch D"]:
@@ -312,7 +312,7 @@ class SmoothRobot(Robot):
         self.begin()
         if self.config.clock == "wall":
             self._stop.clear()
-            self._thread = Thread(target=self._lead, daemon=True, name="smooth motion")
+            self._thread = Thread(target=self._send_all, daemon=True, name="smooth motion")
             self._thread.start()
 
     def begin(self) -> None:
@@ -352,8 +352,8 @@ class SmoothRobot(Robot):
         if now - last > 1 / limits.fps or not np.isfinite(here).all():
             return  # the robot has been at rest since it was connected, as far as is known
         velocity = (here - before) / (last - then) if last > then else np.zeros_like(here)
-        # A velocity beyond the limits means that the robot was put elsewhere between the
-        # readings: start at rest.
+        # A velocity beyond the limits means that the robot was moved by other means between
+        # the readings: start at rest.
         slow = bool((np.abs(velocity) <= limits.velocity).all())
         self.upsampler.reset(here, velocity if slow else 0.0)
 
@@ -367,7 +367,7 @@ class SmoothRobot(Robot):
             The setpoint that was sent last.
 
         Raises:
-            DeviceNotConnectedError: The robot is not connected, or stopped taking setpoints.
+            DeviceNotConnectedError: The robot is not connected, or refused a setpoint.
         """
         self._complain()
         if not self.is_connected:
@@ -397,7 +397,7 @@ class SmoothRobot(Robot):
     def _complain(self) -> None:
         if self._error is not None:
             raise DeviceNotConnectedError(
-                f"{self.inner} took no more setpoints: {self._error}"
+                f"{self.inner} refused a setpoint: {self._error}"
             ) from self._error
 
     def _named(self, values: np.ndarray) -> dict[str, float]:
@@ -407,7 +407,7 @@ class SmoothRobot(Robot):
         self.inner.send_action(self._named(setpoint))
         self.sent += 1
 
-    def _lead(self) -> None:
+    def _send_all(self) -> None:
         """Send setpoints in real time until stopped."""
         period = 1 / self.config.rate
         due = time.perf_counter()
