@@ -167,7 +167,8 @@ class DatasetWriter:
 
         Raises:
             RuntimeError: No episode is open.
-            ValueError: A quantity is unknown, missing, new, or of the wrong length.
+            ValueError: A quantity is unknown, missing, of the wrong length, or was not in the
+                first frame.
         """
         self._open_task()
         row = recorded.frame_row(values, self._widths, self._frames)
@@ -205,8 +206,8 @@ class DatasetWriter:
 
         Raises:
             RuntimeError: An episode is open.
-            ValueError: The joints differ from the dataset's, images are missing or of the wrong
-                size, or as in `save_episode`.
+            ValueError: The joints differ from the dataset's, or images are missing or of the
+                wrong size. Also as in `save_episode`.
         """
         self._require_no_open_episode("first")
         if demonstration.joint_names != self.joint_names:

@@ -386,8 +386,8 @@ def nearest_frames(
 def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
     """Scale the duration of a demonstration; the path stays the same.
 
-    Velocities and the nominal frame rate are scaled accordingly: no frame is added or removed
-    (`resample` sets another rate). Efforts stay as measured.
+    Velocities and the nominal frame rate are scaled accordingly. No frame is added or removed;
+    `resample` does that. Efforts stay as measured.
 
     Args:
         demo: Demonstration of at least two frames.
@@ -423,8 +423,8 @@ def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demons
     Args:
         demo: The demonstration.
         delays: Field -> time from its measurement to its stamp [s], such as {"feature": 0.04}.
-            The demonstration is shortened by the longest delay, because its last values would
-            be stamped after its end.
+            The demonstration is shortened by the longest delay, because the last values of the
+            delayed field would be stamped after the end of the recording.
 
     Raises:
         ValueError: A field is not recorded, or a delay is negative or too long.
@@ -497,7 +497,7 @@ _VELOCITY_WINDOW = 0.1
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of the demonstration of median duration.
+    """Warp every demonstration to the timing of a reference: that of median duration.
 
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled
@@ -554,7 +554,7 @@ def _follow(
     # Several pairs may contain the same frame of the reference: use their mean time.
     times = np.bincount(first, weights=demo.time[second]) / np.bincount(first)
     if len(reference) > 2:
-        # The path advances by whole frames; a line fitted around each frame interpolates.
+        # The path advances by whole frames. Lines fitted around each frame smooth these steps.
         column, window = times[:, None], _VELOCITY_WINDOW
         times = local_polynomial(reference.time, column, window=window, degree=1)[0][:, 0]
     times = np.maximum.accumulate(np.clip(times, 0, demo.time[-1]))

@@ -121,7 +121,7 @@ def frame_row(
         earlier: Earlier frames of the episode, with the same quantities.
 
     Raises:
-        ValueError: A quantity is unknown, missing, new, or of the wrong length.
+        ValueError: A quantity is unknown, missing, of the wrong length, or not in `earlier`.
     """
     number = len(earlier)
     if earlier and values.keys() != earlier[0].keys():

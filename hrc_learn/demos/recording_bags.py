@@ -33,7 +33,7 @@ _SAME_CLOCK = 0.5
 """Largest difference between stamps and times of reception if both use one clock [s]."""
 _BURST = 2e-4
 """Smallest median interval between messages of a running robot [s]. Messages that were written
-together after the motion are closer."""
+together after the motion are closer together."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
 
 

@@ -143,7 +143,7 @@ class Recording:
 
 
 def longest_hold(stamps: Float64[np.ndarray, " frames"]) -> float:
-    """Age up to which a value is held [s]: 0.2 s or three periods, whichever is longer."""
+    """Longest time for which a value is held [s]: the longer of 0.2 s and three periods."""
     return max(0.2, 3 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.2
 
 
@@ -217,7 +217,7 @@ def read_stamps(
 def make_field(
     name: str, shape: tuple[int, ...], dtype: np.dtype, read: Read, **details: Any
 ) -> Field:
-    """A field, of the kind that follows from its name, shape and type.
+    """Make a field; its kind follows from name, shape and type.
 
     Args:
         name: Name in the file.
@@ -403,6 +403,6 @@ def _ends(whole: Recording) -> list[int] | None:
             flags.append(field.numbers()[:, 0] > 0)
     if not flags or len({len(flag) for flag in flags}) > 1:
         return None
-    # A flag may stay up from the success to the end of the episode.
+    # A flag may be set in all frames from the success to the end of the episode.
     ends = np.flatnonzero(np.diff(np.logical_or.reduce(flags).astype(int)) < 0) + 1
     return [*ends.tolist(), len(flags[0])]

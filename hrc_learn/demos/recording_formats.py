@@ -389,7 +389,7 @@ def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
         episodes += [replace(one, fields=one.fields | own) for one in found]
     if unused and episodes:
         names = ", ".join(video.name for video in unused)
-        text = f"videos left out, as no other file's name begins their names: {names}"
+        text = f"videos left out, as their names do not begin with a file's name: {names}"
         episodes[0] = replace(episodes[0], notes=(*episodes[0].notes, text))
     return episodes
 

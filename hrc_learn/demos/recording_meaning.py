@@ -234,7 +234,7 @@ def _add_fingers(meaning: Meaning, search: FieldSearch) -> None:
 
 
 def _name_joints(meaning: Meaning, given: tuple[str, ...], first: Recording) -> None:
-    """Give the joints their names; quantities of another number of joints are left out."""
+    """Give the joints their names; quantities with fewer or more joints are left out."""
     chosen = {r: s for r, s in meaning.selections.items() if r in JOINT_FIELDS}
     if not chosen:
         return

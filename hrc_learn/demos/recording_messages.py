@@ -110,7 +110,7 @@ def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
 def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
     """Poses of tools and of frames without children in the base frame, from `/tf` topics.
 
-    Times are left out at which a frame between base and tool has been silent for too long.
+    A time is left out if a frame between base and tool has been silent for too long.
     """
     parents = {child: parent for parent, child in edges}
     moving = {c for (_, c), rows in edges.items() if np.ptp([r[2] for r in rows], axis=0).any()}

@@ -200,8 +200,9 @@ def decode(
     gaps = np.flatnonzero(np.diff(numbers) > max(1, round(_SKIP_SECONDS * fps)))
     try:
         with av.open(str(segment.file)) as container:
-            # By default, all threads of PyAV decode the same image. Threads that decode ahead
-            # may log while the container closes; both would then wait for Python's lock.
+            # By default, all threads of PyAV decode the same image. A thread that decodes ahead
+            # may log while the container closes. The thread and the closing would then wait for
+            # each other, because of Python's lock.
             stream = container.streams.video[0]
             for number, run in enumerate(np.split(numbers, gaps + 1)):
                 wanted, start = {*run.tolist()}, segment.start + run[0] / fps

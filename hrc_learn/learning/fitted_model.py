@@ -104,7 +104,7 @@ class FittedModel:
         fits = [kind for kind, n in counts.items() if n == len(values) and given in ("", kind)]
         if not fits or not bool(values.isfinite().all()):
             raise ValueError(
-                f"{option} {' '.join(words)}: {self.folder} needs {forms}, all finite, or "
+                f"{option} {' '.join(words)}: {self.folder} accepts {forms}, all finite, or "
                 "the word episode and the number of an episode."
             )
         if len(fits) > 1:
@@ -182,7 +182,7 @@ def arm_for(model: FittedModel, name: str) -> Arm:
     if apart[best] > _SAME_TOOL:
         raise ValueError(
             f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from the tool of "
-            f"{name} at its first joints: they belong to another tool or base frame. Fit with "
+            f"{name} at the same time: they belong to another tool or base frame. Fit with "
             "--channels joint, or choose the arm's description with that tool."
         )
     return arms[best]

@@ -308,7 +308,7 @@ def _joints_at(
 ) -> Float[Tensor, " joints"]:
     """Joint positions [rad] that reach a target, near the joint positions `near` [rad].
 
-    An arm of fewer than six joints reaches the position, and the orientation as far as it can.
+    An arm of fewer than six joints reaches the position, and comes near the orientation.
     """
     pose = _completed(target, usual)
     free = target is not None and target.orientation is None and model.pose is None

@@ -130,7 +130,7 @@ class MultipliedColumns:
             arm, root = self._taught.arm.name, self._source.folder.root
             raise ValueError(
                 f"{root}: the recorded tool is {1000 * apart:.0f} mm from where the joints of "
-                f"{arm} move it: record it in its base frame (hrc check finds wrong zeros)"
+                f"{arm} move it: give it in the arm's base frame (hrc check finds wrong zeros)"
             )
         return found if found.norm() > _APART else torch.zeros_like(found)
 

@@ -55,7 +55,8 @@ _REACHED, _TURNED = 1e-3, 0.3
 _USABLE, _SLOWER = 0.975, 5
 # Largest factor by which one attempt slows a motion down.
 _JUMP = 3.0
-# `_ENDING`: see `MotionSource.ending`. `_AT_REST`: fraction of the largest speed that is rest.
+# `_ENDING`: see `MotionSource.ending`. `_AT_REST`: fraction of the largest speed that counts
+# as rest.
 _ENDING, _AT_REST = 0.25, 0.05
 # Stride of the frames that are checked for collisions.
 _CHECKED = 3
@@ -96,8 +97,8 @@ class Segmentation:
             spaced = len(cuts) == n and min(np.diff(cuts)) >= _SHORTEST
             if not spaced or cuts[0] < 0 or cuts[-1] >= len(demo):
                 raise ValueError(
-                    f"segments: episode {demo.episode} needs {n} cuts below {len(demo)}, "
-                    f"{_SHORTEST} frames or more apart, from 0 on, but has {list(cuts)}"
+                    f"segments: episode {demo.episode} needs {n} cuts of 0 to {len(demo) - 1}, "
+                    f"{_SHORTEST} frames or more apart, but has {list(cuts)}"
                 )
 
 
@@ -186,7 +187,10 @@ def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
 
 
 def frame_of(objects: Mapping[str, Pose], name: str, like: Pose) -> Pose:
-    """Poses of the frame `name` in the base frame; for the base frame, as many as in `like`."""
+    """Poses of the frame `name` in the base frame.
+
+    For the base frame itself, these are as many identity poses as `like` has poses.
+    """
     still = torch.zeros_like(like.orientation)
     still[..., 0] = 1.0
     if name == BASE:
@@ -342,8 +346,8 @@ class MotionSource:
             robot: Arm of the new motions.
             near: Joint positions along each demonstration [rad] if `robot` was demonstrated:
                 the new motions keep the demonstrated posture. Otherwise, candidate postures at
-                the first pose [rad]. The posture is used from which the arm reaches most frames
-                of the first demonstration, preferably without a collision.
+                the first pose [rad]. The arm starts with the posture from which it reaches most
+                frames of the first demonstration, preferably without a collision.
             obstacles: Boxes to avoid: centre and half edges [m].
 
         Raises:

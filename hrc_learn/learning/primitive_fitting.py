@@ -209,7 +209,7 @@ def load_primitive(folder: Path, channel: str) -> Primitive:
 
 
 def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Channels to learn: the wanted ones, or else joints and pose as far as they were recorded.
+    """Channels to learn: the wanted ones, or else joints and pose, if they were recorded.
 
     Raises:
         ValueError: The demonstrations lack a column of a channel, or hold no motion at all.
@@ -288,7 +288,7 @@ def fit_primitives(
         n_basis: Number of basis functions. None: the smallest candidate that predicts held-out
             samples as well as the best one (see `select_basis_count`).
         method: See `JointDMP.fit`.
-        channels: Channels to learn. Default: joints and pose, as far as they were recorded. A
+        channels: Channels to learn. Default: joints and pose, if they were recorded. A
             Panda's pose is computed from its joints, and its arm angle is learned too.
         candidates: Numbers of basis functions to choose from.
         options: Further fields of `FitOptions`, and `scaling`. `smooth` is True by default.

@@ -45,7 +45,7 @@ EPISODE = 1.0
 
 
 class Device:
-    """Mix-in for devices without calibration; list it before LeRobot's class as a base."""
+    """Mix-in for devices without calibration; list this base before LeRobot's base class."""
 
     _connected, is_calibrated = False, True
 
@@ -153,7 +153,7 @@ class LoopWatch:
         if len(self._quality.states) >= EPISODE * self._fps:
             doubts.insert(0, self._quality.worthless())
         for doubt in filter(None, doubts):
-            logger.warning("%s: in what was recorded, %s", self._name, doubt)
+            logger.warning("%s: in the recording, %s", self._name, doubt)
         self._quality.clear()
 
 

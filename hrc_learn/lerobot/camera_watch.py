@@ -106,7 +106,7 @@ class CameraWatchStep(ProcessorStep):
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
     def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
-        """Update the watch with the marker; return the tool's pose, or None if it is hidden."""
+        """Update the watch; return the tool's pose, or None if the marker is hidden."""
         vector = state[self.pose_columns]
         if marker[2] < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
             return None

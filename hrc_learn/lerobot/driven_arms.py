@@ -215,7 +215,7 @@ class Ros2CameraConfig(CameraConfig):
     """Camera of an image topic; width and height must be those of the published images."""
 
     topic: str
-    """Topic of raw or, if it ends in /compressed, of compressed images."""
+    """Topic of raw images, or of compressed images if its name ends in /compressed."""
     fps: int | None = 30
     """Rate at which the topic publishes [1/s]."""
     timeout: float = 2.0
@@ -270,7 +270,7 @@ class Ros2Camera(Camera):
 
         try:
             image = image_of(message)
-        except ValueError as error:  # it would end the thread of the session
+        except ValueError as error:  # the error would end the thread of the session
             self._refused = f" ({error})"
             return
         with self._came:

@@ -236,7 +236,7 @@ def test_noise_of_ten_times_the_usual_and_half_a_percent(noise, usual, told):
 def test_levels_of_less_than_a_fifth_of_the_usual(distinct, held, usual, told):
     odd = profile(distinct=[usual, distinct, usual], held=[1, held, 1])
     found = said(checks.noise(feature(alike(odd, distinct=usual))))
-    text = "is of far fewer levels than in the other episodes: b"
+    text = "has far fewer levels than in the other episodes: b"
     assert found == ([(4, ("b",), text)] if told else [])
 
 

@@ -75,7 +75,7 @@ def test_every_odd_episode_comes_before_every_sound_one(ranking):
 @pytest.mark.parametrize(
     ("episode", "reason"),
     [
-        (2, "unlike all others"),
+        (2, "unlike the other"),
         (3, "shows the same motion as episode 1"),
         (5, "standing still"),
         (7, "jerkily"),

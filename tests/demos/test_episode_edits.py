@@ -42,7 +42,7 @@ def test_a_cut_keeps_two_frames_of_the_episode_at_least(start, stop, valid):
     if valid:
         assert Decision(**make).stop == stop
     else:
-        with pytest.raises(ValueError, match="are no part of two frames or more"):
+        with pytest.raises(ValueError, match="must keep two frames or more of the"):
             Decision(**make)
 
 

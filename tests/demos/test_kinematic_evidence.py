@@ -91,7 +91,7 @@ def test_a_millimetre_and_a_tick_of_noise_do_not_matter(model):
         (lambda q: q * [1, 1, -1, 1, 1, 1], "elbow_joint with opposite sign"),
         (
             lambda q: q * [1, -1, 1, -1, 1, 1],
-            "shoulder_lift_joint, wrist_1_joint with the other",
+            "shoulder_lift_joint, wrist_1_joint with opposite",
         ),
         (lambda q: q[:, [1, 0, 2, 3, 4, 5]], "shoulder_pan_joint and shoulder_lift_joint exch"),
     ],
@@ -298,7 +298,7 @@ def test_steps_of_encoders_tell_degrees_from_fractions_of_a_range(tmp_path, mode
         np.testing.assert_allclose(
             source[0].joint_position[:, :5], values[0][:, :5] / 100, atol=1e-5
         )
-        assert any("as their ranges differ: taken for %" in note for note in source.notes)
+        assert any("joints of different ranges step" in note for note in source.notes)
 
 
 @pytest.mark.parametrize("step", [360 / 4096, 2 * np.pi / 4096, 0.5])

@@ -501,8 +501,8 @@ def test_mapping_overrules_what_names_say(tmp_path):
         *(
             (
                 {"joint_position": f"{STATE}[{bounds}]"},
-                rf"{STATE}: joint_position takes .*\[{bounds}\]', which is no "
-                rf"range of its 3 components",
+                rf"{STATE}: .*\[{bounds}\]' for joint_position is no "
+                rf"range of the 3 components",
             )
             for bounds in ("0:6", "3:6", "3:", "4", "2:1", "2:2", "", "0:3:2", "x")
         ),

@@ -414,7 +414,7 @@ def test_a_video_belongs_to_the_episode_whose_name_it_begins_with(tmp_path):
     (folder / "other.mp4").write_bytes(video)
     assert cameras() == [["run_1"], ["left"]]
     notes = [part.notes for part in open_recordings(folder)]
-    text = "videos left out, as no other file's name begins their names: other.mp4"
+    text = "videos left out, as their names do not begin with a file's name: other.mp4"
     assert notes == [(text,), ()]
 
 

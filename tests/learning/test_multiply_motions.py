@@ -227,7 +227,7 @@ def test_gradients_flow_to_the_scene(source):
         (("lid", "block"), (0, 40, 63), "no frame 'lid'"),
         (("block", "block"), (0, 63), "needs 3 cuts"),
         (("block", "block"), (0, 58, 63), "6 frames or more apart"),
-        (("block", "block"), (0, 40, END), f"cuts below {END}"),
+        (("block", "block"), (0, 40, END), f"cuts of 0 to {END - 1}"),
     ],
 )
 def test_wrong_segments_are_refused(demos, objects, frames, cuts, message):

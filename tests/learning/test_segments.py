@@ -52,7 +52,7 @@ def test_cuts_are_six_frames_apart_within_the_demonstration(cuts, right):
     if right:
         found.check([demo(20, 3)], {"cup": HERE})
     else:
-        message = rf"episode 3 needs 3 cuts below 20, 6 frames or more .* \[{cuts[0]}, "
+        message = rf"episode 3 needs 3 cuts of 0 to 19, 6 frames or more .* \[{cuts[0]}, "
         with pytest.raises(ValueError, match=message):
             found.check([demo(20, 3)], {"cup": HERE})
 
@@ -65,7 +65,7 @@ def test_frames_of_segments_are_known():
         wrong = Segmentation(frames=(frame,), cuts={3: (0, 19)})
         with pytest.raises(ValueError, match=rf"no frame '{frame}'; there are base, cup"):
             wrong.check(demos, {"cup": HERE})
-    with pytest.raises(ValueError, match=r"episode 3 needs 2 cuts below 20, .* has \[\]"):
+    with pytest.raises(ValueError, match=r"episode 3 needs 2 cuts of 0 to 19, .* has \[\]"):
         Segmentation(frames=("base",), cuts={4: (0, 19)}).check(demos, {})
     for cuts in ((), (19,), (0, 19)):
         with pytest.raises(ValueError, match=r"no frame ''; there are base"):

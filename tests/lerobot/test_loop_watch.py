@@ -79,7 +79,7 @@ def test_a_good_demonstration_is_kept_without_a_word(caplog):
 
 
 def test_an_arm_that_stays_is_told(caplog):
-    assert seen(caplog, reach(0, 0.004)) == ["arm: in what was recorded, the arm has not moved"]
+    assert seen(caplog, reach(0, 0.004)) == ["arm: in the recording, the arm has not moved"]
 
 
 def test_a_moment_is_no_episode(caplog):
@@ -98,4 +98,4 @@ def test_a_joint_that_stays_at_its_limit_is_told(caplog, frames, told):
 
 def test_what_was_touched_is_told_with_how_long(caplog):
     (message,) = seen(caplog, reach(0, 0.8), lambda k: ("hand touched shelf",) * (4 <= k < 9))
-    assert message == "arm: in what was recorded, hand touched shelf for 0.25 s"
+    assert message == "arm: in the recording, hand touched shelf for 0.25 s"

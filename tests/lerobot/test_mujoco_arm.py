@@ -110,7 +110,7 @@ def test_what_the_arm_meets_while_it_is_recorded_is_told(simulated, caplog, monk
         robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
     assert asked == pytest.approx([0.0, 0.0, 1 / FPS, 2 / FPS])  # since the last action
     robot.disconnect()
-    assert f"in what was recorded, hand touched table for {2 / FPS:.2f} s" in caplog.text
+    assert f"in the recording, hand touched table for {2 / FPS:.2f} s" in caplog.text
 
 
 @pytest.mark.parametrize(

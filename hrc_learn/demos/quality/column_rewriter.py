@@ -196,7 +196,7 @@ class ColumnRewriter:
                 "(drop_repeats=False, drop_bad_frames=False, fps=None)"
             )
         if self._image_columns and edit.resampled:
-            text = "its images cannot be resampled (no fps)"
+            text = "its images cannot be resampled: give no fps"
             raise edit.fault(text, key=self._image_columns[0])
         begin = int(edit.kept[0]) / fps
         end = begin + len(edit) / fps

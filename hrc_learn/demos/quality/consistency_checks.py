@@ -126,15 +126,15 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     # A fifth of the usual levels: values were rounded or the encoder lost bits.
     coarse = (levels < 0.2 * np.median(levels, axis=0)) & moving
     coarse &= feature.stack("held") / frames < 0.1  # a component at rest is not coarse
-    for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
+    for odd, what in ((noisy, "is far noisier"), (coarse, "has far fewer levels")):
         for number in np.flatnonzero(odd.any(1)).tolist():
             places = np.flatnonzero(odd[number]).tolist()
-            text = f"is {what} than in the other episodes: {listed(feature.names, places)}"
+            text = f"{what} than in the other episodes: {listed(feature.names, places)}"
             yield feature.issue(number, text, places, float(len(places)))
 
 
 def switches(feature: FeatureProfiles) -> Iterator[Issue]:
-    """Report grippers and flags that stay, or switch the other way, in one episode only."""
+    """Report grippers and flags that do not switch, or switch the other way, in one episode."""
     span, usual_span = feature.stack("span"), feature.median("span")
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
     usual = np.median(ends, axis=0)

@@ -1,4 +1,4 @@
-"""Merge datasets: match columns by name, convert units to those of the first, copy videos."""
+"""Merge datasets: match columns by name, convert to the first dataset's units, copy videos."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -312,8 +312,8 @@ class Decision:
         if min(self.start, self.stop) < 0 or (
             is_cut and not self.start < self.stop - 1 < self.length
         ):
-            text = f"frames {self.start} to {self.stop} are no part of two frames or more"
-            raise ValueError(f"{text} of an episode of {self.length} frames")
+            text = f"a cut must keep two frames or more of the {self.length} of its episode"
+            raise ValueError(f"{text}, got frames {self.start} to {self.stop}")
 
 
 Decisions = dict[int, Decision]

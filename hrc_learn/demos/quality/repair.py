@@ -187,7 +187,7 @@ def unfinished_files(root: Path) -> list[str]:
     """
     data, lists = (sorted(root.glob(f"{part}/*/file-*.parquet")) for part in ("data", _LISTS))
     files = [str(path.relative_to(root)) for path in (*data, *lists) if is_unfinished(path)]
-    names = [f"{file} has no end" for file in files]
+    names = [f"{file} was not closed" for file in files]
     if data and not lists:
         names.append(f"{_LISTS} is missing")
     if not names and data:

@@ -23,7 +23,7 @@ _MOST_FRAMES = 4000
 """Frames used to find a delay; the middle of a longer episode is enough."""
 _LONGEST_DELAY = 1.5
 """Largest delay considered [s]; no controller answers later."""
-# Negligible fraction of the variance: a tenth of the motion.
+# Negligible fraction of the variance: the square of a tenth of the motion.
 _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
@@ -42,8 +42,8 @@ _SAME_UNIT, _LATE = np.log(2.0), 0.75
 """`_SAME_UNIT`: largest logarithm of the slope (a factor of 2) for a state that follows
 commanded positions. `_LATE`: largest delay of such a state [s]."""
 PROMPT = 0.2
-"""Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion, delayed by
-more, resembles its rate."""
+"""Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion that is
+delayed by a longer time resembles its own rate."""
 RATE_WINDOW = 0.2
 """Time over which joint rates, and commands that they are compared with, are averaged [s]: a
 change from frame to frame is mostly noise."""

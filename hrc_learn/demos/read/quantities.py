@@ -47,7 +47,7 @@ CONTRACT_QUANTITIES: dict[str, str] = _TABLES["contract"]
 """Role in a contract -> quantity of a demonstration, "" for none. All other roles have the same
 name in both."""
 RECORDED: dict[str, list[str]] = _TABLES["recorded"]
-"""Keyword of a frame -> role, feature and component names."""
+"""Keyword of `DatasetWriter.add_frame` -> role, feature and component names."""
 
 INDEX_KEYS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Index columns that LeRobot maintains."""
@@ -122,7 +122,7 @@ def transforms(values: Float64[Tensor, "frames 16"]) -> Tensor:
     """4x4 transforms from 16 numbers, in row order or, as in libfranka, in column order.
 
     Raises:
-        ValueError: In neither order, the last row is (0, 0, 0, 1).
+        ValueError: The last row is (0, 0, 0, 1) in neither order.
     """
     by_rows = values.reshape(-1, 4, 4)
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=by_rows.dtype)

@@ -223,7 +223,7 @@ def guess_joints(
     inside = (steps > _RANGED[0]) & (steps < _RANGED[1])
     ranged = len(steps) >= _FEWEST_ENCODERS and inside.all()
     if ranged and is_hobby_arm(robot_type, labels) and np.ptp(steps) > 1e-2 * steps[0]:
-        text = f"joints step by {steps.min():.3g} to {steps.max():.3g}, as their ranges differ"
+        text = f"joints of different ranges step by {steps.min():.3g} to {steps.max():.3g}"
         return Guess("%", 0.95, text, "deg")
     most = np.median(peaks[moving])
     limit = next((x for x in (_TWO_TURNS, _DEGREES) if most <= x), math.inf)

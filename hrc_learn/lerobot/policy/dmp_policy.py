@@ -282,7 +282,7 @@ def write_closed_form_policy(
     actions = {k: f for k, f in features.items() if f.type is FeatureType.ACTION}
     if not actions:
         raise ValueError(
-            f"{dataset} has no actions, which are what policies learn: record them, or import "
+            f"{dataset} has no actions, which a policy must learn: record them, or import "
             f"arrays with them (hrc import --actions)"
         )
     config = DMPConfig(

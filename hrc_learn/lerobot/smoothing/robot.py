@@ -27,7 +27,7 @@ _LATE = 2.0
 _WAIT = 0.5
 """Action periods to wait for a late action before the motion comes to rest."""
 _BEHIND = 1.0
-"""Duration of the actions that wait to be carried out above which there is a warning [s]."""
+"""Total duration of waiting actions above which a warning is given [s]."""
 _FOLLOW = 0.1
 """Fraction of an action's lateness by which later actions are postponed. A small fraction
 suppresses the jitter of the loop, but follows its drift.
@@ -350,7 +350,7 @@ class SmoothRobot(Robot):
         (then, before), (last, here) = self._readings[0], self._readings[-1]
         limits = self.upsampler.limits
         if now - last > 1 / limits.fps or not np.isfinite(here).all():
-            return  # the robot has been at rest since it was connected, as far as is known
+            return  # no motion was measured just now: the robot counts as at rest
         velocity = (here - before) / (last - then) if last > then else np.zeros_like(here)
         # A velocity beyond the limits means that the robot was moved by other means between
         # the readings: start at rest.
@@ -427,7 +427,7 @@ class SmoothRobot(Robot):
             due += period
 
     def _phase(self, now: float) -> float:
-        """Time since the newest action of the path, in action periods; takes actions when due.
+        """Time since the newest action of the path, in action periods; appends due actions.
 
         The first action is due when it comes, each further action one action period later.
         """
