@@ -88,7 +88,7 @@ def check_dataset(
         return report
     for check in METADATA_CHECKS:
         report.run(check, folder)
-    # A wrong mapping raises an error. A faulty sidecar is reported; then names find the columns.
+    # A wrong mapping is raised. A faulty sidecar is reported, and columns are found by name.
     columns = map_columns(folder.features, mapping)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
     dataset = dataset or OpenedDataset(folder=folder, columns=columns)
