@@ -182,7 +182,7 @@ def arm_for(model: FittedModel, name: str) -> Arm:
     if apart[best] > _SAME_TOOL:
         raise ValueError(
             f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from the tool of "
-            f"{name} at the model's first joints: they belong to another tool or base frame. Fit "
-            "with --channels joint, or choose the arm's description with that tool."
+            f"{name} at the model's first joints: they have another tool or base. Fit with "
+            "--channels joint, or choose the arm's description with that tool."
         )
     return arms[best]

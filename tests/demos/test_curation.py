@@ -175,7 +175,7 @@ def test_the_name_of_an_episode_is_its_number(tmp_path):
 
 @pytest.mark.parametrize("cut", [(-1, 10), (5, 6), (5, 5), (9, 3), (0, 101)])
 def test_cuts_that_leave_nothing_or_do_not_exist_are_refused(cut):
-    with pytest.raises(ValueError, match="no part"):
+    with pytest.raises(ValueError, match="must keep two frames"):
         decide("cut", 100, *cut)
     assert decide("cut", 100, 98, 100).stop == 100
 

@@ -182,13 +182,13 @@ def test_targets_differ_by_their_numbers(words, expected):
     [
         (3, "1 2 3", "3 numbers may be joints or position: write --goal joints or"),
         (7, "1 2 3 1 0 0 0", "7 numbers may be joints or pose"),
-        (2, "1 2 3 4", r"takes 2 numbers \(joints\), 3 numbers \(position\), 7 numbers"),
-        (2, "joints 1 2 3", "takes 2 numbers"),
-        (2, "1 x", "takes 2 numbers"),
+        (2, "1 2 3 4", r"accepts 2 numbers \(joints\), 3 numbers \(position\), 7 numbers"),
+        (2, "joints 1 2 3", "accepts 2 numbers"),
+        (2, "1 x", "accepts 2 numbers"),
         (2, "1 nan", "all finite"),
         (2, "1 2 3 1.021 0 0 0", r"norm of w x y z is 1\.021"),
         (2, "1 2 3 0.979 0 0 0", r"norm of w x y z is 0\.979"),
-        (0, "joints", "takes 3 numbers"),
+        (0, "joints", "accepts 3 numbers"),
     ],
 )
 def test_words_that_are_no_target_are_refused(count, words, message):

@@ -151,7 +151,7 @@ def test_what_the_driver_says_is_told(make):
     robot.send_action(both(0.3))
     robot._thread.join(5)
     with pytest.raises(
-        DeviceNotConnectedError, match=r"no more setpoints: no answer on the bus"
+        DeviceNotConnectedError, match=r"refused a setpoint: no answer on the bus"
     ):
         robot.send_action(both(0.3))
     with pytest.raises(DeviceNotConnectedError, match="no answer on the bus"):
