@@ -108,14 +108,14 @@ class Watchdog:
         """Report that the loop is alive.
 
         Raises:
-            WatchdogError: The watchdog's thread has ended, or hangs in a stop.
+            WatchdogError: The watchdog's thread has ended, or a stop hangs.
         """
         with self._lock:
             if self._thread.ident is not None and not self._thread.is_alive():
                 raise WatchdogError("the watchdog's thread has ended: stop the arm.")
             now, since = self._clock(), self._stopping_since
             if since is not None and now - since > self._timeout:
-                raise WatchdogError(f"the watchdog hangs in a stop for {now - since:.2f} s.")
+                raise WatchdogError(f"the watchdog's stop hangs since {now - since:.2f} s.")
             self._fed, self._due = now, None
 
     def check(self) -> bool:

@@ -34,10 +34,11 @@ TOUCH = 1e-3
 def phase_stopping(
     planned: Float[Tensor, "*#batch D"], measured: Float[Tensor, "*#batch D"], gain: float
 ) -> Float[Tensor, "*batch"]:
-    """Slow-down for a robot that is held back: gain |planned - measured|^2.
+    """Slow-down p for a robot that is held back: gain |planned - measured|^2.
 
-    (Ijspeert et al. 2013, "Dynamical movement primitives", section 2.5; here the gain slows the
-    whole system instead of the phase alone, so that the motion waits on its path.)
+    The clock of the primitive runs slower by the factor 1 + p (Ijspeert et al. 2013, "Dynamical
+    movement primitives", section 2.5; here p slows the whole system instead of the phase alone,
+    so that the motion waits on its path).
 
     Args:
         planned: Position of the primitive [rad] or [m].

@@ -51,8 +51,8 @@ class ExportedDMP:
     program: ExportedProgram
     """Program that maps (state, dt, inputs) to the next state.
 
-    State and inputs are dictionaries of tensors (B, ...); dt is (B,) [s]. A state is what
-    `state_tensors` returns. Inputs are `phase_stopping`, `coupling` and `goal`; a pose has
+    State and inputs are dictionaries of tensors (B, ...); dt is (B,) [s]. `state_tensors`
+    returns such a state. Inputs are `phase_stopping`, `coupling` and `goal`; a pose has
     `goal_position`, `goal_orientation` and `goal_body` instead of `goal`, and its coupling is
     (B, 6). All inputs are required; the values of `resting_inputs` have no effect.
     """

@@ -2,9 +2,9 @@
 
 Interaction primitives (Ben Amor et al. 2014; Maeda et al. 2017, "Probabilistic movement
 primitives for coordination of multiple human-robot collaborative tasks"): the motions of person
-and robot are jointly Gaussian, so the robot's motion follows from the observed part of the
-person's. The kind of interaction and its duration are inferred too: each combination of kind
-and duration has a likelihood in closed form.
+and robot are jointly Gaussian, so the observed part of the person's motion determines the most
+likely motion of the robot. The kind of interaction and its duration are inferred too: each
+combination of kind and duration has a likelihood in closed form.
 """
 
 import math

@@ -320,10 +320,10 @@ def fit_shared(
 ) -> tuple[JointDMP, Float[Tensor, "D"]]:
     """Fit one primitive to all demonstrations, in one pass and bounded memory.
 
-    The fit minimises the distance of all samples to one primitive, which has the start, goal
-    and duration of each demonstration in turn, but the same weights and start velocity (per
-    duration) for all. For demonstrations on one time grid, the result is the mean of their
-    separate primitives.
+    All demonstrations have the same weights and start velocity (per duration), but each has its
+    own start, goal and duration. The fit minimises the distance between the samples and the
+    motions with these boundaries. For demonstrations on one time grid, the result is the mean
+    of their separate primitives.
 
     The least-squares problem min |A X - B|^2, with unknowns X and one row of A and B for each
     sample, is solved from [A B]'[A B]. This product is a sum over the rows, in any order. Each

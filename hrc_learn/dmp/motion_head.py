@@ -375,7 +375,7 @@ class PlannedTrajectory(ContinuedTrajectory):
 
     @output
     def time(self) -> Float[Tensor, "*batch T"]:
-        """Time since the start [s]; during the delay, the end of the delay."""
+        """Time since the start [s]; times during the delay become the end of the delay."""
         time = self.s * self.duration[..., None] + self.delay[..., None]
         return time.to(self._coordinates.dtype).expand(*self._batch, -1)
 

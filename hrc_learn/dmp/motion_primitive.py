@@ -248,11 +248,11 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     ) -> State:
         """Advance by `dt`, exactly for terms that are constant over the step.
 
-        Uncoupled steps of any length end where the rollout does. A coupling that depends on
-        the state is evaluated at the start of the step, with an error of first order in `dt`.
-        The same holds for a filtered goal with the scalings `"paper"` and `"rotation"`, because
-        the goal then scales the forcing. A new goal changes neither the current value nor the
-        velocity.
+        Uncoupled steps of any length reach the states of the rollout. A coupling that depends
+        on the state is evaluated at the start of the step, which causes an error of first order
+        in `dt`. The same holds for a filtered goal with the scalings `"paper"` and
+        `"rotation"`, because the goal then scales the forcing. A new goal changes neither the
+        current value nor the velocity.
 
         Args:
             state: From `initial_state` or the last step.
@@ -337,8 +337,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
         Raises:
             ValueError: Two via points at the same time, a via point outside of `within`, or too
-                many or too close via points for the basis; the message names the distance that
-                works.
+                many or too close via points for the basis; the message names a sufficient
+                distance.
         """
         via = self.via_points(time, value, velocity)
         return self.with_motion(through_via_points(self.motion, via, within))

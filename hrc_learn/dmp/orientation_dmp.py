@@ -383,9 +383,10 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
 class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, OrientationState]):
     """Movement primitive of an orientation.
 
-    The columns are the error e to a reference, which is the goal by default. Forcing term and
-    spring act on e and its derivative, which is exact at all angles, or on the state of Ude et
-    al. 2014 (see `formulation`). Both signs of a quaternion give the same motion.
+    The columns are the error e to a reference, which is the goal by default. By default,
+    forcing term and spring act on e and its derivative; this is exact at all angles. The
+    formulation `"ude"` uses the state of Ude et al. 2014 instead. Both signs of a quaternion
+    give the same motion.
 
     Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and couplings are angular,
     in the base frame, (*batch, 3). Motions to a new start or goal rotate in the same direction
@@ -433,7 +434,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
 
     @property
     def formulation(self) -> str:
-        """State on which forcing term and spring act: `"log"` or `"ude"`."""
+        """State on which forcing term and spring act: `"log"` (e and e') or `"ude"`."""
         return "ude" if isinstance(self.motion, UdePrimitive) else "log"
 
     @property

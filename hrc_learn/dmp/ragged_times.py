@@ -246,7 +246,10 @@ def blocks(s: Float[Tensor, "B T"], most: int) -> Iterator[tuple[slice, slice]]:
 
 
 def chunks(s: Float[Tensor, "B T"], most: int | None = None) -> Iterator[slice]:
-    """Slices of the batch with about `most` samples each (None: `CHUNK`), if there are any."""
+    """Slices of the batch with about `most` samples each (None: `CHUNK`).
+
+    There are no slices if there are no samples.
+    """
     most = most or CHUNK.get(s.device.type, CHUNK["cpu"])
     size = max(1, most // max(s.shape[1], 1))
     return (slice(i, i + size) for i in range(0, s.shape[0] if s.numel() else 0, size))

@@ -28,9 +28,9 @@ END = 0
 PRIOR = 20.0
 """Weight of the prior (a Laplace distribution) of each integer, as a number of vectors."""
 LEAST = 0.02
-"""Mean magnitude assumed for an integer that was always zero."""
+"""Addition to the mean magnitude of each integer, which is zero for some in the data."""
 HEADROOM = 2.0
-"""Largest magnitude of an integer, relative to the largest magnitude in the data."""
+"""Largest allowed magnitude of an integer, relative to its largest magnitude in the data."""
 
 
 class Interval(NamedTuple):

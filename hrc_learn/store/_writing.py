@@ -78,7 +78,7 @@ class Claim:
         self.release()
 
     def release(self) -> None:
-        """Remove uncommitted content, and let others write."""
+        """Remove uncommitted content, and release the lock."""
         if self._lock.closed:
             return
         try:
@@ -98,7 +98,7 @@ class Claim:
         Args:
             kind: Kind of the new folder.
             overwrite: Allow an older folder of this kind to be replaced.
-            foreign: Allow the older folder to hold foreign files, whatever its kind.
+            foreign: Allow the older folder to contain foreign files, whatever its kind.
 
         Raises:
             InTheWayError: The target exists and may not be replaced.
@@ -209,7 +209,7 @@ class Claim:
             disk.sync_folder(self.workspace)
 
     def set_aside(self, place: Path, word: str) -> Path:
-        """Give an entry of the workspace a visible name next to the target."""
+        """Move an entry of the workspace to a visible name next to the target."""
         names = itertools.chain([word], (f"{word}-{n}" for n in itertools.count(2)))
         free = (self.target.with_name(f"{self.target.name}.{name}") for name in names)
         there = next(path for path in free if not os.path.lexists(path))
@@ -323,8 +323,8 @@ def new_file(path: str | os.PathLike[str] | Claim) -> Iterator[Path]:
     """Context for writing a file in a temporary folder; the complete file moves to its path.
 
     Args:
-        path: Path of the file, whose folder must exist, or a claim to the path. A claim stays
-            held. An existing file is replaced.
+        path: Path of the file, whose folder must exist, or a claim to the path. A claim is not
+            released. An existing file is replaced.
 
     Yields:
         Path to write to, with the same file name.
@@ -357,7 +357,7 @@ def replacing(
     """Context for writing a folder in a temporary place; the complete folder moves to its path.
 
     Args:
-        path: Path of the folder, or a claim to the path. A claim stays held.
+        path: Path of the folder, or a claim to the path. A claim is not released.
         kind: Kind of the folder.
         overwrite: Replace an older folder of the same kind; other folders are never replaced.
         source: Identifier of the source, for `source_of`.
@@ -434,7 +434,7 @@ def write_json(path: str | Path, content: object) -> None:
 
 @contextlib.contextmanager
 def _claimed(path: str | os.PathLike[str] | Claim) -> Iterator[Claim]:
-    """Claim to a path for the duration of the context; a given claim stays held after it."""
+    """Claim to a path for the duration of the context; a given claim is not released."""
     if not isinstance(path, Claim):
         with disk.naming(path), Claim(path) as claim:
             yield claim

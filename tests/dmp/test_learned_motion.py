@@ -155,7 +155,7 @@ def test_frames_are_chosen_where_they_determine_the_motion(tmp_path):
     assert (made - shown[5][1]).abs().max() < 0.1
     with pytest.raises(ValueError, match="give the 2 frames"):
         model.at()
-    with pytest.raises(ValueError, match="follows from frames here: leave out the context"):
+    with pytest.raises(ValueError, match="predicts from frames: leave out the context"):
         model.at(frames=Frames(frames.A[5], frames.b[5]), context=[0.5])
     with pytest.raises(ValueError, match="a model of frames has no contexts"):
         model.at_contexts(torch.zeros(1, 2).double())
