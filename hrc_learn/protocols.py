@@ -109,8 +109,10 @@ class DrawnRegion:
     """Half the edge lengths [m]."""
 
     def __post_init__(self) -> None:
-        if min(self.half_size) <= 0:
-            raise ValueError(f"a region's half_size must be positive, but is {self.half_size}.")
+        if not np.isfinite(self.centre).all():
+            raise ValueError(f"a region's centre must be finite, but is {self.centre}.")
+        if not all(0 < x < np.inf for x in self.half_size):
+            raise ValueError(f"half_size must be positive and finite, but is {self.half_size}.")
 
 
 Request = Literal["start", "stop", "save", "discard", "home", "finish"]

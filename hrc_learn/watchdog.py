@@ -89,10 +89,10 @@ class Watchdog:
             clock: Current time [s].
 
         Raises:
-            ValueError: The timeout is not positive.
+            ValueError: The timeout is not positive, or is more than a thread can wait.
         """
-        if not timeout > 0:
-            raise ValueError(f"timeout must be positive, but is {timeout}")
+        if not 0 < timeout < threading.TIMEOUT_MAX:
+            raise ValueError(f"timeout must be positive and finite, but is {timeout}")
         self.trips = 0
         self._timeout, self._stop, self._clock = timeout, stop, clock
         self._fed: float | None = None
@@ -115,7 +115,7 @@ class Watchdog:
                 raise WatchdogError("the watchdog's thread has ended: stop the arm.")
             now, since = self._clock(), self._stopping_since
             if since is not None and now - since > self._timeout:
-                raise WatchdogError(f"the watchdog's stop hangs since {now - since:.2f} s.")
+                raise WatchdogError(f"the stop has not returned for {now - since:.2f} s.")
             self._fed, self._due = now, None
 
     def check(self) -> bool:
@@ -138,9 +138,8 @@ class Watchdog:
         with self._lock:
             self._stopping_since = None
             self._in_a_row += 1
-            if (
-                not stopped and self._fed is None
-            ):  # if it was fed meanwhile, the loop is running again
+            # If the watchdog was fed meanwhile, the loop is running again.
+            if not stopped and self._fed is None:
                 self._due = self._clock() + self._pause
                 self._pause = min(2 * self._pause, _LONGEST_PAUSE)
         return True

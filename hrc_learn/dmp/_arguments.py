@@ -271,10 +271,10 @@ def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[T
     """Times [s] at interval `dt`, from zero to the first one at or after the longest duration.
 
     Raises:
-        ValueError: The interval is not positive.
+        ValueError: The interval is not positive and finite.
     """
     if not (math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt must be positive, got {dt}")
+        raise ValueError(f"dt must be positive and finite, got {dt}")
     # The tolerance keeps rounding from adding a sample past the end.
     longest = duration.max().item() if duration.numel() else 0.0
     last = math.ceil(longest / dt * (1 - 1e-7))

@@ -33,13 +33,13 @@ DEGREE = 3
 def check_positive(name: str, value: float) -> None:
     """Raise ValueError unless `value` is positive and finite."""
     if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be positive, got {value}")
+        raise ValueError(f"{name} must be positive and finite, got {value}")
 
 
 def check_count(count: int) -> None:
-    """Raise ValueError for a basis of fewer than two functions."""
-    if count < 2:
-        raise ValueError(f"a basis needs at least 2 functions, got {count}")
+    """Raise ValueError unless `count` is a whole number of two or more."""
+    if not (count >= 2 and count % 1 == 0):
+        raise ValueError(f"a basis needs a whole number of at least 2 functions, got {count}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Points, Times, positive, to_tensor
+from hrc_learn.dmp._arguments import Points, Times, finite, positive, seconds, to_tensor
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, gaussian
 from hrc_learn.dmp.samples import padded
@@ -102,16 +102,17 @@ class InteractionPrimitive:
         """Estimate of the interaction from the observed part of the person's motion.
 
         Args:
-            time: Time since the person started [s], (n,), increasing.
+            time: Time since the person started [s], (n,).
             person: (n, H); NaN where nothing was observed.
             noise: Standard deviation of each value, from the sensor and from the person's
                 variation between samples.
 
         Raises:
-            ValueError: Wrong shapes, or no observation at all.
+            ValueError: Wrong shapes, times that are negative or not finite, infinite values, or
+                no observation at all.
         """
-        seen_at = to_tensor(time, torch.float64)
         values = to_tensor(person, torch.float64)
+        seen_at = seconds(time, values.device)
         if seen_at.ndim != 1 or values.shape != (len(seen_at), self.observed):
             raise ValueError(
                 f"time and person must be (n,) and (n, {self.observed}), got "
@@ -119,6 +120,7 @@ class InteractionPrimitive:
             )
         if values.isnan().all():
             raise ValueError("no value of the person was observed")
+        finite("person", values[~values.isnan()])
         deviation = positive("noise", noise, values)
         steps = torch.linspace(-3, 3, DURATIONS, dtype=torch.float64)
         duration = (self.log_duration[:, :1] + self.log_duration[:, 1:] * steps).exp()
@@ -136,14 +138,14 @@ class InteractionPrimitive:
         within = posterior[kind] / probability[kind]
         expected = (within * duration[kind].log()).sum().exp()
         model = self.models[kind]
-        whole = torch.full((len(values), model.mean.shape[0]), math.nan, dtype=torch.float64)
-        whole[:, : self.observed] = values
+        free = len(model.mean) - self.observed
+        whole = torch.nn.functional.pad(values, (0, free), value=math.nan)
         scale = model.primitive.duration.double() / expected
         return InteractionEstimate(
             kind=self.kinds[kind],
             probability=probability,
             duration=expected.item(),
-            phase=(seen_at[-1] / expected).clamp(max=1).item(),
+            phase=(seen_at.max() / expected).clamp(max=1).item(),
             motion=model.condition(seen_at * scale, whole, noise=noise),
             observed=self.observed,
         )

@@ -15,6 +15,7 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
+    checked_vector,
     full_precision,
     positive,
 )
@@ -227,18 +228,19 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             acceleration: Limit of each coordinate [1/s^2], (D,) or one for all.
             start: Start of the motion; None: as demonstrated.
             goal: Goal of the motion; None: as demonstrated.
+
+        Raises:
+            ValueError: A limit that is not positive, or a wrong number of limits.
         """
-        fine = torch.linspace(
-            0, 1, LIMIT_SAMPLES, dtype=torch.float64, device=self.start.device
-        )
+        fine = torch.linspace(0, 1, LIMIT_SAMPLES, dtype=torch.float64).to(self.start.device)
         motion = self.rollout(fine * self.duration[..., None].double(), start, goal)
         factors = [torch.zeros_like(self.duration)]
-        for order, (values, limit) in enumerate(
-            ((motion.velocity, velocity), (motion.acceleration, acceleration)), start=1
-        ):
+        for n, name, limit in ((1, "velocity", velocity), (2, "acceleration", acceleration)):
             if limit is not None:
-                ratio = values.abs().amax(-2) / positive("a limit", limit, values)
-                factors.append(ratio.amax(-1) ** (1 / order))
+                largest = getattr(motion, name).abs().amax(-2)
+                limit = positive(name, limit, largest)
+                limit = checked_vector(name, limit, largest) if limit.ndim else limit
+                factors.append((largest / limit).amax(-1) ** (1 / n))
         return self.duration * torch.stack(torch.broadcast_tensors(*factors)).amax(0)
 
 

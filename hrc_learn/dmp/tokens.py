@@ -139,7 +139,7 @@ class MotionTokenizer(nn.Module):
             raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance}")
         samples = _samples(time, motions)
         if len(samples.s) < 2:
-            raise ValueError("motions must be (N, T, D) with at least 2 motions, got 1 or none")
+            raise ValueError(f"motions must be (N, T, D), N of 2 or more, got {len(samples.s)}")
         y = samples.position.mT
         seen = y[samples.mask].numpy()
         chosen, levels = _levels(seen, steps)

@@ -110,6 +110,9 @@ def test_probabilities_are_those_of_gaussians(model):
     assert estimate.duration == pytest.approx(expected.item())
     assert estimate.phase == pytest.approx(float(time[-1] / expected))
     assert model.observe(time + 9.0, values, noise).phase == 1.0
+    backwards = model.observe(time.flip(0), values.flip(0), noise)
+    assert backwards.phase == pytest.approx(estimate.phase)
+    assert backwards.duration == pytest.approx(estimate.duration)
 
 
 def test_kinds_have_the_fractions_and_durations_of_their_demonstrations():
@@ -145,5 +148,9 @@ def test_refuses_with_a_sentence(model):
         model.observe(time[:3], hand[:4], 0.1)
     with pytest.raises(ValueError, match="no value of the person"):
         model.observe(time[:3], hand[:3] * math.nan, 0.1)
+    with pytest.raises(ValueError, match="person must be finite, but contains inf"):
+        model.observe(time[:3], hand[:3].masked_fill(hand[:3] == hand[1, 0], math.inf), 0.1)
+    with pytest.raises(ValueError, match="finite, non-negative seconds"):
+        model.observe(time[:3] * math.nan, hand[:3], 0.1)
     with pytest.raises(ValueError, match="noise must be positive"):
         model.observe(time[:3], hand[:3], 0.0)

@@ -504,7 +504,7 @@ def test_coordinates_and_durations_are_weighted_means(family, strength, shrinkag
     torch.testing.assert_close(single.duration, found[1].duration)
     torch.testing.assert_close(torch.cat([single.start, single.goal]), asked[1])
     assert model.at(start, goal, 3.5).duration.item() == 3.5
-    with pytest.raises(ValueError, match="follows from start and goal here: leave out"):
+    with pytest.raises(ValueError, match="predicts from start and goal: leave out"):
         model.at(start, goal, context=asked[1])
     # By default those that the model predicts for the mean ones.
     usual = model.at_contexts(context.mean(0, keepdim=True))[0]

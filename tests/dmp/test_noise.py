@@ -148,5 +148,7 @@ def test_durations_of_a_batch_keep_both_limits_towards_another_goal():
         v, a = (x[k].detach().abs().amax(0).numpy() for x in (made.velocity, made.acceleration))
         factor = max((v / velocity).max(), np.sqrt((a / acceleration).max()))
         assert tau[k].item() == pytest.approx(factor * dmp.duration[k].item(), rel=2e-3)
-    with pytest.raises(ValueError, match="a limit must be positive"):
+    with pytest.raises(ValueError, match="velocity must be positive"):
         dmp.admissible_duration(velocity=0.0)
+    with pytest.raises(ValueError, match=r"acceleration must have shape \(\.\.\., 2\), got"):
+        dmp.admissible_duration(acceleration=[1.0, 2.0, 3.0])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from dmp_oracle import forcing, gaussians, solve
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import ExponentialPhase, GaussianBasis, Response, SpringDamper
 
@@ -91,3 +92,12 @@ def test_gaussians_are_the_papers_in_the_phase_domain():
 def test_impossible_parts_are_refused(make, complaint):
     with pytest.raises(ValueError, match=complaint):
         make()
+
+
+@pytest.mark.parametrize("count", [10.5, float("nan"), float("inf")])
+def test_counts_are_whole_numbers(count):
+    with (
+        shapes_unchecked(),
+        pytest.raises(ValueError, match=f"whole number of at least 2 functions, got {count}"),
+    ):
+        GaussianBasis(count=count)

@@ -218,8 +218,11 @@ def test_both_hands_act_at_once():
 
 
 def test_a_region_has_a_size():
-    with pytest.raises(ValueError, match="half_size must be positive"):
-        DrawnRegion(centre=(0.0, 0.0, 0.0), half_size=(0.1, 0.0, 0.1))
+    for wrong in (0.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="half_size must be positive and finite"):
+            DrawnRegion(centre=(0.0, 0.0, 0.0), half_size=(0.1, wrong, 0.1))
+    with pytest.raises(ValueError, match="centre must be finite"):
+        DrawnRegion(centre=(0.0, np.nan, 0.0), half_size=(0.1, 0.1, 0.1))
 
 
 @pytest.fixture
