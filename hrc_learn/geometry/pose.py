@@ -81,8 +81,10 @@ class Pose:
 
         Args:
             points: Points (*points, 3) [m]; leading dimensions broadcast against the pose's.
+                Arrays and lists are converted to the dtype and device of the pose.
         """
-        return quaternion.rotate(self.orientation, as_tensor(points)) + self.position
+        like = None if isinstance(points, Tensor) else self.position
+        return quaternion.rotate(self.orientation, as_tensor(points, like)) + self.position
 
     def twist_to(self, other: Pose) -> Float[Tensor, "*both 6"]:
         """Motion to `other` as (linear [m], angular [rad]) in the parent frame.
@@ -96,10 +98,9 @@ class Pose:
 
     def __getitem__(self, index: Any) -> Pose:
         """Index the batch dimensions."""
-        index = index if isinstance(index, tuple) else (index,)
-        return Pose(
-            self.position[(*index, slice(None))], self.orientation[(*index, slice(None))]
-        )
+        batch = index if isinstance(index, tuple) else (index,)
+        index = (*batch, slice(None))
+        return Pose(self.position[index], self.orientation[index])
 
 
 torch.export.register_dataclass(Pose, serialized_type_name="hrc_learn.geometry.Pose")

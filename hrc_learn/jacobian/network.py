@@ -103,8 +103,8 @@ class RBFImageJacobian(nn.Module):
         """
         super().__init__()
         self.input_indices = _checked_indices(input_indices, centers)
-        if not width > 0:
-            raise ValueError(f"width must be positive, got {width}.")
+        if not 0 < width < torch.inf:
+            raise ValueError(f"width must be positive and finite, got {width}.")
         self.normalized = normalized
         self.register_buffer("centers", centers.detach().clone())
         self.register_buffer("width", torch.as_tensor(width, dtype=centers.dtype))

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from sampling import generator, quaternions, rotation_vectors
@@ -53,6 +54,15 @@ def test_broadcasts():
     assert pose.apply(torch.zeros(5, 3, dtype=torch.float64)).shape == (4, 5, 3)
     assert (pose @ poses(5, rng=rng)).position.shape == (4, 5, 3)
     assert pose.twist_to(poses(5, rng=rng)).shape == (4, 5, 6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_lists_of_points_have_the_dtype_of_the_pose(dtype):
+    half_turn = torch.tensor([0, 0, 0, 1.0], dtype=dtype)
+    pose = Pose(torch.tensor([1.0, 0, 0], dtype=dtype), half_turn)
+    expected = torch.tensor([[0.5, 2.0, 3.0]], dtype=dtype)
+    assert_close(pose.apply([[0.5, -2.0, 3.0]]), expected)
+    assert_close(pose.apply(np.array([[0.5, -2.0, 3.0]])), expected)
 
 
 def test_goes_through_vmap_as_a_value():

@@ -103,6 +103,7 @@ def test_gradients():
         ({"input_indices": (0, 1, 2)}, "2 columns"),
         ({"input_indices": (0, 6)}, "components 0 to 5"),
         ({"width": 0.0}, "width must be positive"),
+        ({"width": float("inf")}, "width must be positive and finite, got inf"),
     ],
 )
 def test_nonsense_is_refused(arguments, message):
