@@ -46,7 +46,7 @@ class Gripper(Protocol):
     """A parallel gripper."""
 
     def move(self, width: float) -> None:
-        """Set the opening to reach, or to squeeze towards if an object is in between [m]."""
+        """Set the opening of the fingers [m]; an object between the fingers is squeezed."""
         ...
 
 

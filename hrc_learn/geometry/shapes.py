@@ -192,7 +192,7 @@ def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh raises errors of many types for broken files
-        raise ValueError(f"{path} is no mesh that trimesh reads: {error}") from error
+        raise ValueError(f"{path} is not a mesh that trimesh reads: {error}") from error
     unit = str(scene.units or "").partition(" * ")[0]
     scale = float(unit) if unit[:1].isdigit() else 1.0
     found = []

@@ -199,11 +199,10 @@ class Kind:
 
     name: str
     files: tuple[str, ...] = ()
-    """Patterns of the package's files, for a folder that users may extend; "*" also matches
-    "/".
+    """Patterns of the package's files in a folder that users may extend; "*" also matches "/".
 
     Such a folder may lack a manifest, and its foreign files are carried over. Without patterns,
-    a folder that holds foreign files is not replaced.
+    a folder that contains foreign files is not replaced.
     """
 
 

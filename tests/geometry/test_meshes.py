@@ -157,11 +157,11 @@ def test_a_placed_part_is_turned_moved_and_scaled(tmp_path):
 
 def test_what_is_no_mesh_is_refused_by_name(tmp_path):
     (tmp_path / "a.fbx").write_text("")
-    with pytest.raises(ValueError, match=r"a\.fbx is no mesh that trimesh reads"):
+    with pytest.raises(ValueError, match=r"a\.fbx is not a mesh that trimesh reads"):
         read_mesh(tmp_path / "a.fbx")
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(ValueError, match=r"empty\.obj holds no triangle"):
         read_mesh(tmp_path / "empty.obj")
     (tmp_path / "cut.stl").write_text("solid\nvertex 0 0 0\nvertex 1 0 0\n")
-    with pytest.raises(ValueError, match=r"cut\.stl (holds no triangle|is no mesh)"):
+    with pytest.raises(ValueError, match=r"cut\.stl (holds no triangle|is not a mesh)"):
         read_mesh(tmp_path / "cut.stl")
