@@ -1,7 +1,7 @@
 """Arm-angle ablation: the same motion demonstrated with and without a null-space posture.
 
-The end effector moves alike in both demonstrations of a pair. Without the posture the open door
-of the cabinet stops the arm; with it, the expert also moves the elbow aside.
+The end effector moves alike in both demonstrations of a pair. Without the posture, the open
+door of the cabinet stops the arm. With the posture, the expert also moves the elbow aside.
 """
 
 from dataclasses import dataclass
@@ -26,14 +26,14 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
 @dataclass(frozen=True, kw_only=True)
 class Args:
     pairs: int = 20
-    """Paired demonstrations, each with another tremor and start."""
+    """Number of paired demonstrations, each with its own tremor and start."""
     shelf: str = "middle"
     """Shelf at which the motion ends."""
     robot: str = "panda"
     seed: int = 0
     """Seed of the first pair."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 class Outcome(NamedTuple):

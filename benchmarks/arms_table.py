@@ -1,10 +1,10 @@
-"""A table of the registered arms: joints, reach, agreement with MuJoCo, servoing, demo, more.
+"""Make a table of the registered arms: joints, reach, agreement with MuJoCo, servoing, demo.
 
-Written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the files given.
-The servoing column repeats the scenario `near` of `benchmarks/controller_sweep.py`: random
-starts, targets and uncalibrated cameras, simulated kinematically. The last column comes from
-`hrc demo --robot NAME --json FOLDER/NAME.json`; an arm without one keeps what its row says.
-Arms whose package is not installed are left out.
+The table is written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the
+given files. The servoing column repeats the scenario `near` of
+`benchmarks/controller_sweep.py`: random starts, targets and uncalibrated cameras, simulated
+kinematically. The last column comes from `hrc demo --robot NAME --json FOLDER/NAME.json`;
+without this file, an arm keeps its old value. Arms whose package is not installed are left out.
 """
 
 import os
@@ -57,29 +57,30 @@ _COLUMNS = _HEADER.splitlines()[0].count("|") - 1
 @dataclass(frozen=True, kw_only=True)
 class Args:
     states: int = 10_000
-    """Random joint positions in which pose and Jacobian are compared."""
+    """Number of random joint positions in which pose and Jacobian are compared."""
     postures: int = 500
-    """Of them, those in which contacts are compared."""
+    """Number of these joint positions in which contacts are compared."""
     poses: int = 1000
-    """Random reachable poses to invert."""
+    """Number of random reachable poses to invert."""
     arms: tuple[str, ...] = ()
-    """Measure these alone: rows of others stay as they are; none: all."""
+    """Arms to measure; the rows of other arms stay as they are. Default: all arms."""
     trials: int = 0
-    """Of servoing; 0: what its row says is kept."""
+    """Number of servoing trials; 0 keeps the old value of the servoing column."""
     kinematics: bool = True
-    """Else what a row says of them is kept."""
+    """Measure kinematics; False keeps the old values."""
     demos: Path | None = None
-    """Folder with NAME.json of `hrc demo`; whether arms without one are refused is tried."""
+    """Folder with NAME.json of `hrc demo`. For an arm without this file, the demo's check of
+    the reach is run."""
     measure: bool = True
-    """Else rows keep all that is not of demos."""
+    """Measure arms; False renews only the demo column."""
     files: tuple[Path, ...] = ()
-    """Into which the table is written."""
+    """Files into which the table is written."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print the table, write it."""
+    """Measure, print the table and write it."""
     torch.set_num_threads(1)
     rows, figures = [_HEADER], {}
     for name in registered_arms():
@@ -131,7 +132,7 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
         share = torch.rand(count, n, generator=rng, dtype=torch.float64)
         return lower + (upper - lower) * share
 
-    drawn(5000)  # those of `reach`: what follows are others
+    drawn(5000)  # the random numbers that `reach` uses: the following ones differ
     pose = chain.forward(drawn(args.poses))
     begun = time.thread_time()
     found = solve_inverse(chain, pose, task="pose" if n >= 6 else "position+axis").found
@@ -151,7 +152,9 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
 
 
 def _servoed(name: str, trials: int) -> dict[str, float]:
-    """As shares of trials: done, with a contact; and steps beyond limits; NaN: not reached."""
+    """Fractions of trials that succeed and that touch, and number of steps beyond limits; empty
+    if the arm does not reach the table.
+    """
     config = TrialConfig(
         count=trials, robot=ArmChoice(name), duration=8.0, contacts=True, pull="saturated"
     )
@@ -172,13 +175,15 @@ type Seen = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _compared(described: Arm, q: torch.Tensor) -> dict[str, float]:
-    """Largest differences of flange positions [m], rotations and Jacobians from others'."""
+    """Largest difference of flange positions [m], rotations and Jacobians from those of other
+    libraries.
+    """
     seen = mujoco_kinematics(described)
     figures = {"difference_from_mujoco": largest_difference(described, q, seen)}
     if find_spec("pinocchio") is not None:
         try:
             see = pinocchio_kinematics(described)
-        except IndexError:  # what 4.1 says of some files that MuJoCo reads
+        except IndexError:  # Pinocchio 4.1 raises this for some files that MuJoCo reads
             return figures
         figures["difference_from_pinocchio"] = largest_difference(described, q, see)
     return figures
@@ -187,12 +192,12 @@ def _compared(described: Arm, q: torch.Tensor) -> dict[str, float]:
 def largest_difference(
     described: Arm, q: torch.Tensor, see: Callable[[np.ndarray], Seen]
 ) -> float:
-    """Of flange positions [m], rotations and Jacobians from what another library computes.
+    """Largest difference of flange positions [m], rotations and Jacobians from another library.
 
     Args:
         described: The arm.
         q: Joint positions (states, joints) [rad, m].
-        see: Of one of them, by that library.
+        see: Returns the poses and the Jacobian of that library at one joint position.
     """
     flange = described.with_tool(torch.eye(4, dtype=torch.float64))
     poses, jacobians = flange.forward_and_jacobian(q)
@@ -207,10 +212,10 @@ def largest_difference(
 
 
 def mujoco_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
-    """By MuJoCo's own reading of an arm's file.
+    """Kinematics of an arm as MuJoCo reads them from its file.
 
     Raises:
-        ValueError: MuJoCo does not read it.
+        ValueError: MuJoCo does not read the file.
     """
     assert described.description is not None
     model = mujoco_model(described.description)
@@ -257,7 +262,7 @@ def pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
 
     def see(row: np.ndarray) -> Seen:
         for joint, angle in zip(joints, row, strict=True):
-            # One that turns without end is its cosine and sine there.
+            # Pinocchio represents a continuous joint by cosine and sine.
             value = [angle] if joint.nq == 1 else [math.cos(angle), math.sin(angle)]
             q[joint.idx_q : joint.idx_q + joint.nq] = value
         pinocchio.computeJointJacobians(model, data, q)
@@ -270,9 +275,10 @@ def pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
 
 
 def _self_contacts(described: Arm, q: torch.Tensor) -> dict[str, float]:
-    """Shares of postures in which an arm touches itself, by capsules and by MuJoCo's hulls.
+    """Fractions of postures in which an arm touches itself, by capsules and by MuJoCo's hulls.
 
-    "missed" are those in which hulls of links meet that are no neighbours, but no capsules.
+    "missed" counts postures in which hulls of links that are not neighbours touch, but no
+    capsules.
     """
     chain, n = described.chain, len(described.joint_names)
     capsules = described.body.self_distance(q).numpy() < 0
@@ -315,7 +321,7 @@ def _self_contacts(described: Arm, q: torch.Tensor) -> dict[str, float]:
 
 
 def _panda_file() -> Arm:
-    """The Panda of example-robot-data, for its collision meshes."""
+    """The Panda of example-robot-data, used for its collision meshes."""
     ur5 = arm("ur5").description
     assert ur5 is not None
     robots = next(folder for folder in ur5.parents if folder.name == "robots")
@@ -323,7 +329,7 @@ def _panda_file() -> Arm:
 
 
 def mujoco_model(path: Path) -> mujoco.MjModel:
-    """MuJoCo's own reading of a file; of URDF the kinematics alone."""
+    """MuJoCo's model of a file. Of a URDF file, only the kinematics are read."""
     if path.suffix != ".urdf":
         return mujoco.MjModel.from_xml_path(str(path))
     robot = ElementTree.parse(path).getroot()
@@ -340,7 +346,9 @@ def mujoco_model(path: Path) -> mujoco.MjModel:
 
 
 def _differences(measured: dict[str, float]) -> str:
-    """From MuJoCo and Pinocchio; of Franka's arms tests compare what others have of them."""
+    """Differences from MuJoCo and Pinocchio as text. For Franka's arms, tests make this
+    comparison.
+    """
     found = [measured.get(f"difference_from_{name}") for name in ("mujoco", "pinocchio")]
     shown = [f"{error:.0e}" for error in found if error is not None]
     return ", ".join(shown) or "its own model"
@@ -351,13 +359,13 @@ def _percent(measured: dict[str, float], *names: str) -> str:
 
 
 def _row_before(name: str, args: Args) -> list[str]:
-    """The row of an arm in the first of the files, if it has one."""
+    """Row of an arm in the first file that has one; empty if there is none."""
     rows = [row for file in args.files for row in file.read_text(encoding="utf-8").splitlines()]
     return [row for row in rows if row.startswith(f"| {name} |")][:1]
 
 
 def _cells_before(name: str, args: Args) -> list[str]:
-    """Those of that row, the last ones counted from its end."""
+    """Cells of that row; empty if the number of columns has changed."""
     before = _row_before(name, args)
     cells = [cell.strip() for cell in before[0].split("|")[1:-1]] if before else []
     return cells if len(cells) == _COLUMNS else []
@@ -376,7 +384,7 @@ def _servoing(name: str, measured: dict[str, float], args: Args) -> str:
 
 
 def _demo(name: str, args: Args) -> str:
-    """What came of the demo; without a new one, what the table says already."""
+    """Result of the demo. Without a new result, the old value of the table."""
     path = None if args.demos is None else args.demos / f"{name}.json"
     if path is None or not path.is_file():
         before = _row_before(name, args)
@@ -389,7 +397,7 @@ def _demo(name: str, args: Args) -> str:
 
 
 def _refusal(name: str) -> str:
-    """Why the demo does not begin with an arm; empty where it does."""
+    """Reason why the demo refuses an arm; empty if it does not."""
     choice = ArmChoice(name)
     try:
         Workplace.of(choice.work_arm())

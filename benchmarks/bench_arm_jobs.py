@@ -1,11 +1,11 @@
-"""The whole job beside a person through the driver of the real arm, its sockets and its cycles.
+"""Run the whole job near a person through the driver, sockets and cycles of the real arm.
 
-One object is grasped, carried and placed while a person pushes the elbow, and a worker comes to
-the table if wanted, with the nominal imperfections of a laboratory, in MuJoCo behind the
-network protocol of the arm (franky-sim), which waits for each answer. What led the arm in each
-cycle, answers and what a control box goes on with where none comes, is judged afterwards by the
-limit checker of franka-sim, in its own environment (tools/make_franka_sim.sh), by the Panda's
-limits. Packets are lost on purpose, if wanted.
+One object is grasped, carried and placed while a person pushes the elbow and, if requested, a
+worker comes to the table. The simulation in MuJoCo has the nominal imperfections of a
+laboratory. It stands behind the network protocol of the arm (franky-sim) and waits for each
+answer. Packets can be dropped. Afterwards, franka-sim's limit checker judges the velocity
+commanded in each cycle, including the extrapolation of a control box that receives no answer,
+against the Panda's limits. The checker runs in its own environment (tools/make_franka_sim.sh).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ REPORTED = {
     "min distance": "smallest distance of the worker [mm]",
     "contacts with the worker": "contacts with the worker",
 }
-"""Metrics of the job, by the heads of their columns."""
+"""Metrics of the job, by the headings of their columns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,25 +67,26 @@ class Args:
     models: Path
     """Folder of `hrc demo`, with `aiming` and `placing`."""
     driver: Literal["franky", "franka"] = "franka"
-    """franky's own motion generator, or our loop at 1 kHz."""
+    """Driver: franky's own motion generator, or our 1 kHz loop."""
     first_seed: int = 0
-    """Of the objects' places, of images and imperfections."""
+    """First seed of object places, images and imperfections."""
     jobs: int = 50
-    """Seeds from there on."""
+    """Number of jobs, with successive seeds."""
     loss: float = 0.0
-    """Share of the packets that are lost, of states and of answers each."""
+    """Fraction of packets that are lost, the same for states and answers."""
     pulls: Literal["scripted", "random"] = "scripted"
-    """When the elbow is pushed: while the arm waits for it, or at any time."""
+    """Time of the pushes at the elbow: while the arm waits for them, or any time."""
     worker: bool = False
-    """Whether a worker comes to the table, whom nobody expects."""
+    """True if an unannounced worker comes to the table."""
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
-    """How the job is done."""
+    """Settings of the job."""
     json: Path | None = None
-    """Receives the rows as they come, one job a line; seeds that it has are not done again."""
+    """File that receives one row per job, immediately; seeds that it contains are not repeated.
+    """
 
 
 def main(args: Args) -> None:
-    """Do the jobs, one after another."""
+    """Run the jobs one after another."""
     if not PYTHON.exists():
         raise ValueError("tools/make_franka_sim.sh makes the environment of the checker first")
     aiming = VisualServoSkill.load(args.models / "aiming")
@@ -112,7 +113,7 @@ def _done_before(path: Path | None) -> list[dict[str, Any]]:
 def job(
     aiming: VisualServoSkill, placing: PlacingSkill, seed: int, args: Args
 ) -> dict[str, Any]:
-    """One of them, as a row."""
+    """Run one job and return its row."""
     served: list[tuple[ArmServer, LossyLink, CycleLog]] = []
 
     @contextmanager
@@ -163,7 +164,7 @@ def job(
 
 
 def judged(cycles: list[DrivenCycle]) -> dict[str, Any]:
-    """What the checker says of all cycles."""
+    """Findings of the checker on all cycles."""
     if not cycles:
         return {"ticks": 0, "findings": 0, "shown": []}
     limits = panda.limits
@@ -184,7 +185,7 @@ def judged(cycles: list[DrivenCycle]) -> dict[str, Any]:
 
 
 def show(rows: list[dict[str, Any]]) -> None:
-    """Print what came of all."""
+    """Print the results of all jobs."""
     table = Table("", "", title=f"{len(rows)} jobs")
     done = [row for row in rows if not row["failure"]]
     table.add_row("done", f"{len(done)}")

@@ -1,9 +1,9 @@
-"""CPU time and memory of the commands that read datasets, on ones far beyond a screen.
+"""CPU time and memory of the commands that read datasets, on very large datasets.
 
-By default 10,000 episodes of 100 frames and 14 numbers, a million frames, and four episodes of
-an hour at 50 Hz; ten episodes tell what the imports take. Each command runs in a process of
-its own; its memory is the largest that the system counted for it. A recording of as many
-episodes is killed before it ends, and recovered.
+By default, one dataset has 10,000 episodes of 100 frames and 14 numbers, a million frames; the
+other has four episodes of an hour at 50 Hz. A dataset of ten episodes measures the cost of
+imports. Each command runs in its own process, whose largest resident memory is reported. In
+addition, a recording with as many episodes is killed before it ends, and then recovered.
 
     python benchmarks/bench_big_sets.py --commands fit curate
 """
@@ -36,25 +36,25 @@ COMMANDS = ("check", "fit", "evaluate", "show", "curate", "repair", "recover")
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """The sets, and what is run on them."""
+    """Sizes of the datasets, and commands to run on them."""
 
     episodes: int = 10_000
-    """Of the set of many."""
+    """Number of episodes of the dataset with many episodes."""
     frames: int = 100
-    """Of each of them."""
+    """Number of frames in each of these episodes."""
     hours: int = 4
-    """Episodes of an hour in the set of long ones; 0 leaves it out."""
+    """Number of one-hour episodes of the dataset with long episodes; 0: no such dataset."""
     commands: tuple[str, ...] = COMMANDS
-    """What is run."""
+    """Commands to run."""
     folder: Path | None = None
-    """Where the sets are made, and stay; none: in a temporary place."""
+    """Folder in which the datasets are made and kept. Default: a temporary folder."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True)
 class Set:
-    """A dataset of one size; commands write beside it."""
+    """A dataset of one size; commands write next to it."""
 
     name: str
     episodes: int
@@ -63,13 +63,13 @@ class Set:
 
     @property
     def root(self) -> Path:
-        """Of the dataset."""
+        """Folder of the dataset."""
         return self.folder / "set"
 
 
 @dataclass(frozen=True)
 class Used:
-    """What a process took."""
+    """CPU time and memory of a process."""
 
     seconds: float
     """Of CPU."""
@@ -79,7 +79,7 @@ class Used:
 
 
 def main(args: Args) -> int:
-    """Make the sets, run the commands, print a table."""
+    """Make the datasets, run the commands and print a table."""
     if unknown := set(args.commands) - set(COMMANDS):
         raise ValueError(f"there is no command {min(unknown)}; there are {', '.join(COMMANDS)}")
     table = Table("command", "set", "CPU [s]", "memory [MiB]", "status")
@@ -112,21 +112,22 @@ def main(args: Args) -> int:
 
 
 def write(root: Path, episodes: int, frames: int, die: bool = False) -> None:
-    """Record reaches to random goals, smooth and a little noisy.
+    """Record smooth reaches to random goals, with a little noise.
 
     Args:
-        root: Of the dataset.
-        episodes: How many.
-        frames: Of each.
+        root: Folder of the dataset.
+        episodes: Number of episodes.
+        frames: Number of frames in each episode.
         die: Kill this process instead of ending the recording.
     """
     rng = np.random.default_rng(0)
     s = np.linspace(0, 1, frames)
-    # Somebody who records for an hour reaches more than once.
+    # In an episode of an hour, a person reaches more than once.
     reach = s**3 * (10 - 15 * s + 6 * s**2) if frames < _HOUR else np.sin(360 * np.pi * s) ** 2
     with DatasetWriter(root, _FPS, "any", JOINTS, {"action": JOINTS}) as writer:
         for _ in range(episodes):
-            # Of one sign, or a joint of four motions looks mirrored in one of them.
+            # All amplitudes are positive; otherwise, with four motions, a joint could look
+            # mirrored in one of them.
             goal = rng.uniform(0.2, 1, len(JOINTS))
             joints = reach[:, None] * goal + rng.normal(0, 1e-4, (frames, len(JOINTS)))
             writer.start_episode("reach")

@@ -1,14 +1,15 @@
-"""What a policy does after its camera was moved, with and without correcting what it sees.
+"""Success of a policy after its camera was moved, with and without corrected pixels.
 
-The policy `dmp` learns in closed form from a dataset of
+The policy `dmp` is fitted in closed form to a dataset of
 
     hrc record expert --scenario grasping --config robot.marker=true --episodes 30 --out DATA
 
-to grasp by the pixel of the object, and does so in MuJoCo from beginnings that were not shown:
-with the camera where it was; moved by 10 cm and 10 degrees in random directions in which it
-still sees the table; and the same with `add_camera_watch(..., correct=True)`. Each time it was
-moved it is watched anew, so that in the first episode after that nothing is known of it before
-the arm moves: this policy, which plans from the first thing it sees, cannot grasp then.
+It learns to grasp from the initial pixel of the object. In MuJoCo, it then grasps from starts
+that were not demonstrated: with the original camera pose; with the camera moved by 10 cm and 10
+degrees in random directions in which it still sees the table; and with the moved camera and
+`add_camera_watch(..., correct=True)`. The watch is reset after each move, so the motion of the
+camera is unknown at the beginning of the next episode. In that episode this policy cannot
+succeed, because it plans from its first observation.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ from hrc_learn import cli
 from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
 N_BASIS = 60
-"""Of a coordinate: as of `hrc fit --as-lerobot-policy`."""
+"""Number of basis functions of a coordinate, as in `hrc fit --as-lerobot-policy`."""
 FIRST_SEED = 50_000
-"""Beginnings that were not shown: demonstrations count from 0."""
+"""First seed of starts that were not demonstrated: demonstrations use seeds from 0 on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,17 +45,18 @@ class Args:
     data: Path
     """Dataset of `hrc record expert --scenario grasping --config robot.marker=true`."""
     policy: Path | None = None
-    """Checkpoint of a policy that was trained on it; `dmp` is fitted to it without."""
+    """Checkpoint of a policy that was trained on the dataset. Default: `dmp`, fitted to the
+    dataset."""
     moves: int = 10
-    """Of the camera, in different directions."""
+    """Number of camera motions, in different directions."""
     episodes: int = 5
-    """After each of them."""
+    """Number of episodes after each camera motion."""
     distance: float = 0.10
-    """By which the camera is moved [m]."""
+    """Distance by which the camera is moved [m]."""
     angle: float = 10.0
-    """By which it is turned [degrees]."""
+    """Angle by which the camera is rotated [degrees]."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
@@ -67,7 +69,7 @@ def main(args: Args) -> None:
             checkpoint.mkdir()
             write_closed_form_policy(args.data, checkpoint, n_basis=N_BASIS)
         else:
-            shutil.copytree(args.policy, checkpoint)  # a watch is put into it
+            shutil.copytree(args.policy, checkpoint)  # the watch is added to a copy
         rows: tuple[tuple[str, float, bool], ...] = (
             ("as it was", 0.0, False),
             ("moved", 1.0, False),
@@ -87,7 +89,7 @@ def main(args: Args) -> None:
 
 
 def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[list[bool]]:
-    """Whether the object was grasped: a row for each move of the camera."""
+    """Flags of grasped objects: one row for each motion of the camera."""
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies import get_policy_class, make_pre_post_processors
 
@@ -102,7 +104,7 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
     policy: Any = get_policy_class(config.type).from_pretrained(checkpoint)
     fps, grasped = round(float(read_info(args.data)["fps"])), []
     for move in range(args.moves):
-        # Loaded anew, it knows of no move before.
+        # Loaded anew for each move, so that the watch knows of no earlier move.
         before, after = make_pre_post_processors(config, pretrained_path=str(checkpoint))
         camera = MovedCameraConfig(size * args.distance, size * args.angle, move)
         scene = ArmEnvConfig(

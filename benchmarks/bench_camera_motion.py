@@ -1,9 +1,9 @@
-"""How surely a moved camera is noticed, and how often one is accused that stood still.
+"""Detection rate of a moved camera, and rate of false alarms of a camera at rest.
 
 Arms with the nominal imperfections of a laboratory (joint zeros, base, tool, encoder noise;
-`Imperfections.nominal`) show their marker to cameras with lens distortion. Each is learned
-from demonstrations; then it is knocked in the middle of motions, and then it stands still for
-hours. Images carry their stamps: a delay that is not known is not among the errors.
+`Imperfections.nominal`) show their marker to cameras with lens distortion. The camera is fitted
+to demonstrations. Then it is knocked during motions, and afterwards it rests for hours. Images
+carry time stamps, so an unknown delay is not among the errors.
 """
 
 import os
@@ -40,30 +40,31 @@ _IMAGE = (1440, 1080)
 _TIME_TO_NOTICE = 2.0
 _HOME = torch.tensor([0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.8], dtype=torch.float64)
 _SWING = 0.12  # standard deviation of each of three sines of a joint [rad]
-_PERIOD = 12.0  # of the slowest of them [s]
+_PERIOD = 12.0  # period of the slowest of these sines [s]
 _PIXEL_NOISE = 0.15
-"""Of a marker's centre [px]: docs/benchmarks/kinematics.md gives 0.05 to 0.22."""
+"""Standard deviation of a marker's centre [px]; docs/benchmarks/kinematics.md gives 0.05 to
+0.22."""
 _MARKER = (0.0, 0.06, 0.03)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     laboratories: int = 10
-    """Arms and cameras drawn."""
+    """Number of pairs of arm and camera, drawn at random."""
     demonstrations: int = 10
-    """Of each, 10 s long."""
+    """Number of demonstrations with each pair, each 10 s long."""
     knocks: int = 10
-    """Of each size in each laboratory, in a random direction across the view."""
+    """Number of knocks of each size for each pair, in random directions across the view."""
     hours: float = 10.0
-    """In all, of cameras that stand still [h]."""
+    """Total time of cameras at rest [h]."""
     seed: int = 0
-    """Of all that is drawn."""
+    """Seed of all random numbers."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 class _Laboratory:
-    """An arm with errors that stay, before a camera that may be knocked."""
+    """An arm with constant errors, in front of a camera that may be knocked."""
 
     def __init__(self, rng: np.random.Generator):
         self._rng, errors = rng, Imperfections.nominal()
@@ -86,7 +87,7 @@ class _Laboratory:
         self.camera = torch.tensor(whole, dtype=torch.float64)
 
     def motion(self, seconds: float) -> tuple[Pose, Pose, Float[Tensor, " frames"]]:
-        """True and measured poses, and which images arrived."""
+        """True poses, measured poses, and flags of images that arrived."""
         time = torch.arange(round(seconds * _FPS), dtype=torch.float64) / _FPS
         rate = 2 * math.pi / _PERIOD * torch.tensor([1.0, 1.7, 2.9], dtype=torch.float64)
         phase = torch.from_numpy(self._rng.uniform(0, 2 * math.pi, (3, 7)))
@@ -121,7 +122,7 @@ class _Knock(NamedTuple):
     millimetres: float
 
     def draw(self, rng: np.random.Generator) -> Float[np.ndarray, "6"]:
-        """A turn and a shift in a random direction across the view."""
+        """Random rotation and translation across the view."""
         angles = rng.uniform(0, 2 * math.pi, 2)
         turn, shift = (np.array([np.cos(a), np.sin(a), 0.0]) for a in angles)
         return np.concatenate(
@@ -139,7 +140,7 @@ _KNOCKS = (
 
 
 def _noticed_after(laboratory: _Laboratory, watch: CameraWatch, twist: np.ndarray) -> float:
-    """Time from a knock in mid-motion to the alarm [s]; infinite where there is none in 4 s."""
+    """Time from a knock during a motion to the alarm [s]; infinite without one within 4 s."""
     watch.clear()
     true, measured, arrived = laboratory.motion(8.0)
     knocked = len(arrived) // 2
@@ -154,7 +155,7 @@ def _noticed_after(laboratory: _Laboratory, watch: CameraWatch, twist: np.ndarra
 
 
 def _false_alarms(laboratory: _Laboratory, watch: CameraWatch, hours: float) -> tuple[int, int]:
-    """Alarms, each counted once in its minute, and frames watched."""
+    """Number of alarms, at most one per minute, and number of frames watched."""
     alarms = frames = 0
     for _ in range(round(hours * 60)):
         watch.clear()

@@ -1,10 +1,10 @@
-"""A person pulls at the elbow at random moments while a policy leads the end effector.
+"""A person pulls at the elbow at random moments while a policy guides the end effector.
 
-A policy of LeRobot's does a scenario on the simulated Panda, with the imperfections of an
-ordinary laboratory, from many beginnings, with and without a person beside it. Reported are the
-successes of both, the contacts, how far the elbow was moved, and how far the end effector was
-off its path: by the arm's own encoders from the poses that the policy asked for, and truly from
-the path it took from the same beginning without the person.
+A LeRobot policy executes a scenario on the simulated Panda with nominal imperfections, from
+many starts, with and without a person. Reported are the success rates of both, contacts, the
+displacement of the elbow, and two deviations of the end effector. The first is the distance,
+measured by the encoders, from the poses that the policy requests. The second is the true
+distance from the path of the run without the person that has the same start.
 """
 
 from __future__ import annotations
@@ -31,45 +31,46 @@ from hrc_learn import cli
 from hrc_learn.experiments.run_measures import path_distance
 from hrc_learn.kinematics import panda
 
-# LeRobot takes ten seconds to import: only once there is something to do.
+# LeRobot takes ten seconds to import, so it is imported only when needed.
 if TYPE_CHECKING:
     from hrc_learn.lerobot.episode_recording import CheckpointPolicy
     from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
     from hrc_learn.teleoperation import ScriptedForce
 
 _ELBOW = 3
-"""Joint at the elbow, from 0."""
+"""Index of the joint at the elbow, from 0."""
 HELD_OUT = 1000
-"""Number of the first beginning that the policy did not learn from."""
+"""Number of the first start that the policy was not trained on."""
 _AFTER = 1.0
-"""How long a pull counts on after its end [s]: while the arm goes back."""
+"""Time after the end of a pull that counts as part of the pull [s]: the arm returns."""
 _WANTED = 0.150
-"""How far the elbow is to be moved, wherever kinematics allows [m]."""
+"""Wanted displacement of the elbow, if kinematics allow it [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     data: Path
-    """Folder of the demonstrations and the policy; made where it does not hold them."""
+    """Folder of the demonstrations and the policy, which are made if they are missing."""
     policy: Path | None = None
-    """Checkpoint of any policy of LeRobot's for this task and rate, its folder
-    `pretrained_model`; None: `dmp` in closed form, of 10 demonstrations."""
+    """Checkpoint of a LeRobot policy for this task and rate, its folder `pretrained_model`.
+    None: `dmp` in closed form, from 10 demonstrations."""
     task: Literal["placing", "grasping"] = "placing"
-    """What is done."""
+    """Task of the policy."""
     rollouts: int = 50
-    """With the person, and as many without."""
+    """Number of rollouts with the person, and of rollouts without."""
     first: int = HELD_OUT
-    """Number of the first beginning."""
+    """Number of the first start."""
     imperfections: float = 1.0
-    """Of arm, calibration and workplace, in multiples of the nominal ones."""
+    """Size of the imperfections of arm, calibration and workplace, relative to the nominal
+    ones."""
     observed: Literal["posture", "joints"] = "posture"
-    """What the policy observes of the joints: its own posture, or where they are."""
+    """Joints that the policy observes: its own posture, or the measured joints."""
     after_push: Literal["return", "stay"] = "return"
-    """Where the joints go when the person lets go."""
+    """Motion of the joints after release."""
     fps: int = 25
-    """Actions a second."""
+    """Actions per second."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,26 +79,26 @@ class Done:
 
     success: bool
     contacts: int
-    """Of the arm with furniture and with itself."""
+    """Contacts of the arm with furniture and with itself."""
     waited: float
-    """How long the motion waited [s]."""
+    """Time for which the motion waited [s]."""
     time: Float[np.ndarray, " T"]
     joints: Float[np.ndarray, "T 7"]
-    """By the encoders [rad]."""
+    """Joint positions measured by the encoders [rad]."""
     posture: Float[np.ndarray, "T 7"]
-    """That the policy asked for [rad]."""
+    """Joint positions requested by the policy [rad]."""
     hand: Float[np.ndarray, "T 3"]
-    """Where the end effector really was [m]."""
+    """True position of the end effector [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pulled:
-    """What one pull did."""
+    """Effect of one pull."""
 
     elbow: float
-    """How far the elbow was moved [m]."""
+    """Displacement of the elbow [m]."""
     margin: float
-    """How far limits, furniture and the direction of the pull would have let it [m]."""
+    """Displacement that joint limits, furniture and the direction of the pull allow [m]."""
 
 
 def main(args: Args) -> None:
@@ -144,7 +145,7 @@ def main(args: Args) -> None:
 
 
 def _fitted(args: Args, config: MujocoArmRobotConfig) -> Path:
-    """The policy `dmp` in closed form, of ten demonstrations without imperfections."""
+    """The policy `dmp`, fitted in closed form to ten demonstrations without imperfections."""
     from hrc_learn.lerobot.episode_recording import record_expert
     from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
@@ -193,7 +194,7 @@ def _contacts(robot: MujocoArmRobot) -> int:
 
 
 def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoArmRobot) -> list[Pulled]:
-    """Of every pull that was over before the rollout was."""
+    """Effects of all pulls that ended before the rollout."""
     joints, posture = torch.from_numpy(run.joints), torch.from_numpy(run.posture)
     elbow = _elbow(joints) - _elbow(posture)
     effects = []
@@ -257,7 +258,9 @@ def _figures(
 
 
 def _off_path(run: Done) -> Float[np.ndarray, " T"]:
-    """Distance of the end effector, by the encoders, from the poses asked for lately [m]."""
+    """Distance of the end effector, measured by the encoders, from the recently requested poses
+    [m].
+    """
     hand, goal = (
         panda.forward(torch.from_numpy(q)).position.numpy() for q in (run.joints, run.posture)
     )

@@ -1,9 +1,10 @@
-"""What it costs to keep all limits and distances by one program, and what making way buys.
+"""Cost of keeping limits and distances by a quadratic program, and the benefit of way-making.
 
-First the exported step with the constraint layer beside the one without, in turn in the same
-run, one thread, CPU time; each is built once, in two to four minutes, and kept. Then arms that
-move their tool to a pose while a person's fist comes near the elbow and stays there: with the
-null space at rest, or moved by the person, who takes time to react, by the arm itself, or both.
+First, the exported step with the constraint layer and the exported step without it are called
+in turn in the same run: one thread, CPU time. Each is built once, in two to four minutes, and
+kept. Then arms move their tool to a pose while a person's fist approaches the elbow and stays
+there. The null space is at rest, or it is moved by the person, who has a reaction time, by the
+arm itself, or by both.
 """
 
 import os
@@ -39,37 +40,38 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 
 _LIMIT = 2.0
-"""Highest ratio of the exported step with the layer to that without."""
+"""Largest allowed ratio of the time of the step with the layer to that of the step without."""
 _DT = 0.01
-# Joints whose origins stand for the arm, from shoulder to wrist, and the radius about them and
-# of the fist together [m].
+# Joints whose origins represent the arm, from shoulder to wrist. The radius is the sum of the
+# radii of arm and fist [m].
 _JOINTS, _RADIUS = [2, 3, 4, 5, 6], 0.16
-# Where the fist starts and stops, from where the elbow was [m], and its speed [m/s].
+# Distances of the fist from the initial position of the elbow at its start and its end [m], and
+# its speed [m/s].
 _FROM, _UP_TO, _SPEED = 0.6, 0.2, 0.3
-_REACTION = 0.4  # of the person who moves the null space [s]
-_NEAR = 0.08  # too near for comfort [m]
+_REACTION = 0.4  # reaction time of the person who moves the null space [s]
+_NEAR = 0.08  # distance that counts as too near [m]
 _ARRIVED = 0.01  # distance of the tool from its goal [m]
-_STEP = 1e-6  # of central differences [rad]
+_STEP = 1e-6  # step of central differences [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     repeats: int = 5000
-    """Repeats of each exported step; 0: none is built."""
+    """Number of calls of each exported step; 0: none is built."""
     pairs: int = 8
-    """Distances in the step."""
+    """Number of distances in the step."""
     arms: int = 100
-    """Arms that a person comes near; 0: none."""
+    """Number of arms that a fist approaches; 0: none."""
     seconds: float = 6.0
-    """For which they are simulated [s]."""
+    """Simulated time [s]."""
     packages: Path | None = None
     """Folder in which compiled steps are kept; default: the user's cache."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print tables, write the figures."""
+    """Measure, print tables, and write the measured values."""
     torch.set_num_threads(1)
     console, figures = Console(), {}
     with torch.inference_mode():
@@ -82,7 +84,7 @@ def main(args: Args) -> None:
 
 
 def _exported(args: Args, console: Console) -> dict[str, float]:
-    """The two steps in turn."""
+    """CPU time of both steps, called in turn."""
     controller, observation = usual_step(panda.ready)
     rng = torch.Generator().manual_seed(0)
     layered = AdaptiveController(
@@ -119,22 +121,23 @@ def _exported(args: Args, console: Console) -> dict[str, float]:
 
 
 class _Outcome(NamedTuple):
-    """Of each arm."""
+    """Results of each arm."""
 
     least: Tensor
-    """Smallest distance on the way [m]."""
+    """Smallest distance during the motion [m]."""
     near: Tensor
     """Time for which the distance was below 8 cm [s]."""
     arrival: Tensor
-    """When the tool came to its goal [s]; infinite: never."""
+    """Time at which the tool reached its goal [s]; infinite: never."""
     off: Tensor
     """Largest distance of the tool from the straight line to its goal [m]."""
     unsolved: float
-    """Share of the steps in which the solver's own were not enough."""
+    """Fraction of the steps in which the solver did not converge within its own number of
+    steps."""
 
 
 def _compared(args: Args, console: Console) -> dict[str, float]:
-    """The four modes, and the second without constraints."""
+    """Results of the four modes, and of a null space at rest without constraints."""
     figures: dict[str, float] = {}
     table = Table(
         "null space", "least mm, p5", "median", "s near", "arrived", "after s",
@@ -168,7 +171,7 @@ def _approached(
     constraints: ConstraintConfig | None,
     mode: Literal["none", "expert", "automatic", "both"],
 ) -> _Outcome:
-    """Arms that move their tool while a fist comes for the elbow."""
+    """Move the tools of the arms while a fist approaches each elbow."""
     rng = torch.Generator().manual_seed(0)
     inside = panda.limits.lower + 0.2, panda.limits.upper - 0.2
 
@@ -215,7 +218,7 @@ def _approached(
 def _observed(
     observation: Observation, q: Tensor, near: Distances, push: Tensor
 ) -> Observation:
-    """No marker is seen: the tool goes to its goal."""
+    """Observation without a visible marker, so that the tool moves to its goal pose."""
     return replace(
         observation,
         joint_position=q,
@@ -234,7 +237,7 @@ def _off_line(position: Tensor, start: Pose, goal: Pose) -> Tensor:
 
 
 def _distances(q: Tensor, fist: Tensor, velocity: Tensor) -> Distances:
-    """Of joints from a fist; gradients by central differences."""
+    """Distances of joints from a fist; gradients by central differences."""
 
     def from_fist(q: Tensor, fist: Tensor) -> Tensor:
         return panda.joint_origins(q)[..., _JOINTS, :] - fist.unsqueeze(-2)

@@ -1,11 +1,12 @@
-"""How fast a control step is: exported, eager and in batches, beside its targets and mink.
+"""Time of a control step: exported, eager and in batches, compared with targets and mink.
 
-One thread; float64, batches float32. The step is the recommended one with all it can do: Kalman
-estimate of the image Jacobian, a person, late images, safety filter. Its floor is what any
+One thread; float64, batches float32. The measured step has all features: Kalman estimate of the
+image Jacobian, a person, late images, safety filter. The floor is the time that any
 resolved-rate step needs: forward kinematics, Jacobian, and one 6 x 6 solve. Calls are made in
-turn, which finds caches cold; `exported_alone` is called back to back. Figures are CPU time:
-median, 99th percentile and least. mink's `solve_ik` with a frame and a posture task is measured
-along where it is installed. Exported steps are built once, each in a minute or two, and kept.
+turn, with cold caches; `exported_alone` is called repeatedly. Reported are median, 99th
+percentile and minimum of the CPU time. If mink is installed, its `solve_ik` with a frame and a
+posture task is measured as well. Exported steps are built once, each in a minute or two, and
+kept.
 """
 
 import os
@@ -71,17 +72,17 @@ LEAST = {
 @dataclass(frozen=True, kw_only=True)
 class Args:
     repeats: int = 500
-    """Repeats of each call."""
+    """Number of calls of each kind."""
     compile: bool = True
     """Measure compiled code as well."""
     packages: Path | None = None
     """Folder in which compiled steps are kept; default: the user's cache."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     torch.set_num_threads(1)
     console = Console()
     with torch.inference_mode():
@@ -155,7 +156,7 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
 
 
 def usual_step(q: Tensor) -> tuple[AdaptiveController, Observation]:
-    """The recommended step with all it can do, for one arm or many."""
+    """The recommended step with all features, for one arm or many."""
     controller, observation = _servoing(KalmanEstimator, 9, q)
     return controller, replace(
         observation,
@@ -166,7 +167,7 @@ def usual_step(q: Tensor) -> tuple[AdaptiveController, Observation]:
 
 
 def settled(runner: StepRunner) -> Callable[[], object]:
-    """A step once vision feedback has faded in."""
+    """A step of a controller whose vision feedback has faded in."""
     for _ in range(400):
         runner.step()
     return runner.step
@@ -188,7 +189,7 @@ def _batched_calls(args: Args) -> dict[str, Callable[[], object]]:
                 if not isinstance(runner, EagerRunner):
                     calls[f"steps_exported_{neurons}_neurons_{batch}"] = runner.step
         if args.compile:
-            # One row a joint: the batch is last in memory.
+            # One row per joint: the batch is last in memory.
             rows = q.mT.contiguous().mT
             compiled = torch.compile(panda.transform_and_jacobian, dynamic=False)
             calls[f"kinematics_compiled_{batch}"] = lambda q=rows, f=compiled: f(q)
@@ -196,7 +197,9 @@ def _batched_calls(args: Args) -> dict[str, Callable[[], object]]:
 
 
 def _servoing_batch(neurons: int, q: Tensor) -> tuple[AdaptiveController, Observation]:
-    """The same for many arms, each with weights of its own that adapt, in the dtype of q."""
+    """Controller and observation of many arms, each with its own adapting weights, in the dtype
+    of q.
+    """
     controller, observation = _servoing(CompositeEstimator, neurons, q.double())
     controller = controller.to(q.dtype)
     observation = _pytree.tree_map(
@@ -208,7 +211,7 @@ def _servoing_batch(neurons: int, q: Tensor) -> tuple[AdaptiveController, Observ
 def _servoing(
     kind: type[ImageJacobianEstimator], neurons: int, q: Tensor
 ) -> tuple[AdaptiveController, Observation]:
-    """A controller and what it sees while it servoes on a visible target."""
+    """A controller, and its observation while it servoes to a visible target."""
     J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
     side = round(neurons**0.5)
     neurons_at = grid((0.05, 0.35, side), (0.35, 0.65, side))
@@ -225,7 +228,7 @@ def _servoing(
 
 
 def _mink_call() -> Callable[[], object]:
-    """One step of mink on the same arm: frame and posture task, position and speed limits."""
+    """One step of mink with the same arm: frame and posture task, position and speed limits."""
     import mink  # pyright: ignore[reportMissingImports]
     import mujoco
 

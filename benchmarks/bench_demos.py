@@ -1,8 +1,8 @@
-"""How fast demonstrations are recorded and read, against the floor of a bare pyarrow read.
+"""Speed of recording and reading demonstrations, compared with a bare pyarrow read.
 
-The dataset is what an arm with an image feature leaves: 20 episodes of 30 s at 50 Hz, 41
-numbers a frame. Medians over repeats; all figures come from one run on one thread. Reading is
-measured in CPU time, on files in the disk's cache: on a shared machine others count little.
+The dataset is that of an arm with an image feature: 20 episodes of 30 s at 50 Hz, 41 numbers
+per frame. Reported are medians over repeats in one run on one thread. Reading is measured in
+CPU time, on files in the disk cache, so other programs on a shared machine have little effect.
 """
 
 import os
@@ -41,17 +41,17 @@ class Args:
     episodes: int = 20
     """Episodes of the dataset."""
     frames: int = 1500
-    """Frames of each."""
+    """Number of frames in each episode."""
     repeats: int = 9
-    """Times each reading is repeated; the median counts."""
+    """Number of repeats of each reading; the median is reported."""
     peer: bool = False
     """Also record and read one episode, and images of two cameras, with LeRobot."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     pa.set_cpu_count(1)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "set"
@@ -90,10 +90,10 @@ def measure_writing(root: Path, args: Args) -> dict[str, float]:
 
 
 def measure_reading(root: Path, args: Args) -> dict[str, float]:
-    """Read it back: the bare columns, the demonstrations, one of them, tensors."""
+    """Read the dataset: bare columns, demonstrations, one demonstration, tensors."""
     frames = args.frames * args.episodes
     floor = median_seconds(lambda: read_bare(root), args.repeats)
-    # In turns: on a shared machine each pair sees the same neighbours.
+    # In turn: on a shared machine, both are slowed down by the same programs.
     turns = [
         (seconds(lambda: read_converted(root)), seconds(lambda: load_demos(root)))
         for _ in range(args.repeats)
@@ -122,7 +122,7 @@ def measure_reading(root: Path, args: Args) -> dict[str, float]:
 
 
 def measure_lerobot(root: Path, args: Args) -> dict[str, float]:
-    """What LeRobot's own classes take for one episode of the same columns."""
+    """Times of LeRobot's own classes for one episode of the same columns."""
     start = time.perf_counter()
     from lerobot.datasets import LeRobotDataset
 
@@ -155,7 +155,7 @@ def measure_lerobot(root: Path, args: Args) -> dict[str, float]:
 
 
 def measure_images(root: Path, frames: int = 150, size: tuple[int, int] = (480, 640)) -> dict:
-    """Images of two cameras, frame after frame: `ImageReader` and LeRobot's `dataset[i]`."""
+    """Read images of two cameras frame by frame: `ImageReader` and LeRobot's `dataset[i]`."""
     from lerobot.datasets import LeRobotDataset
 
     cameras = {"front": size, "wrist": size}
@@ -179,7 +179,7 @@ def measure_images(root: Path, frames: int = 150, size: tuple[int, int] = (480, 
 
 
 def make_episode(frames: int, seed: int) -> list[dict]:
-    """Frames of one episode, made beforehand so that only recording is measured."""
+    """Frames of one episode, made in advance so that only recording is measured."""
     rng = np.random.default_rng(seed)
     joints = np.cumsum(rng.normal(scale=0.01, size=(frames, 7)), axis=0)
     angle = np.linspace(0, 2, frames)
@@ -201,7 +201,7 @@ def make_episode(frames: int, seed: int) -> list[dict]:
 
 
 def read_bare(root: Path) -> list[np.ndarray]:
-    """The same columns as flat arrays, and nothing made of them: no reader can be faster."""
+    """The same columns as flat arrays without any conversion: no reader can be faster."""
     return [
         np.concatenate(
             [
@@ -217,7 +217,7 @@ def read_bare(root: Path) -> list[np.ndarray]:
 
 
 def read_converted(root: Path) -> list[dict[str, np.ndarray]]:
-    """A bare loop that hands out what `load_demos` does: an array of float64 a quantity and
+    """A bare loop that returns the same arrays as `load_demos`: float64 for each quantity and
     episode, orientations as continuous unit quaternions, time from 0.
     """
     rows = pa.concat_tables(map(pq.read_table, sorted((root / "meta/episodes").glob("*/*"))))
@@ -254,7 +254,7 @@ def read_converted(root: Path) -> list[dict[str, np.ndarray]]:
 
 
 def data_files(root: Path) -> list[Path]:
-    """Files of frames, in the order of the episodes."""
+    """Parquet files of frames, in the order of the episodes."""
     return sorted((root / "data").glob("*/*.parquet"))
 
 

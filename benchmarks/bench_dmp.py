@@ -1,9 +1,9 @@
-"""How fast movement primitives fit, roll out and step, against bare matrix products.
+"""Speed of fitting, rolling out and stepping movement primitives, against bare matrix products.
 
-7 joints, 1000 samples, 50 basis functions, one thread, float32 (steps: float64). Each figure
-is the median CPU time of calls made in turn with its floor, the same product on ready
-matrices; the least of them, on a busy machine, is what a quiet one takes. Libraries that do
-the same are measured along where they are installed, and so is how exact the results are.
+7 joints, 1000 samples, 50 basis functions, one thread, float32 (steps: float64). Each time is
+the median CPU time of calls made in turn with the floor: the same matrix product on prepared
+matrices. On a busy machine, the minimum approximates the time on a quiet one. Other libraries
+are measured if they are installed. Accuracy is measured as well.
 """
 
 import os
@@ -70,25 +70,26 @@ TARGETS: dict[str, tuple[float, int]] = {
     "noisy_peak_acceleration_most": (1.5, -1),
     "noisy_error_of_best_fixed_most": (1.0, -1),
 }
-"""What DMPs are to reach; +1: at least, -1: at most."""
+"""Targets; +1: at least, -1: at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     repeats: int = 50
-    """Repeats of a call that takes milliseconds; short ones are repeated more often."""
+    """Number of repeats of calls that take milliseconds; shorter calls are repeated more often.
+    """
     recordings: Path | None = None
-    """Folder of recordings to reproduce, as they are and made noisy; see `recordings.py`."""
+    """Folder of recordings to reproduce, without and with added noise; see `recordings.py`."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
     save: Path | None = None
-    """Keeps the figures for a later --compare."""
+    """File that keeps the measured values for a later --compare."""
     compare: Path | None = None
-    """Figures of an earlier --save to show beside these."""
+    """File of an earlier --save, shown next to the new values."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     torch.set_num_threads(1)
     earlier = read_figures(args.compare) if args.compare else {}
     figures: dict[str, float] = {}
@@ -121,7 +122,7 @@ def demonstrations(batch: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 @torch.no_grad()
 def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
-    """Position alone and with its derivatives, to new goals, against the bare product."""
+    """Roll out position alone, and with derivatives, to new goals, against the bare product."""
     dmp = JointDMP.fit(*demonstrations(batch), BASIS)
     goal = dmp.goal + 0.1
     X, H = torch.randn(batch * JOINTS, BASIS + 3), torch.randn(BASIS + 3, SAMPLES)
@@ -151,7 +152,7 @@ def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
 
 
 def measure_fits(batch: int, repeats: int) -> dict[str, float]:
-    """Demonstrations to primitives, residuals included."""
+    """Fit primitives to demonstrations, including the residuals."""
     time, position = demonstrations(batch)
     calls: dict[str, Callable[[], object]] = {
         name: lambda method=name: JointDMP.fit(time, position, BASIS, method=method)
@@ -184,7 +185,8 @@ def measure_poses(repeats: int) -> dict[str, float]:
 def measure_steps(repeats: int) -> dict[str, float]:
     """One closed-loop step of 1 ms: eager, in NumPy, and as an exported program.
 
-    Each by itself, as in a loop: a step in turn with others finds its code out of the caches.
+    Each kind is called alone, as in a loop: in turn with others, its code would leave the
+    caches.
     """
     time, position = demonstrations(1)
     dmp = JointDMP.fit(time.double(), position.double(), BASIS)
@@ -211,7 +213,7 @@ def measure_steps(repeats: int) -> dict[str, float]:
 
 @torch.no_grad()
 def measure_new_goals(repeats: int) -> dict[str, float]:
-    """Steps that get a new goal, and the same without one, by kind of primitive."""
+    """Steps with and without a new goal, by kind of primitive."""
     time, columns = (x.double() for x in demonstrations(1))
     turned, angle = quaternion.exp(columns[:, 3:6]), torch.tensor([0.1, 0.0, 0.0]).double()
     joint = JointDMP.fit(time, columns, BASIS)
@@ -250,7 +252,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 
 def measure_memory() -> dict[str, float]:
-    """Memory that a fit of one long recording takes at its peak, in a process of its own."""
+    """Peak memory of a fit of one long recording, in its own process."""
     figures: dict[str, float] = {}
     for samples in (100_000, 1_000_000):
         command = [sys.executable, "-c", LONG_FIT, str(samples)]
@@ -262,9 +264,9 @@ def measure_memory() -> dict[str, float]:
 
 
 def measure_own_times(repeats: int) -> dict[str, float]:
-    """Each motion another duration, beside the same batch on one time grid; and by gradients.
+    """Rollouts of a batch with different durations, compared with one common time grid.
 
-    And fits of stamps that differ.
+    In addition, gradients, and fits of demonstrations with different time stamps.
     """
     figures: dict[str, float] = {}
     for batch in (256, 4096):
@@ -307,7 +309,7 @@ def measure_own_times(repeats: int) -> dict[str, float]:
 
 
 def measure_gradients(repeats: int) -> dict[str, float]:
-    """Backward through a rollout of 256, to weights and goal."""
+    """Backward pass through a rollout of 256 motions, to weights and goal."""
     dmp = JointDMP.fit(*demonstrations(256), BASIS)
     goal = dmp.goal.clone().requires_grad_()
     seed = torch.randn(256, SAMPLES, JOINTS)
@@ -323,7 +325,9 @@ def measure_gradients(repeats: int) -> dict[str, float]:
 
 
 def repeats_for(batch: int, repeats: int) -> int:
-    """More for what takes microseconds, fewer for what takes a tenth of a second."""
+    """Number of repeats: more for calls of microseconds, fewer for calls of a tenth of a
+    second.
+    """
     return {1: 20 * repeats, 256: repeats}.get(batch, max(repeats // 5, 3))
 
 
@@ -337,7 +341,7 @@ def read_figures(path: Path) -> dict[str, float]:
 
 
 def show(figures: dict[str, float], earlier: dict[str, float]) -> None:
-    """Print all figures, with what they should reach and what they were."""
+    """Print all values with their targets and the earlier values."""
     kernels = [
         library["architecture"]
         for library in threadpool_info()

@@ -1,21 +1,21 @@
-"""Policies in public environments and in ours, by LeRobot's evaluation, at equal CPU time.
+"""Compare policies in public and our environments, by LeRobot's evaluation, at equal CPU time.
 
-Demonstrations are by scripted experts, from beginnings of their own and without disturbances.
-Policies see numbers, no images: where the agent is and where things are. They learn for the
-same time by the clock of the CPU and are evaluated by what `lerobot-eval` runs, from beginnings
-that were not shown: as they are; with the object moved aside once the agent is on its way to
-it; and after three demonstrations only.
+Scripted experts give the demonstrations, from their own starts and without disturbances.
+Policies observe numbers, not images: positions of the agent and of objects. All policies learn
+for the same CPU time and are evaluated by the code of `lerobot-eval`, from starts that were not
+demonstrated, in three ways: unchanged; with the object moved while the agent approaches it; and
+after three demonstrations only.
 
-Public environments demand older packages than ours:
+Public environments need older packages than ours:
 
     tools/make_environments.sh
     .venv-environments/bin/python benchmarks/bench_environments.py
 
-and ours (--tasks grasping) the MuJoCo of .venv, whose Python runs it there. A policy that is
-kept (--keep) can be evaluated by the command itself:
+Our environment (--tasks grasping) needs the MuJoCo of .venv, and so the Python of .venv. The
+command evaluates a policy that was kept (--keep):
 
     PYTHONPATH=benchmarks lerobot-eval --env.discover_packages_path=public_tasks
-      --env.type=public_task --env.task=pusht --policy.path=FOLDER ...
+        --env.type=public_task --env.task=pusht --policy.path=FOLDER ...
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from safetensors.torch import load_file, save_file
 from hrc_learn import cli
 
 FIRST_SEED = 10_000
-"""Of beginnings that were not shown: demonstrations count from 0."""
+"""First seed of starts that were not demonstrated: demonstrations use seeds from 0 on."""
 PUBLIC = tuple(name for name in TASKS if name != "grasping")
 COLUMNS = ("unmoved", "moved", "few")
 SEPARATOR = "/"
-"""Between the number of an episode and the key of its column, in a file."""
+"""Separator between the number of an episode and the key of its column, in a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,27 +63,27 @@ class Args:
         "dmp",
         "motion_chunk",
     )
-    """LeRobot's own and ours."""
+    """Policies of LeRobot and ours."""
     demonstrations: int = 50
-    """To learn from."""
+    """Number of demonstrations to learn from."""
     few: int = 3
-    """To learn from in the last column."""
+    """Number of demonstrations for the last column."""
     minutes: float = 1.0
-    """CPU time of building and training each."""
+    """CPU time of building and training each policy."""
     executed: int | None = None
-    """Actions carried out of each chunk; None: as known.py has it for the task."""
+    """Number of executed actions of each chunk; None: the task's number in known.py."""
     rollouts: int = 12
-    """Of each kind, from the same beginnings."""
+    """Number of episodes of each kind, from the same starts."""
     seed: int = 0
-    """Of weights and batches."""
+    """Seed of weights and batches."""
     state_noise: float = 0.0
-    """In training, of `motion_chunk`."""
+    """Noise on the state in the training of `motion_chunk`."""
     out: Path = Path("outputs/environments")
-    """Demonstrations are kept here, and taken from here the next time."""
+    """Folder in which demonstrations are kept for later runs."""
     keep: bool = False
-    """Keep the policies too, as checkpoints of LeRobot."""
+    """Keep the policies too, as LeRobot checkpoints."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
@@ -125,7 +125,7 @@ def main(args: Args) -> None:
 
 
 def demonstrations(name: str, count: int, folder: Path, console: Console) -> list[Episode]:
-    """Demonstrations of a task, read from a folder, or made and kept there if it has fewer."""
+    """Demonstrations of a task: read from a folder, or made and kept there if it has fewer."""
     path = folder / f"{name}.safetensors"
     columns = load_file(path) if path.exists() else {}
     shown: list[Episode] = []
@@ -196,13 +196,13 @@ def _by_expert(task: Any, args: Args, moved: bool) -> int:
 
 
 def _successes(environments: gym.vector.VectorEnv, learned: Learned) -> int:
-    """By what `lerobot-eval` runs."""
+    """Number of successes, by the code of `lerobot-eval`."""
     from lerobot.processor import PolicyProcessorPipeline
     from lerobot.scripts.lerobot_eval import eval_policy
 
-    torch.manual_seed(0)  # of policies that draw their actions
+    torch.manual_seed(0)  # for policies that sample their actions
     nothing: Any = PolicyProcessorPipeline(steps=[])
-    with redirect_stderr(StringIO()):  # a bar for every episode
+    with redirect_stderr(StringIO()):  # a progress bar for every episode
         result = eval_policy(
             environments,
             learned.policy,

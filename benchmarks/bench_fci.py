@@ -1,11 +1,12 @@
-"""What a cycle of Franka's control interface costs: our loop beside a bare one, in one run.
+"""Cost of a cycle of Franka's control interface: our loop and a minimal loop in one run.
 
-Against franka-sim with all that it enforces; without its environment (tools/make_franka_sim.sh)
-nothing is measured. The bare loop reads a state, writes a velocity of zero and does no more;
-it is the least that pylibfranka allows from Python. Ours is `FrankaArm`'s: the state read, the
-filtered step, the answer sent, with its step compiled and uncompiled. They take turns, and the
-share of one in the other says more than either where others use the machine: its load stands
-beside the figures. Costs are wall time, from the state read to the answer sent.
+Both run against franka-sim with all its checks. Without its environment
+(tools/make_franka_sim.sh), nothing is measured. The minimal loop only reads a state and writes
+a velocity of zero: the least work that pylibfranka allows in Python. Ours is the loop of
+`FrankaArm`, with compiled and uncompiled step: read the state, compute the filtered step, send
+the answer. The loops take turns. On a shared machine, their ratio is more reliable than each
+time; the load of the machine is reported, too. Costs are wall time from reading the state to
+sending the answer.
 """
 
 from __future__ import annotations
@@ -42,17 +43,17 @@ class Args:
     """Command line."""
 
     seconds: float = 10.0
-    """Of motion, for each loop in each turn."""
+    """Motion time of each loop in each turn."""
     turns: int = 2
-    """How often each loop is measured."""
+    """Number of measurements of each loop."""
     host: str = "127.0.2.1"
-    """Address for the simulator."""
+    """Address of the simulator."""
     json: Path | None = None
-    """Receives the figures."""
+    """File for the measured values."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     if args.turns < 1 or not args.seconds > 0:
         raise ValueError(f"nothing to measure in {args.turns} turns of {args.seconds} s")
     if not PYTHON.exists():
@@ -67,7 +68,7 @@ def main(args: Args) -> None:
 
 @contextmanager
 def simulator(host: str) -> Iterator[None]:
-    """A server of franka-sim."""
+    """Run a server of franka-sim."""
     program = ROOT / "tools" / "franka_sim_server.py"
     with subprocess.Popen(
         [PYTHON, program, "--host", host, "--log", "ERROR"], stdout=subprocess.PIPE, text=True
@@ -81,7 +82,7 @@ def simulator(host: str) -> Iterator[None]:
 
 
 def measure(args: Args) -> dict[str, float]:
-    """Cost [us] and share answered of each loop, how they compare, and the load."""
+    """Cost [us] and answered fraction of each loop, their ratio, and the load."""
     costs: dict[str, list[np.ndarray]] = {name: [] for name in LOOPS}
     answered: dict[str, list[float]] = {name: [] for name in LOOPS}
     reflexes = dict.fromkeys(LOOPS, 0)
@@ -110,14 +111,14 @@ def measure(args: Args) -> dict[str, float]:
 
 
 def percentile(histogram: np.ndarray, percent: float) -> float:
-    """Of counts by the microsecond [us]."""
+    """Percentile of a histogram with bins of a microsecond [us]."""
     reached = np.cumsum(histogram) >= percent / 100 * histogram.sum()
     return float(np.argmax(reached)) + 1.0
 
 
 def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, float, int]:
-    """Histogram of what cycles cost by the microsecond, the share answered, the reflexes."""
-    # The Panda's limits are above an FR3's: this keeps within both.
+    """Histogram of cycle costs by microsecond, answered fraction, and number of reflexes."""
+    # The Panda's limits exceed an FR3's: this stays within both.
     config = FrankaConfig(realtime=False, gripper=False, compiled=compiled, dynamics=0.15)
     with FrankaArm(host, panda, config) as arm:
         begin, due, cycles, costs = time.monotonic(), 0.0, 0, np.zeros(2000)
@@ -129,7 +130,7 @@ def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, 
                 except DriverError:  # too many cycles were missed
                     arm.recover()
             report = arm.report
-            if report.cycles != cycles:  # some are missed, whatever they cost
+            if report.cycles != cycles:  # some cycles are missed in any case
                 cycles = report.cycles
                 costs[min(int(1e6 * report.cost), len(costs) - 1)] += 1
             time.sleep(5e-4)
@@ -138,7 +139,7 @@ def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, 
 
 
 def bare_loop(host: str, seconds: float) -> tuple[np.ndarray, float, int]:
-    """The same of the least that there is, in a process as the loop has one."""
+    """The same values for the minimal loop, which runs in a process of the same kind."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_bare_loop, args=(theirs, host, seconds))
@@ -170,7 +171,7 @@ def _bare_loop(connection: Connection, host: str, seconds: float) -> None:
 
 
 def show(figures: dict[str, float]) -> None:
-    """Print all figures."""
+    """Print all measured values."""
     table = Table("figure", "measured", title="Cycles of 1 ms")
     for name, value in figures.items():
         table.add_row(name, f"{value:.4g}")

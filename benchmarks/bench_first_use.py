@@ -1,8 +1,8 @@
-"""How long a newcomer waits: the commands of a page of the documentation, one after the other.
+"""Waiting times of a newcomer: the commands of a documentation page, one after another.
 
-They run in an empty folder and at a terminal, so that progress is shown as a person sees it.
-Of each: time on the wall and of the CPU, and the longest time in which the terminal showed
-nothing new. On a machine that does something else only CPU time means much.
+The commands run in an empty folder and in a terminal, so that progress is shown as to a person.
+For each command, the table lists wall time, CPU time, and the longest time without new output.
+On a busy machine only the CPU time is meaningful.
 
     python benchmarks/bench_first_use.py docs/tutorial.md
     python benchmarks/bench_first_use.py --commands "hrc demo --out new" "hrc demo --out new"
@@ -32,9 +32,9 @@ ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 WIDTH, HEIGHT = "100", "40"
-"""Of the terminal [characters]."""
+"""Size of the terminal [characters]."""
 SERVES = ("hrc page", "hrc serve", "hrc curate")
-"""What goes on until somebody ends it."""
+"""Commands that run until a person ends them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,44 +42,44 @@ class Args:
     page: Annotated[Path, tyro.conf.Positional] = ROOT / "docs" / "tutorial.md"
     """Markdown file whose shell blocks are run."""
     commands: tuple[str, ...] = ()
-    """Run instead of those of a page."""
+    """Commands to run instead of those of a page."""
     keep: Path | None = None
-    """Folder to run in and keep; a temporary one when None."""
+    """Folder to run in and keep. None: a temporary folder."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True)
 class Waited:
-    """What a command took [s]."""
+    """Times of a command [s]."""
 
     command: str
     wall: float
     cpu: float
     silence: float
-    """Longest time without anything new."""
+    """Longest time without new output."""
     before: str
-    """Last line before it."""
+    """Last line of output before that time."""
     output: str
     status: int
 
 
 def commands_of(page: str) -> list[str]:
-    """The commands of a page's shell blocks, without those that somebody has to end."""
+    """Commands in a page's shell blocks, without those that a person has to end."""
     lines = [line for block in BLOCK.findall(page) for line in block.splitlines()]
     commands = [line.split(" #")[0].strip() for line in lines]
     return [command for command in commands if command and not command.startswith(SERVES)]
 
 
 def wait_for(command: str, folder: Path) -> Waited:
-    """Run a command at a terminal of its own.
+    """Run a command in its own terminal.
 
     Raises:
         FileNotFoundError: There is no such program.
     """
     words = shlex.split(command)
     if words[:2] == ["hrc", "show"] and "--out" not in words:
-        words += ["--out", "shown.rrd"]  # there is nobody to close a viewer
+        words += ["--out", "shown.rrd"]  # no person is there to close a viewer
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     size = {"COLUMNS": WIDTH, "LINES": HEIGHT, "TERM": "xterm-256color"}
     ours, theirs = pty.openpty()
@@ -97,7 +97,7 @@ def wait_for(command: str, folder: Path) -> Waited:
     while True:
         try:
             new = os.read(ours, 65536)
-        except OSError:  # Linux says so when nobody has the terminal any more
+        except OSError:  # Linux raises this when the last process has closed the terminal
             new = b""
         now = time.monotonic()
         if now - last > silence:
@@ -107,7 +107,7 @@ def wait_for(command: str, folder: Path) -> Waited:
             break
         output += new
     os.close(ours)
-    _, status, used = os.wait4(process.pid, 0)  # its children's time is in it
+    _, status, used = os.wait4(process.pid, 0)  # includes the time of its child processes
     process.returncode = os.waitstatus_to_exitcode(status)
     return Waited(
         command=command,
@@ -121,13 +121,13 @@ def wait_for(command: str, folder: Path) -> Waited:
 
 
 def _last_line(output: str) -> str:
-    """Of a terminal's output, without what moves its cursor and colours it."""
+    """Last line of a terminal's output, without control sequences for cursor and colour."""
     lines = [line.strip() for line in re.split(r"[\r\n]+", CONTROL.sub("", output))]
     return next((line for line in reversed(lines) if line), "")
 
 
 def main(args: Args) -> None:
-    """Run, print a table, write the figures; ends at the first command that fails."""
+    """Run the commands, print a table and write the values; end at the first failure."""
     commands = args.commands or tuple(commands_of(args.page.read_text("utf-8")))
     console = Console()
     table = Table("command", r"wall \[s]", r"CPU \[s]", r"longest silence \[s]")

@@ -1,9 +1,9 @@
-"""How well a motion out of one object and into another is predicted for objects elsewhere.
+"""Prediction of motions from one object to another, for new places of the objects.
 
-Made-up planar motions between two frames a metre apart, give or take 0.3 m, each turned by up
-to one radian: out of the first along its x axis, into the second along its own, for a stretch
-that differs by 10 %. Learnt from a few, and compared with the motion itself in fifty other
-places.
+Synthetic planar motions lead between two frames about a metre apart (varied by 0.3 m), each
+rotated by up to one radian. A motion leaves the first frame along its x axis and enters the
+second along its x axis, over a distance that varies by 10 %. Models are fitted to a few motions
+and compared with the true motions in fifty other places.
 """
 
 import os
@@ -30,15 +30,15 @@ class Args:
     counts: tuple[int, ...] = (3, 4, 6, 8, 12)
     """Of demonstrations."""
     seeds: int = 10
-    """Sets of demonstrations of each count."""
+    """Number of sets of demonstrations for each count."""
     n_basis: int = 30
-    """Basis functions of each primitive."""
+    """Number of basis functions of each primitive."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Predict, print a table, write the figures."""
+    """Predict, print a table, and write the measured values."""
     torch.set_num_threads(1)
     figures: dict[str, float] = {}
     for count in args.counts:
@@ -77,7 +77,7 @@ def predict(count: int, n_basis: int, rng: torch.Generator) -> dict[str, float]:
 
 
 def made_up_frames(n: int, rng: torch.Generator) -> Frames:
-    """Two in each of n places."""
+    """Two frames in each of n places."""
     angle = 2 * torch.rand(n, 2, generator=rng, dtype=torch.float64) - 1
     c, s = angle.cos(), angle.sin()
     A = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
@@ -101,12 +101,12 @@ def made_up_motions(
 
 
 def context(frames: Frames) -> Tensor:
-    """Where the frames are and where they point, as numbers."""
+    """Positions and directions of the frames, as numbers."""
     return torch.cat([frames.b, frames.A[..., 0]], dim=-1).flatten(1)
 
 
 def regression(each: JointDMP, shown: Tensor, asked: Tensor) -> JointDMP:
-    """Primitives for contexts, linear in those of the demonstrations."""
+    """Primitives for new contexts, linear in the contexts of the demonstrations."""
     x = each.coordinates().detach()
     fit = fit_ridge(shown, x.flatten(1), 1e-6)
     features = torch.nn.functional.pad((asked - fit.mean) / fit.scale, (1, 0), value=1.0)
@@ -115,7 +115,7 @@ def regression(each: JointDMP, shown: Tensor, asked: Tensor) -> JointDMP:
 
 
 def product_of_moments(position: Tensor, shown: Frames, others: Frames) -> Tensor:
-    """Gaussians of each moment by itself, seen from the frames and multiplied elsewhere."""
+    """Product of the frames' Gaussians at each moment separately, for frames at new places."""
     seen = torch.linalg.solve(shown.A, (position[:, None] - shown.b[:, :, None]).mT).mT
     mean = seen.mean(0)
     off = (seen - mean)[..., None]

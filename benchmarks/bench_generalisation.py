@@ -1,8 +1,8 @@
-"""How well primitives predict a demonstration they have not seen.
+"""Accuracy of primitives on demonstrations that they were not fitted to.
 
 Each demonstration of a task is predicted from all others, given its start and goal, and then
-its pose at half time as well. Recordings are one file a task, TASK.npy, of shape
-(demonstrations, samples, 7): position and unit quaternion (w, x, y, z), sampled evenly.
+also given its pose at half time. Each recording is a file TASK.npy of shape (demonstrations,
+samples, 7): position and unit quaternion (w, x, y, z), evenly sampled.
 """
 
 import os
@@ -30,10 +30,10 @@ from hrc_learn.dmp import (
 from hrc_learn.geometry import Pose, quaternion
 
 DURATION = 5.0
-"""[s]; no figure depends on it."""
+"""Duration [s]; no result depends on it."""
 HALF = DURATION / 2
 NOISE = 1e-4
-"""Standard deviation of what is given, in the units of the recording and in rad."""
+"""Standard deviation of the given values, in the units of the recording and in rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,21 +41,21 @@ class Args:
     recordings: Path
     """Folder of TASK.npy files."""
     n_basis: int = 50
-    """Basis functions of each primitive."""
+    """Number of basis functions of each primitive."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Demonstrations of one task: primitives of all but one, and that one."""
+    """Demonstrations of one task: primitives of all but one, and the remaining one."""
 
     others: PoseDMP
-    """Learned from the other demonstrations, as printed."""
+    """Primitives of the other demonstrations, in the paper's form."""
     gentle: PoseDMP
-    """The same, taking up new ends along a minimum-jerk approach."""
+    """The same with `approach=1`: a minimum-jerk approach to new starts and goals."""
     shown: Pose
-    """What is to be predicted, (T,)."""
+    """Demonstration to predict, (T,)."""
 
     @property
     def ends(self) -> tuple[Pose, Pose]:
@@ -63,7 +63,7 @@ class Task:
 
     @property
     def via(self) -> Pose:
-        """At half time, (1,): between two samples if their number is even."""
+        """Pose at half time, (1,): between two samples if their number is even."""
         T = len(self.shown.position)
         before, after = self.shown[(T - 1) // 2], self.shown[T // 2]
         middle = quaternion.slerp(before.orientation, after.orientation, 0.5)
@@ -71,7 +71,7 @@ class Task:
 
 
 def main(args: Args) -> None:
-    """Predict, print a table, write the figures."""
+    """Predict, print a table, and write the measured values."""
     torch.set_num_threads(1)
     files = sorted(args.recordings.glob("*.npy"))
     if not files:
@@ -114,7 +114,7 @@ def predict_each(poses: Pose, n_basis: int) -> dict[str, tuple[float, float]]:
 
 
 def select(dmps: PoseDMP, rows: torch.Tensor) -> PoseDMP:
-    """Some of a batch of primitives."""
+    """Selected primitives of a batch."""
     motion = dmps.motion
     chosen = motion.with_coordinates(
         motion.coordinates().detach()[rows],
@@ -133,7 +133,7 @@ def error(motion: PoseTrajectory, shown: Pose) -> tuple[float, float]:
 
 
 def another(task: Task) -> PoseDMP:
-    """The demonstration whose start and goal are closest, adapted."""
+    """The demonstration with the closest start and goal, adapted."""
     start, goal = (
         (own.position - new.position).norm(dim=-1)
         for own, new in (
@@ -148,17 +148,17 @@ def another(task: Task) -> PoseDMP:
 
 
 def mean(task: Task) -> PoseDMP:
-    """The mean of all others, adapted."""
+    """The mean of all other demonstrations, adapted."""
     return mean_primitive(task.others).with_boundary(*task.ends)
 
 
 def gentle_mean(task: Task) -> PoseDMP:
-    """The same along a minimum-jerk approach."""
+    """The same mean with a minimum-jerk approach."""
     return mean_primitive(task.gentle).with_boundary(*task.ends)
 
 
 def conditioned(task: Task, slack: float, times: list[float]) -> PoseDMP:
-    """The distribution of the others, given the pose at these times."""
+    """The distribution of the others, conditioned on the poses at these times."""
     given = {0.0: task.shown[:1], HALF: task.via, DURATION: task.shown[-1:]}
     where = [given[time] for time in times]
     via = Pose(
@@ -183,11 +183,11 @@ METHODS: dict[str, Callable[[Task], Any]] = {
     "via: distribution 0.1": lambda task: conditioned(task, 0.1, [0.0, HALF, DURATION]),
     "via: distribution 0.3": lambda task: conditioned(task, 0.3, [0.0, HALF, DURATION]),
 }
-"""Those that begin with "via" know the pose at half time; numbers are the slack."""
+"""Methods that begin with "via" use the pose at half time; numbers are the slack."""
 
 
 def show(errors: dict[str, dict[str, tuple[float, float]]]) -> None:
-    """A row for each method, with the median over all tasks last."""
+    """Print a row for each method, with the median over all tasks last."""
     table = Table("% of range / deg", *errors, "median")
     for name in METHODS:
         row = np.array([errors[task][name] for task in errors])
@@ -198,7 +198,7 @@ def show(errors: dict[str, dict[str, tuple[float, float]]]) -> None:
 
 
 def figures(errors: dict[str, dict[str, tuple[float, float]]]) -> dict[str, float]:
-    """Flat, by method, task and quantity."""
+    """Measured values as a flat dictionary, by method, task and quantity."""
     flat = {}
     for name in METHODS:
         key = name.replace(":", "").replace(",", "").replace(" ", "_")

@@ -1,10 +1,11 @@
-"""Movement primitives and kinematics on a GPU, each as a share of what the card can do.
+"""Speed of movement primitives and kinematics on a GPU, relative to the limits of the card.
 
 7 joints, 1000 samples, 50 basis functions, float32. The floor of a call is the longer of two
-times: what must be read and written by the bandwidth of a large copy, and what must be
-multiplied by the rate of a large float32 product (without TF32), both measured in the same run.
-Times are wall-clock between events of the device, median of calls one after another: what is
-small waits for Python. The same call on all CPU cores is measured along.
+times. One is the time to read and write its data at the bandwidth of a large copy; the other is
+the time of its multiplications at the rate of a large float32 product (without TF32). Both
+rates are measured in the same run. Times are medians of wall time between events of the device,
+for successive calls; small calls are limited by Python. The same calls are measured on all CPU
+cores.
 """
 
 import statistics
@@ -31,24 +32,24 @@ _FLOAT = 4
 _MOTION = _FLOAT * SAMPLES * JOINTS
 """Bytes of a trajectory."""
 _PRODUCT = 2 * (BASIS + 3) * SAMPLES * JOINTS
-"""Operations of the matrix product behind a trajectory: weights, start, goal and velocity."""
+"""Operations of the matrix product for a trajectory, from weights, start, goal and velocity."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     device: str = "cuda"
-    """Device of PyTorch; "cpu" tries the program where there is no other."""
+    """Device of PyTorch; "cpu" tests the program on a machine without a GPU."""
     batches: tuple[int, ...] = (1, 256, 4096, 16384)
-    """Motions at a time."""
+    """Numbers of motions in a batch."""
     repeats: int = 50
-    """Calls of each on the device; a fifth as many on the CPU."""
+    """Number of calls of each kind on the device; a fifth of it on the CPU."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A call and what no implementation can do without."""
+    """A call, and the least work that any implementation needs for it."""
 
     name: str
     batch: int
@@ -107,7 +108,7 @@ def main(args: Args) -> None:
 
 
 def measure_floors(device: torch.device) -> tuple[float, float]:
-    """Bytes a second of a copy, read and written, and operations a second of a product."""
+    """Bytes per second of a copy, read and written, and operations per second of a product."""
     size = 2**28 if device.type == "cuda" else 2**24
     source = torch.ones(size, device=device)
     target = torch.empty_like(source)
@@ -120,7 +121,7 @@ def measure_floors(device: torch.device) -> tuple[float, float]:
 
 
 def time_calls(call: Callable[[], object], repeats: int, device: torch.device) -> float:
-    """Median seconds of a call, after two that nobody times."""
+    """Median time of a call [s], after two calls that are not timed."""
     for _ in range(2):
         call()
     if device.type != "cuda":
@@ -137,12 +138,12 @@ def time_calls(call: Callable[[], object], repeats: int, device: torch.device) -
         call()
         event.record()
     torch.cuda.synchronize(device)
-    # One after another: the time between two ends.
+    # The calls follow each other: the time of one is the time between two ends.
     return statistics.median(a.elapsed_time(b) for a, b in pairwise(events)) / 1e3
 
 
 def tasks(device: torch.device, batches: tuple[int, ...]) -> Iterator[Task]:
-    """Each made as it is its turn: the largest fill gigabytes."""
+    """Calls to measure, each prepared when it is its turn: the largest need gigabytes."""
     for batch in batches:
         yield from _motions(device, batch)
     for batch in batches[1:]:
@@ -189,7 +190,7 @@ def _motions(device: torch.device, batch: int) -> Iterator[Task]:
         moved = dmp.rollout(goal=learned).position
         torch.autograd.grad(moved, (dmp.weights, learned), seed)
 
-    # The trajectory is written, its gradient read.
+    # The trajectory is written, its gradient is read.
     yield Task(
         name="forward_and_backward",
         batch=batch,
@@ -198,7 +199,7 @@ def _motions(device: torch.device, batch: int) -> Iterator[Task]:
         operations=2 * work["operations"],
     )
     state = dmp.step(dmp.initial_state(), 0.5)
-    # Position and rate are read and written, start, goal and weights read.
+    # Position and rate are read and written; start, goal and weights are read.
     step = {
         "bytes": float(_FLOAT * batch * JOINTS * (BASIS + 8)),
         "operations": float(2 * batch * JOINTS * BASIS),
@@ -223,7 +224,7 @@ def _motions(device: torch.device, batch: int) -> Iterator[Task]:
 
 
 def _own_times(device: torch.device, batch: int) -> Iterator[Task]:
-    """Each motion another duration; stamps of their own."""
+    """Motions with different durations and time stamps."""
     stamps, position = (x.to(device) for x in demonstrations(batch))
     dmp = JointDMP.fit(stamps, position, BASIS)
     rng = torch.Generator().manual_seed(1)
@@ -265,20 +266,20 @@ def _own_times(device: torch.device, batch: int) -> Iterator[Task]:
         batch=batch,
         call=partial(JointDMP.fit, own, position, BASIS),
         bytes=work["bytes"] * (1 + 1 / JOINTS),
-        # The normal matrix of each, one half of it, and its right sides.
+        # The normal matrix of each demonstration (one half of it) and its right-hand sides.
         operations=float(batch * (columns**2 * SAMPLES + _PRODUCT)),
     )
 
 
 def _kinematics(device: torch.device, batch: int) -> Iterator[Task]:
-    # One row a joint: the batch is last in memory.
+    # One row per joint: the batch is last in memory.
     q = panda.ready.float().to(device).expand(batch, 7).mT.contiguous().mT
     yield Task(
         name="kinematics",
         batch=batch,
         call=torch.no_grad()(lambda: panda.transform_and_jacobian(q)),
         bytes=float(_FLOAT * batch * (7 + 12 + 6 * 7)),
-        # Seven products of a transform whose last row is known, and as many cross products.
+        # Seven products with transforms whose last row is known, and as many cross products.
         operations=float(batch * 7 * (2 * 3 * 3 * 4 + 9)),
     )
 

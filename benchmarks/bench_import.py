@@ -1,7 +1,7 @@
-"""How long the package takes to import, against PyTorch alone.
+"""Import time of the package, compared with PyTorch alone.
 
-Each figure is the median CPU time of fresh interpreters, one at a time and in turn, so that
-other work on the machine counts little and slows all alike; ratios are of these medians.
+Each time is the median CPU time of fresh interpreters, which run in turn, one at a time, so
+that other programs have little effect and slow all alike. Ratios are those of the medians.
 """
 
 import resource
@@ -25,21 +25,21 @@ IMPORTS: dict[str, tuple[str, ...]] = {
     **{name: (f"hrc_learn.{name}",) for name in CORE},
     "core": tuple(f"hrc_learn.{name}" for name in CORE),
 }
-"""What is imported, by the name of its figure."""
+"""Imported modules, by the name of the measured value."""
 REACH = 1.2
-"""Most that an import of the core may take, in imports of torch."""
+"""Largest allowed import time of the core, relative to that of torch."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     repeats: int = 7
-    """Interpreters started for each figure."""
+    """Number of interpreters started for each value."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     if args.repeats < 1:
         raise ValueError(f"repeats must be at least 1, but is {args.repeats}")
     figures = measure(args.repeats)
@@ -49,10 +49,10 @@ def main(args: Args) -> None:
 
 
 def measure(repeats: int) -> dict[str, float]:
-    """Seconds of each import, and how many times that of torch it is."""
+    """Time of each import [s], and its ratio to that of torch."""
     seconds: dict[str, list[float]] = {name: [] for name in IMPORTS}
     for modules in IMPORTS.values():
-        start_interpreter(modules)  # fills the disk's cache, writes the bytecode
+        start_interpreter(modules)  # fills the disk cache and writes the bytecode
     for _ in range(repeats):
         for name, modules in IMPORTS.items():
             seconds[name].append(start_interpreter(modules))
@@ -71,13 +71,13 @@ def start_interpreter(modules: tuple[str, ...]) -> float:
 
 
 def cpu_time_of_children() -> float:
-    """Of all that have ended [s]."""
+    """CPU time of all child processes that have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def show(figures: dict[str, float]) -> None:
-    """Print all figures, with what they should stay below."""
+    """Print all measured values with their bounds."""
     table = Table("figure", "measured", "reach", title="Imports in fresh interpreters")
     for name, value in figures.items():
         reach = ""

@@ -1,8 +1,7 @@
-"""The posture nearest to a given one, of all that reach a pose: in one batch, and one by one.
+"""Find the posture nearest to a given one among all that reach a pose: in a batch or a loop.
 
-One by one is what a loop over the redundant joint costs that calls the same inverse for each of
-its positions. CPU time on one thread, of calls made in turn; arms whose package is not
-installed are left out.
+The loop over the redundant joint calls the same inverse for each of its positions. CPU time on
+one thread, calls made in turn. Arms whose package is not installed are left out.
 """
 
 import os
@@ -25,7 +24,7 @@ from hrc_learn.kinematics import Arm, ArmChoice, UnreachableError
 from hrc_learn.kinematics.inverse import solutions_from
 from hrc_learn.kinematics.registry import MissingModelError
 
-_SAMPLES = 57  # of joint 7, or starts
+_SAMPLES = 57  # number of positions of joint 7, or of starts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,13 +32,13 @@ class Args:
     arms: tuple[str, ...] = ("panda", "fr3", "xarm7", "ur5", "iiwa7")
     """Registered names."""
     repeats: int = 10
-    """Calls timed of each kind."""
+    """Number of timed calls of each kind."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     torch.set_num_threads(1)
     figures: dict[str, float] = {}
     for name in args.arms:
@@ -67,7 +66,7 @@ def main(args: Args) -> None:
 
 
 def _one_by_one(robot: Arm, pose: Pose, near: Tensor) -> Tensor:
-    """The nearest solution: of each position of joint 7 in turn, or from each start."""
+    """The nearest solution, from a loop over the positions of joint 7 or over the starts."""
     chain, found = robot.chain, []
     low, high = chain.limits.lower, chain.limits.upper
     if robot.is_franka:

@@ -1,8 +1,8 @@
-"""How well `learn` predicts a demonstration it has not seen, beside fixed models.
+"""Accuracy of `learn` on demonstrations that it was not fitted to, compared with fixed models.
 
-Each demonstration of a task is predicted from start, goal and duration by a model learned from
-all others; `learn` chooses anew without it. Recordings are folders SET/TASK.npy of shape
-(demonstrations, samples, D), sampled evenly.
+Each demonstration of a task is predicted from its start, goal and duration by a model of all
+other demonstrations; `learn` chooses its model anew for each. Recordings are folders
+SET/TASK.npy of shape (demonstrations, samples, D), evenly sampled.
 """
 
 import os
@@ -37,17 +37,17 @@ FIXED = {
 @dataclass(frozen=True, kw_only=True)
 class Args:
     recordings: Path
-    """Folder of folders SET of TASK.npy files."""
+    """Folder that contains folders SET with files TASK.npy."""
     n_basis: int = 40
-    """Basis functions of each primitive."""
+    """Number of basis functions of each primitive."""
     most: int = 8
-    """Largest number of tasks of each set, the first by name."""
+    """Largest number of tasks of each set; the first tasks by name are used."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Predict, print a table, write the figures."""
+    """Predict, print a table, and write the measured values."""
     torch.set_num_threads(1)
     sets = sorted(p for p in args.recordings.iterdir() if p.is_dir())
     errors: dict[str, dict[str, list[float]]] = {}

@@ -343,7 +343,7 @@ class Args:
     processes: int = 2
     """Searches that run at the same time."""
     json: Path | None = None
-    """Receives the measured values."""
+    """File for the measured values."""
 
 
 def searches(args: Args) -> Iterator[Search]:

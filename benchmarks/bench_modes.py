@@ -39,7 +39,7 @@ class Args:
     seed: int = 0
     """Of the made-up demonstrations."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 class Set(NamedTuple):
@@ -54,7 +54,7 @@ class Set(NamedTuple):
 
 
 def main(args: Args) -> None:
-    """Predict, print a table, write the figures."""
+    """Predict, print a table, and write the measured values."""
     torch.set_num_threads(1)
     errors: dict[str, list[float]] = {"nearest": [], "mean": [], "mixture": []}
     several, right = [], []

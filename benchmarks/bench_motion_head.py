@@ -77,7 +77,7 @@ class Args:
     picture: Path | None = None
     """Receives the learning curves."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 type Motions = Callable[[Float[Tensor, "B P"]], Float[Tensor, "B T D"]]

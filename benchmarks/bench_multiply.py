@@ -54,7 +54,7 @@ class Args:
     yaw: float = 0.0
     """Largest rotation of the object about the vertical [rad]."""
     json: Path | None = None
-    """File for the figures."""
+    """File for the measured values."""
 
 
 def main(args: Args) -> None:

@@ -52,7 +52,7 @@ class Args:
     attempts: int = 100
     """Motions of each method."""
     json: Path | None = None
-    """File for the figures."""
+    """File for the measured values."""
 
 
 def main(args: Args) -> None:

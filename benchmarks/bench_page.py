@@ -87,7 +87,7 @@ class Args:
     meshes: bool = True
     """Whether the clients draw the arm as it is, rather than as capsules."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 class Reader:
@@ -232,7 +232,7 @@ def soaked(page: Page, state: ArmState, person: Headset, minutes: float) -> dict
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     torch.set_num_threads(1)
     rows: dict[str, dict[str, float]] = {}
     with (

@@ -56,7 +56,7 @@ class Args:
     seed: int = 0
     """Of the bootstrap."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(kw_only=True)

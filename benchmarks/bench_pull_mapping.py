@@ -44,11 +44,11 @@ class Args:
     seeds: int = 10
     """Of random pulls, 40 s each."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print tables, write the figures."""
+    """Measure, print tables, and write the measured values."""
     torch.set_num_threads(1)
     console, figures = Console(), {}
     workplace = Workplace()

@@ -57,7 +57,7 @@ class Args:
     config: TouchConfig = field(default_factory=TouchConfig)
     """What counts as a touch."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 class Listener(Human):

@@ -123,7 +123,7 @@ class Args:
     train: bool = False
     """Train LeRobot's ACT on each dataset for 20 steps."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> int:

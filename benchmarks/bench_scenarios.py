@@ -40,7 +40,7 @@ F64 = torch.float64
 @dataclass(frozen=True, kw_only=True)
 class Args:
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Scenario:
 
 
 def main(args: Args) -> None:
-    """Run all, print a table, write the figures."""
+    """Run all, print a table, and write the measured values."""
     torch.set_num_threads(1)
     table = Table("scenario", "figure", "theirs", "ours", "from")
     figures: dict[str, float] = {}

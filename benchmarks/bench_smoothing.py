@@ -82,7 +82,7 @@ class Args:
     seed: int = 0
     """Of weights and batches."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True)

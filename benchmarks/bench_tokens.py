@@ -57,7 +57,7 @@ class Args:
     random: int = 0
     """Random sequences to decode with each of our tokenizers."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 class Fast:

@@ -38,7 +38,7 @@ class Args:
     dataset: Path | None = None
     """Keep the dataset here, or read the one that is; a temporary one without."""
     json: Path | None = None
-    """Receives all figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:

@@ -37,7 +37,7 @@ class Args:
     seconds: float = 60.0
     """Length of the run that is written as a recording, at 125 steps a second."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:

@@ -49,15 +49,15 @@ class Args:
     seed: int = 0
     """Of the worker, his visit and all errors."""
     save: Path | None = None
-    """Keeps the figures for a later --compare."""
+    """File that keeps the measured values for a later --compare."""
     compare: Path | None = None
-    """Figures of an earlier --save to show beside these."""
+    """File of an earlier --save, shown next to the new values."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table, write the figures."""
+    """Measure, print a table, and write the measured values."""
     torch.set_num_threads(1)
     earlier = read_figures(args.compare) if args.compare else {}
     with torch.inference_mode():

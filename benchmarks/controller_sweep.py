@@ -70,7 +70,7 @@ class Args:
     figure: Path | None = None
     """Receives a picture of the times to the target, as .png or .svg."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> int:

@@ -123,7 +123,7 @@ class Args:
     figure: Path | None = None
     """Receives the picture, as .png or .svg."""
     json: Path | None = None
-    """Receives the figures as one flat object."""
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> int:
