@@ -1,11 +1,11 @@
-"""Errors of servoing without markers, part by part, against the truth of the simulator.
+"""Errors of servoing without markers, step by step, against the truth of the simulator.
 
-Each scene has its own clutter, lamp, shadows, distractors, object pose, imperfections of the
-laboratory, and a camera moved since the demonstrations. The object is looked for from home.
-Then the tool visits poses over the table; their images teach the camera, as servoing does. At
-last it stands right above the object: the distance of the learned target from the tool that is
-found there is where servoing would end. Control errors are not part of it: `hrc run grasping
---markerless --trials` has them.
+Each scene has its own clutter, lamp, shadows, distractors, object pose and imperfections, and a
+camera that was moved after the demonstrations. The object is searched for from home. Then the
+tool visits poses over the table, and their images adapt the camera, as in servoing. Finally the
+tool stands right above the object. Servoing would end at the learned target, so the distance
+between this target and the detected tool is the error. Control errors are not included:
+`hrc run grasping --markerless --trials` measures them.
 """
 
 import os
@@ -44,7 +44,8 @@ from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
-# Distances of the visited poses from above the middle of the table [m], and tilts [rad].
+# Distances of the visited poses from the pose above the middle of the table [m], and tilts
+# [rad].
 _REACH, _HIGHER, _TILT = (0.10, 0.08), 0.06, 0.03
 # Distance of the tool from the border of the image [px].
 _BORDER = 80
@@ -57,17 +58,18 @@ class Args:
     aiming: Path
     """Folder of `hrc fit image-jacobian --markerless`."""
     dataset: Path | None = None
-    """The films that it was fitted to: the image Jacobian is compared with the truth there."""
+    """Films that the skill was fitted to; on them, the image Jacobian is compared with the
+    truth."""
     robot: str = "panda"
     """Arm by name."""
     scenes: int = 20
-    """Scenes, each with another seed."""
+    """Number of scenes, each with its own seed."""
     seed: int = 100
-    """First of these seeds."""
+    """Seed of the first scene."""
     visits: int = 18
-    """Poses of the tool that teach the camera."""
+    """Number of tool poses that adapt the camera."""
     still: bool = False
-    """Leave the camera where it was."""
+    """Keep the camera at its original pose."""
     ideal: bool = False
     """No imperfections of arm and calibration."""
     json: Path | None = None
@@ -79,37 +81,39 @@ class _Look(NamedTuple):
     pose: Pose
     """Measured pose."""
     pixel: Float[np.ndarray, "2"]
-    """Where it was found [px]."""
+    """Pixel at which the tool was detected [px]."""
     true: Float[np.ndarray, "2"]
-    """Where it truly is [px]."""
+    """True pixel of the tool [px]."""
 
 
 class _Seen(NamedTuple):
-    """Everything that was seen in one scene."""
+    """All observations in one scene."""
 
     item: SeenFeature
     looks: list[_Look]
     last: _Look | None
-    """Right above the object."""
+    """The tool right above the object; None: not detected."""
     jacobian: Float[np.ndarray, "2 2"]
-    """True derivative of the tool's pixel by its place in the plane, there [px/m]."""
+    """True derivative of the tool's pixel by its position in the horizontal plane, above the
+    object [px/m]."""
     yaw: float
-    """Turn of the object on the table [rad]."""
+    """Rotation of the object on the table [rad]."""
     looked: int
-    """Images in which the tool was looked for."""
+    """Number of images in which the tool was searched for."""
 
 
 class _Errors(NamedTuple):
-    """Errors in one scene; NaN where something was not found."""
+    """Errors in one scene; NaN if the object or the tool was not found."""
 
     turn: float = math.nan
-    """Error of the gripper's turn for the object [deg]."""
+    """Error of the gripper's rotation relative to the object [deg]."""
     offset: float = math.nan
-    """Distance from above the object at which servoing would end [mm]."""
+    """Distance between the point at which servoing would end and the point above the object
+    [mm]."""
     predicted: float = math.nan
-    """Standard deviation of that as predicted [mm]."""
+    """Predicted standard deviation of this distance [mm]."""
     found: float = math.nan
-    """Part of it that the found pixels of the tool cause [mm]: with true ones it vanishes."""
+    """Part of this distance that is caused by detection errors of the tool [mm]."""
 
 
 def main(args: Args) -> None:
@@ -167,7 +171,7 @@ def _jacobian(args: Args, skill: VisualServoSkill) -> dict[str, float]:
 
 
 def _looks(args: Args, skill: VisualServoSkill, seed: int) -> tuple[Workplace, _Seen | None]:
-    """Workplace of a scene, and what was seen there."""
+    """Workplace of a scene, and the observations in it."""
     rng = np.random.default_rng(seed)
     workplace = Workplace.of(ArmChoice(args.robot).work_arm())
     workplace = unmarked_for(workplace, skill, UnmarkedLook(), seed)
@@ -184,7 +188,9 @@ def _errors(
     seen: _Seen,
     config: CameraConfig = UNMARKED,
 ) -> _Errors:
-    """Where servoing would end, with a camera learned from what was seen."""
+    """Errors at the point where servoing would end, with the camera adapted to the
+    observations.
+    """
     assert skill.target is not None
     estimator = CameraEstimator(copy.deepcopy(skill.jacobian).double(), config)
     state = estimator.initial_state()
@@ -227,7 +233,7 @@ def _errors(
 
 
 class _Camera:
-    """A scene, its camera and what is found there."""
+    """A scene, its camera, and the detections in its images."""
 
     def __init__(self, skill: VisualServoSkill, scene: GraspingScene, rng: np.random.Generator):
         self._skill, self._scene, self._rng = skill, scene, rng
@@ -244,7 +250,7 @@ class _Camera:
         self._looked = 0
 
     def seen(self, visits: int) -> _Seen | None:
-        """Look for the object, then visit poses; None: the object was not found."""
+        """Search for the object, then visit poses; None: the object was not found."""
         self._place(self._workplace.home_joints())
         number = self._item.marker.id
         item = self._sensor.features([number]).get(number)
@@ -270,7 +276,7 @@ class _Camera:
         )
 
     def _visits(self, number: int) -> list[Pose]:
-        """Poses over the table in all turns, the last one near its middle."""
+        """Poses over the table with all rotations, the last one near its middle."""
         above, rng = self._workplace.hover(), self._rng
         size, poses = self._workplace.robot.hand_size, []
         for _ in range(number):
@@ -284,12 +290,15 @@ class _Camera:
         return poses
 
     def _look(self, pose: Pose) -> _Look | None:
-        """The tool found in an image while it truly is at a pose; None: not seen."""
+        """The tool detected in an image while its true pose is the given one; None: not
+        detected.
+        """
         robot = self._workplace.robot
         try:
             q = robot.inverse(pose, near=self._workplace.hover_joints())
             self._place(q)
-            # Base and tool are truly elsewhere: a step back lands the true tool at the pose.
+            # Errors of base and tool displace the true tool: a correcting step brings it to the
+            # pose.
             q = robot.inverse(_corrected(pose, self._true_tool()), near=q)
         except UnreachableError:
             return None
@@ -314,7 +323,7 @@ class _Camera:
 
 
 def _corrected(wanted: Pose, reached: Pose) -> Pose:
-    """The pose to ask for, if asking for `wanted` led to `reached`."""
+    """Pose to command, if commanding `wanted` led to `reached`."""
     turn = quaternion.multiply(wanted.orientation, quaternion.conjugate(reached.orientation))
     return Pose(
         2 * wanted.position - reached.position, quaternion.multiply(turn, wanted.orientation)

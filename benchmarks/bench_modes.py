@@ -1,9 +1,10 @@
-"""How well a demonstration is predicted from others that go several ways.
+"""Prediction of demonstrations that take one of several routes.
 
-Planar sets of demonstrations: those of the LASA handwriting dataset (seven each, four of the
-thirty sets of several ways), or made-up ones like them: strokes to one end from starts that
-scatter by 7 % of the way, of one way or of two or three, seven to nine demonstrations each.
-Each is left out in turn and predicted from the others, given its start and goal alone.
+The sets of planar demonstrations come from the LASA handwriting dataset (seven demonstrations
+each; four of the thirty sets have several routes), or they are synthetic and similar: seven to
+nine strokes to a common end, from starts that scatter by 7 % of the length, along one, two or
+three routes. Each demonstration is left out in turn and predicted from the others, given only
+its start and goal.
 """
 
 import os
@@ -31,13 +32,13 @@ SAMPLES = 150
 @dataclass(frozen=True, kw_only=True)
 class Args:
     lasa: Path | None = None
-    """Folder of the LASA set's .mat files; None: sets are made up."""
+    """Folder of the LASA set's .mat files. None: synthetic sets."""
     sets: int = 32
-    """How many to make up, half of them of one way."""
+    """Number of synthetic sets; half of them have one route."""
     n_basis: int = 30
-    """Basis functions of each primitive."""
+    """Number of basis functions of each primitive."""
     seed: int = 0
-    """Of the made-up demonstrations."""
+    """Seed of the synthetic demonstrations."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -50,7 +51,7 @@ class Set(NamedTuple):
     position: Tensor
     """(n, T, 2)."""
     ways: int | None
-    """How many there are; None: several, as many as there may be."""
+    """Number of routes; None: several, the exact number is not known."""
 
 
 def main(args: Args) -> None:
@@ -72,7 +73,7 @@ def main(args: Args) -> None:
 
 
 def made_up_sets(args: Args) -> Iterator[Set]:
-    """As many as are asked for."""
+    """Synthetic sets, in the requested number."""
     rng = torch.Generator().manual_seed(args.seed)
     for k in range(args.sets):
         ways = 1 if k % 2 == 0 else 2 + int(torch.randint(2, (), generator=rng))
@@ -80,7 +81,7 @@ def made_up_sets(args: Args) -> Iterator[Set]:
 
 
 def drawn_sets(folder: Path) -> Iterator[Set]:
-    """Those of the LASA set; of which four go several ways, as their names say."""
+    """Sets of the LASA dataset; the names of four of them show several routes."""
     for name, shown in read_recordings(folder).items():
         time, position = (
             torch.from_numpy(np.stack(x))
@@ -98,7 +99,7 @@ def made_up(ways: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def stroke(rng: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Where it starts, and how it bends: three sines of each coordinate."""
+    """Start of a stroke, and the amplitudes of its bend: three sines of each coordinate."""
     start = torch.randn(2, generator=rng, dtype=torch.float64)
     length = 0.7 + 0.6 * torch.rand(1, generator=rng, dtype=torch.float64)
     bend = torch.randn(3, 2, generator=rng, dtype=torch.float64)
@@ -106,7 +107,9 @@ def stroke(rng: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def demonstration(start: Tensor, bend: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-    """One of a stroke: from another start, bent by 15 % more or less, earlier or later."""
+    """A demonstration of a stroke: with another start, another bend (by 15 %) and another
+    timing.
+    """
     start = start + 0.07 * torch.randn(2, generator=rng, dtype=torch.float64)
     bend = bend * (1 + 0.15 * torch.randn(bend.shape, generator=rng, dtype=torch.float64))
     s = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)
@@ -120,7 +123,9 @@ def demonstration(start: Tensor, bend: Tensor, rng: torch.Generator) -> tuple[Te
 def predict(
     primitives: JointDMP, i: int, position: Tensor, errors: dict[str, list[float]]
 ) -> int:
-    """Add errors by method [% of the largest range of the set]; how many modes there are."""
+    """Add the errors by method [% of the largest range of the set]; returns the number of
+    modes.
+    """
     others = primitives[[j for j in range(len(position)) if j != i]]
     start, goal = position[i, 0], position[i, -1]
     away = (others.start - start).norm(dim=-1) + (others.goal - goal).norm(dim=-1)
@@ -132,7 +137,7 @@ def predict(
         "mixture": mixture.at(context).mean_primitive(),
     }
     low, high = position.flatten(0, 1).aminmax(dim=0)
-    # Samples of all sets are evenly spaced.
+    # Samples of all sets are evenly spaced in time.
     s = torch.linspace(0, 1, position.shape[1], dtype=torch.float64)
     for name, dmp in predictions.items():
         path = dmp.with_boundary(start, goal).rollout(s * dmp.duration).position
@@ -142,7 +147,9 @@ def predict(
 
 
 def summarise(errors: dict[str, list[float]], several: np.ndarray) -> dict[str, float]:
-    """Median and 90th percentile, of all, of sets of one way and of several."""
+    """Median and 90th percentile over all sets, over sets with one route, and over those with
+    several.
+    """
     figures = {}
     for name, values in errors.items():
         which = {"all": several | True, "one_way": ~several, "several_ways": several}
@@ -154,7 +161,7 @@ def summarise(errors: dict[str, list[float]], several: np.ndarray) -> dict[str, 
 
 
 def show(figures: dict[str, float]) -> None:
-    """A row for each method."""
+    """Print a row for each method."""
     groups = ("all", "one_way", "several_ways")
     title = f"RMSE, % of range: median / p90 (modes right: {figures['modes_right']:.0%})"
     table = Table("predicted by", *groups, title=title)

@@ -1,13 +1,13 @@
-"""Compare `MotionHead` with ProDMP of MP_PyTorch as the last layer of a policy that searches.
+"""Compare `MotionHead` with ProDMP of MP_PyTorch as the last layer of a policy.
 
-Episodic reinforcement learning in MuJoCo: an arm of five joints in a plane passes two points
-at given times and ends at a third. A network reads the three points and says, once an episode,
-the mean of a Gaussian over the parameters of a motion; a clipped policy gradient (PPO, as for
-black boxes in Otto et al. 2022) improves it. The network, its optimiser, the contexts, the
-number of parameters and the root mean square by which the first samples deviate are the same
-for both heads, each at its defaults otherwise. The rate of the optimiser falls to nothing along
-a run. CMA-ES searches both parameter spaces as well, for one context at a time and without a
-network. Figures are returns by environment steps.
+Episodic reinforcement learning in MuJoCo: a planar arm with five joints passes two points at
+given times and ends at a third. Once per episode, a network maps the three points to the mean
+of a Gaussian over the parameters of a motion. A clipped policy gradient (PPO, for black-box
+optimisation as in Otto et al. 2022) improves the network. Both heads have the same network,
+optimiser, contexts, number of parameters and root mean square deviation of the first samples;
+all other settings are the defaults of each head. The learning rate falls to zero during a run.
+In addition, CMA-ES searches both parameter spaces, for one context at a time and without a
+network. Reported are returns over environment steps.
 
 Needs mp_pytorch and cma: pip install mp_pytorch cma
 """
@@ -38,54 +38,55 @@ from hrc_learn.dmp import MotionHead
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import STYLE, WIDTH
 
-# MuJoCo's classes are compiled, and its stubs leave most of them out.
-# pyright: reportAttributeAccessIssue=false
+# MuJoCo's classes are compiled, and its stubs omit most of them.
 
 JOINTS, LINK = 5, 0.2
-"""Of the arm, and the length of each of its links [m]."""
+"""Number of joints of the arm, and length of each link [m]."""
 STEP, DURATION = 0.01, 2.0
-"""Of the simulation and of an episode [s]."""
+"""Time step of the simulation, and duration of an episode [s]."""
 STEPS = round(DURATION / STEP)
 PASSED = (0.35, 0.7, 1.0)
-"""Shares of the episode at which the tip is to be at the three points."""
+"""Times at which the tip should be at the three points, as fractions of the episode."""
 EFFORT = 1e-4
-"""Cost of a mean squared joint acceleration of 1 rad^2/s^4, in metres of distance."""
+"""Cost of a mean squared joint acceleration of 1 rad^2/s^4, as a distance [m]."""
 QUANTILE = 2.776
-"""Of Student's distribution with four degrees of freedom: of five seeds, 95 %."""
+"""Quantile of Student's distribution with four degrees of freedom, for 95 % intervals of five
+seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     seeds: int = 5
-    """Runs of each, with other contexts, networks and samples."""
+    """Number of runs of each head, with different contexts, networks and samples."""
     iterations: int = 400
-    """Updates of a policy."""
+    """Number of updates of a policy."""
     episodes: int = 128
-    """Between two updates."""
+    """Number of episodes between two updates."""
     search_episodes: int = 3000
-    """Of CMA-ES for one context."""
+    """Number of episodes of CMA-ES for one context."""
     search_contexts: int = 8
-    """Searched for by CMA-ES in each run, one after the other; their mean is its figure."""
+    """Number of contexts of CMA-ES in each run, one after another; their mean is reported."""
     n_basis: int = 5
-    """Of each joint; as many parameters and one, the goal."""
+    """Number of basis functions of each joint; with the goal, a joint has one parameter more.
+    """
     deviation: float = 0.3
-    """Standard deviation of whitened parameters at first."""
+    """Initial standard deviation of whitened parameters."""
     rate: float = 1e-3
-    """Of Adam at first; it falls linearly to zero."""
+    """Initial learning rate of Adam; it falls linearly to zero."""
     first_seed: int = 0
-    """Others than those reported are for choosing `deviation` and `rate`."""
+    """First seed. Use seeds other than the reported ones to choose `deviation` and `rate`."""
     picture: Path | None = None
-    """Receives the learning curves."""
+    """File for a picture of the learning curves."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 type Motions = Callable[[Float[Tensor, "B P"]], Float[Tensor, "B T D"]]
-"""Parameters to joint positions at every step."""
+"""Map from parameters to joint positions at every step."""
 
 
 def main(args: Args) -> None:
-    """Learn with both heads and all seeds; print, draw and write what came of it."""
+    """Train both heads with all seeds; print, draw and write the results."""
     missing = [name for name in ("mp_pytorch", "cma") if find_spec(name) is None]
     if missing:
         raise ValueError(f"not installed: pip install {' '.join(missing)}")
@@ -107,16 +108,16 @@ def main(args: Args) -> None:
 
 
 def our_motions(n_basis: int) -> Motions:
-    """Of a head without timing."""
+    """Motions of a head without timing parameters."""
     head = MotionHead(JOINTS, n_basis, duration=DURATION)
     time = STEP * torch.arange(1, STEPS + 1)
     return lambda z: head(z, time, torch.zeros(JOINTS)).position
 
 
 def prodmp_motions(n_basis: int) -> Motions:
-    """Of ProDMP, with each basis function scaled to one as its authors advise.
+    """Motions of ProDMP, with each basis function scaled to one as its authors advise.
 
-    All are scaled once more, so that unit normal parameters deviate as much as in our head.
+    A common scale makes unit normal parameters deviate as much as in our head.
     """
     from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
 
@@ -148,7 +149,7 @@ def prodmp_motions(n_basis: int) -> Motions:
 
 
 class Reacher:
-    """Episodes of the arm, its joints led along motions by springs and dampers."""
+    """Episodes of the arm, whose joints follow motions by springs and dampers."""
 
     def __init__(self):
         body = end = ""
@@ -176,7 +177,7 @@ class Reacher:
     def returns(
         self, path: Float[Tensor, "B T D"], context: Float[Tensor, "B 6"]
     ) -> Float[Tensor, "B"]:
-        """Minus the distances from the points [m] and the effort."""
+        """Returns: minus the distances from the points [m], minus the effort."""
         control = path.double().numpy()
         initial = self._start.repeat(len(control), 0)
         state, tip = (
@@ -191,7 +192,7 @@ class Reacher:
 
 
 def contexts(n: int, rng: torch.Generator) -> Float[Tensor, "n 6"]:
-    """Three points each that the arm reaches, the second near the way of the others."""
+    """Random contexts: three points in reach, the second near the line between the others."""
     first, last = 0.7 * torch.randn(2, n, JOINTS, generator=rng)
     middle = (first + last) / 2 + 0.4 * torch.randn(n, JOINTS, generator=rng)
     angle = torch.stack([first, middle, last], 1).cumsum(-1)
@@ -199,7 +200,7 @@ def contexts(n: int, rng: torch.Generator) -> Float[Tensor, "n 6"]:
 
 
 def network(outputs: int) -> nn.Sequential:
-    """Two hidden layers; it puts out zeros at first."""
+    """Network with two hidden layers and an initial output of zero."""
     last = nn.Linear(64, outputs)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -207,7 +208,7 @@ def network(outputs: int) -> nn.Sequential:
 
 
 def learn(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"]:
-    """Returns of the mean policy on held-out contexts, before each tenth update and at last."""
+    """Returns of the mean policy on held-out contexts, at each tenth update and at the end."""
     torch.manual_seed(seed)
     rng = torch.Generator().manual_seed(seed)
     reacher, held_out = Reacher(), contexts(64, torch.Generator().manual_seed(10_000))
@@ -250,7 +251,7 @@ def learn(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"
 
 
 def search(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"]:
-    """Best return that CMA-ES has seen for a context, by generation; mean over contexts."""
+    """Best return found by CMA-ES by generation; mean over contexts."""
     rng = torch.Generator().manual_seed(20_000 + seed)
     runs = [
         search_one(motions, args, context[None], args.search_contexts * seed + k + 1)
@@ -262,7 +263,7 @@ def search(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points
 def search_one(
     motions: Motions, args: Args, context: Float[Tensor, "1 6"], seed: int
 ) -> Float[np.ndarray, "points"]:
-    """The same of one context; `seed` is positive."""
+    """The same for one context; `seed` is positive."""
     import cma  # pyright: ignore[reportMissingImports]
 
     reacher, P = Reacher(), JOINTS * (args.n_basis + 1)
@@ -282,7 +283,9 @@ def search_one(
 def summarise(
     curves: dict[str, Float[np.ndarray, "seeds points"]], args: Args
 ) -> dict[str, float]:
-    """Means and half-widths of 95 % intervals, of both heads and their difference by seed."""
+    """Means and half-widths of 95 % intervals, for both heads and their difference with equal
+    seeds.
+    """
     figures: dict[str, float] = {}
     for kind in ("policy", "CMA-ES"):
         ours, theirs = (curves[f"{kind}, {name}"] for name in ("MotionHead", "ProDMP"))
@@ -304,12 +307,12 @@ def summarise(
 
 
 def half_width(values: Float[np.ndarray, "seeds"]) -> float:
-    """Of the 95 % interval of a mean."""
+    """Half-width of the 95 % interval of a mean."""
     return QUANTILE * float(values.std(ddof=1)) / math.sqrt(len(values))
 
 
 def show(figures: dict[str, float]) -> None:
-    """Print all figures."""
+    """Print all measured values."""
     table = Table("figure", "value", title="A reacher through points, return [m]")
     for name, value in figures.items():
         table.add_row(name, f"{value:,.4g}")

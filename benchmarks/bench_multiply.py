@@ -1,11 +1,11 @@
-"""`hrc multiply` against rigid segments joined by straight lines, and against an open replay.
+"""Compare `hrc multiply` with rigid segments joined by straight lines, and replay its episodes.
 
-The same demonstrations, scenes, arm, limits and judge serve both. The baseline is that of
+Both methods use the same demonstrations, scenes, arm, limits and judge. The baseline is that of
 MimicGen (Mandlekar et al. 2023): each segment of one demonstration is moved rigidly with its
-object, and a straight line at the demonstrated mean speed leads from the tool to its start.
-Jerk is that of the planned joint positions. `--replay` carries out the actions of a dataset in
-a program of its own: Parquet in, MuJoCo's servos, success by the height of the object and the
-contacts of both fingers.
+object, and a straight line at the demonstrated mean speed joins the tool's position with the
+start of the segment. Jerk is that of the planned joint positions. `--replay` executes the
+actions of a dataset without code of `hrc multiply`: actions from Parquet files, MuJoCo's
+servos, success by the height of the object and the contacts of both fingers.
 
     bench_multiply.py --dataset five --attempts 50 --json outputs/multiply.json
     bench_multiply.py --dataset five --replay thousand --attempts 200
@@ -35,7 +35,7 @@ from hrc_learn.sim.workplace import Workplace
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 LIFTED = 0.075
-"""Height by which a lifted object has risen at least [m]: half of the demonstrated one."""
+"""Smallest height to which a lifted object rises [m]: half of the demonstrated height."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,8 @@ class Args:
     robot: str = ""
     """Arm of the motions. Default: that of the demonstrations."""
     wide: float = 0.0
-    """Widening of the ranges of the object's position, as a fraction of them, on each side."""
+    """Increase of the ranges of the object's position on each side, as a fraction of the
+    ranges."""
     yaw: float = 0.0
     """Largest rotation of the object about the vertical [rad]."""
     json: Path | None = None

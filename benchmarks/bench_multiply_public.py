@@ -1,13 +1,12 @@
-"""`hrc multiply` on expert demonstrations of MetaWorld, judged by MetaWorld.
+"""Test `hrc multiply` on expert demonstrations of MetaWorld, judged by MetaWorld.
 
-Five episodes of a scripted expert become a LeRobot dataset of the Sawyer's joints, its hand,
-the object and the goal, as LeRobot itself writes it. `hrc multiply` makes episodes for new
-scenes without physics. Their actions are carried out in MetaWorld, which decides whether the
-task was done. The baseline does the same scenes by MimicGen's method (Mandlekar et al. 2023):
-each segment of one demonstration's commands is moved with its object or the goal, and a
-straight line leads to its start; the first segment ends when the object moves. Jerk is that of
-the commanded positions of the hand. Needs
-tools/make_environments.sh.
+Five episodes of a scripted expert become a LeRobot dataset with the Sawyer's joints, its hand,
+the object and the goal, written by LeRobot. `hrc multiply` makes episodes for new scenes
+without physics. Their actions are executed in MetaWorld, which decides on success. The baseline
+solves the same scenes by MimicGen's method (Mandlekar et al. 2023): each segment of one
+demonstration's commands is moved with its object or the goal, and a straight line leads to its
+start; the first segment ends when the object moves. Jerk is that of the commanded positions of
+the hand. Needs tools/make_environments.sh.
 
     .venv-environments/bin/python benchmarks/bench_multiply_public.py --task pick-place-v3 \
         --out outputs/metaworld --json outputs/metaworld.json
@@ -34,11 +33,11 @@ from hrc_learn.learning.multiply_motions import POSITION_ONLY
 JOINTS = tuple(f"right_j{k}" for k in range(7))
 HAND = ("ee.x", "ee.y", "ee.z")
 STILL = 20
-"""Frames that the expert stays after its success."""
+"""Number of frames for which the expert continues after its success."""
 MOVED = 0.01
-"""Motion of an object that has been grasped [m]."""
+"""Displacement above which an object counts as grasped [m]."""
 APART = 0.15
-"""MetaWorld begins with object and goal at least this far from each other [m]."""
+"""Smallest distance between object and goal in MetaWorld's initial scenes [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +49,7 @@ class Args:
     demonstrations: int = 5
     """Successful episodes of the expert."""
     attempts: int = 100
-    """Motions of each method."""
+    """Number of motions of each method."""
     json: Path | None = None
     """File for the measured values."""
 
@@ -94,7 +93,7 @@ def main(args: Args) -> None:
 
 
 def record(task: MetaWorld, name: str, folder: Path, count: int) -> None:
-    """Episodes of the expert as a dataset, written by LeRobot."""
+    """Record episodes of the expert as a dataset, written by LeRobot."""
     things = [f"object.{axis}" for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")]
     names = {
         "observation.state": [*(f"{joint}.pos" for joint in JOINTS), *HAND, "gripper.pos"],
@@ -197,9 +196,9 @@ def rigid(
 
 
 def succeeds(task: MetaWorld, scene: np.ndarray, actions: np.ndarray) -> bool:
-    """Whether MetaWorld reports a success while the actions are carried out."""
+    """True if MetaWorld reports success while the actions are executed."""
     env = task._env
-    # The height of an object that lies on the table is MetaWorld's own.
+    # An object that lies on the table has the height that MetaWorld gives it.
     env._last_rand_vec = np.array([*scene[:2], 0.02, *scene[3:]])
     env._freeze_rand_vec = True
     env.reset()

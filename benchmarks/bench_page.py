@@ -1,11 +1,12 @@
-"""From a hand that moves to the effort that a controller reads, by the page and by the headset.
+"""Delay from a motion of a hand to the controller's input, through the page and the headset.
 
-A headset emulated in Chromium pinches link 4 and jumps to and fro; a mouse drags the same link
-on viser's page. The way is measured from the instant at which the hand is set or the mouse
-moved, by the clock of this machine, to the first reading of `Human.read` that differs: wall
-time, with drawing without a graphics processor, so that it says as much of the machine's load
-as of the page. Beside it, frames a second that the client draws, and the same with others who
-watch. With `--soak` the hand goes on for a while, and the memory of both sides is looked at.
+A headset emulated in Chromium pinches link 4, and its hand jumps back and forth; a mouse drags
+the same link on viser's page. The delay is measured from the time at which the hand is set or
+the mouse is moved, by the clock of this machine, to the first reading of `Human.read` that
+differs. It is wall time, with drawing without a graphics processor, so it depends on the load
+of the machine as much as on the page. The frame rate of the client is reported, too, and all
+values are measured again with other clients watching. With `--soak`, the hand continues for
+some minutes, and the memory of both sides is measured.
 
     python benchmarks/bench_page.py --watchers 4 --soak 10
 """
@@ -42,8 +43,8 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.page import Page, PageConfig
 
-_POLL = 0.001  # between readings of the person [s]
-_LOST = 2.0  # a motion that has no effect within this is counted as lost [s]
+_POLL = 0.001  # period of reading the person [s]
+_LOST = 2.0  # time after which a motion without an effect counts as lost [s]
 _JUMPS = """
 window.jumped = [];
 window.jumping = setInterval(() => {
@@ -77,21 +78,22 @@ asyncio.run(main())
 @dataclass(frozen=True, kw_only=True)
 class Args:
     seconds: float = 20.0
-    """Time of each measurement [s]."""
+    """Duration of each measurement [s]."""
     watchers: int = 4
-    """Who watch in the second measurement."""
+    """Number of watching clients in the second measurement."""
     soak: float = 0.0
-    """Minutes that the hand goes on at the end."""
+    """Duration of the final measurement [min]."""
     pixels: float = 1.0
-    """Of a screen's, across, that viser's page draws (its `fixedDpr`)."""
+    """Fraction of the screen's horizontal resolution that viser's page draws (its `fixedDpr`).
+    """
     meshes: bool = True
-    """Whether the clients draw the arm as it is, rather than as capsules."""
+    """True if the clients draw the arm's meshes, False for capsules."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 class Reader:
-    """Reads the person as a control loop does, and notes when what they ask for changes."""
+    """Reads the person's input as a control loop does, and records the times of its changes."""
 
     def __init__(self, page: Page, state: ArmState):
         self.changes: list[float] = []
@@ -115,7 +117,7 @@ class Reader:
         self._thread.join()
 
     def delays(self, moved: list[float]) -> np.ndarray:
-        """From each motion to its effect [s]; of lost ones infinity."""
+        """Delay from each motion to its effect [s]; infinite for lost motions."""
         changes = np.array([*self.changes, np.inf])
         first = changes[np.searchsorted(changes, moved)]
         delays = first - np.array(moved)
@@ -124,7 +126,7 @@ class Reader:
 
 @contextmanager
 def still_page(meshes: bool):
-    """A page beside an arm that stands still: only hands change what is asked."""
+    """Page of an arm at rest: only hands change the input."""
     workplace = Workplace()
     world, q = World(workplace.scene), workplace.home_joints().numpy()
     world.hold(workplace.scene.objects[0].name, q)
@@ -136,7 +138,7 @@ def still_page(meshes: bool):
 
 
 def by_hand(page: Page, state: ArmState, person: Headset, seconds: float) -> dict[str, float]:
-    """Of a hand that jumps to and fro."""
+    """Delays of a hand that jumps back and forth."""
     frames, began = person.tab.evaluate("window.seen.frames"), time.time()
     with Reader(page, state) as reader:
         person.tab.evaluate(_JUMPS)
@@ -151,7 +153,7 @@ def by_hand(page: Page, state: ArmState, person: Headset, seconds: float) -> dic
 def by_mouse(
     page: Page, state: ArmState, folder: Path, seconds: float, pixels: float
 ) -> dict[str, float]:
-    """Of a mouse that drags link 4 on viser's page."""
+    """Delays of a mouse that drags link 4 on viser's page."""
     q = torch.from_numpy(state.joint_position)
     elbow = panda.link_poses(q)[3].position.numpy()
     moved = []
@@ -168,7 +170,7 @@ def by_mouse(
 
 
 def figures(delays: np.ndarray) -> dict[str, float]:
-    """Of delays: median and 95th percentile [ms], and how many there were and were lost."""
+    """Median and 95th percentile of delays [ms], numbers of all and of lost motions."""
     median, p95 = np.percentile(delays, [50, 95], method="higher")
     lost = int(np.isinf(delays).sum())
     return {"p50_ms": 1e3 * median, "p95_ms": 1e3 * p95, "motions": len(delays), "lost": lost}
@@ -176,7 +178,7 @@ def figures(delays: np.ndarray) -> dict[str, float]:
 
 @contextmanager
 def watched(page: Page, count: int):
-    """Others who are told the scene, in processes of their own."""
+    """Watching clients, which receive the scene, each in its own process."""
     urls = [
         f"ws://127.0.0.1:{page.address.port}/session/somebody-who-watches-{k}"
         for k in range(count)
@@ -197,22 +199,23 @@ def watched(page: Page, count: int):
 
 
 def memory(person: Headset) -> tuple[float, float]:
-    """Of this process and of the client's heap [MB]."""
+    """Memory of this process and heap of the client [MB]."""
     pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
     browser = person.tab.context.new_cdp_session(person.tab)
-    browser.send("HeapProfiler.collectGarbage")  # or garbage would count
+    browser.send("HeapProfiler.collectGarbage")  # otherwise, garbage would count
     browser.detach()
     heap = person.tab.evaluate("performance.memory.usedJSHeapSize")
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6, heap / 1e6
 
 
 def soaked(page: Page, state: ArmState, person: Headset, minutes: float) -> dict[str, float]:
-    """Memory before and after, and what got lost meanwhile.
+    """Memory before and after, and the motions lost in between.
 
-    A hand that was let go, as after a client's silence, takes hold again at the next minute's
-    start: `let_go` counts how often, and `lost` the motions without effect until then.
+    A hand that was released, as after a silence of the client, grips again at the start of the
+    next minute: `let_go` counts such releases, and `lost` the motions without effect until
+    then.
     """
-    by_hand(page, state, person, 20)  # what is filled once is full
+    by_hand(page, state, person, 20)  # caches that are filled once are full now
     server, client = memory(person)
     motions = lost = let_go = 0.0
     for minute in range(max(round(minutes), 1)):
@@ -244,10 +247,11 @@ def main(args: Args) -> None:
         with headset(folder / "headset", page, (320, 200)) as person:
             person.enter()
             arm = person.tab.evaluate("JSON.parse(localStorage['hrc-placing'] ?? '{}').arm")
-            assert arm is None  # it stands ahead of where the person entered
+            # the placement lies in front of the point where the person entered
+            assert arm is None
             q = torch.from_numpy(state.joint_position)
             x, y, z = panda.link_poses(q)[3].position.tolist()
-            # Ahead by 1.1 m on a table of 0.72 m, with x to the person.
+            # 1.1 m ahead, on a table of 0.72 m, with x towards the person
             person.reach("left", [y, 0.72 + z, -1.1 + x])
             person.pinch("left")
             if not page.human.read(state).effort(7).any():
@@ -261,13 +265,15 @@ def main(args: Args) -> None:
     columns = [str(column.header) for column in table.columns[1:]]
     for name, row in rows.items():
         table.add_row(name, *(f"{row[c]:.3g}" if c in row else "" for c in columns))
-    Console(width=120).print(table)  # no column is cut, wherever it is kept
+    Console(width=120).print(table)  # no column is cut in a log file
     flat = {f"{name}_{key}": value for name, row in rows.items() for key, value in row.items()}
     write_values(args.json, flat)
 
 
 def measure(args: Args) -> None:
-    """As `main`; without a browser or the client built it says so and measures nothing."""
+    """The work of `main`; without a browser or the built client, prints this and measures
+    nothing.
+    """
     try:
         main(args)
     except pytest.skip.Exception as missing:

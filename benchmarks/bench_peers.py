@@ -1,11 +1,12 @@
-"""How well `learn` and its peers predict a demonstration they have not seen.
+"""Accuracy of `learn` and its peers on demonstrations that they were not fitted to.
 
 Each demonstration is predicted from all others of its task, given start, goal and duration. The
-settings of each peer (`motion_peers.py`) are those that best predict some of these others, each
-from the rest. Recordings are folders SET/TASK.npy of shape (demonstrations, samples, D), evenly
-sampled; `prepare_recordings.py` makes them from public files, and the LASA set comes with the
-environment of the peers, which is built if it is missing. Results are kept in a file per set: a
-second run predicts only with new sets, new peers and new settings.
+settings of each peer (`motion_peers.py`) are chosen on these other demonstrations: they are the
+settings that best predict some of them, each from the rest. Recordings are folders SET/TASK.npy
+of shape (demonstrations, samples, D), evenly sampled. `prepare_recordings.py` makes them from
+public files; the LASA set comes with the environment of the peers, which is built if it is
+missing. Results are kept in a file per set: a second run computes only new sets, new peers and
+new settings.
 """
 
 import os
@@ -36,39 +37,40 @@ ENVIRONMENT = ROOT / ".venv-peers"
 SAMPLES = 200
 """Samples to which each motion is resampled."""
 RESAMPLES = 2000
-"""Of the bootstrap."""
+"""Number of resamples of the bootstrap."""
 FEW_TASKS = 5
-"""The bootstrap draws tasks if a set has as many or more, otherwise demonstrations."""
+"""The bootstrap draws tasks if a set has at least this number of tasks, otherwise
+demonstrations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     recordings: Path | None = None
-    """Folder of folders SET of TASK.npy files; None: the LASA set alone."""
+    """Folder that contains folders SET with files TASK.npy; None: only the LASA set."""
     out: Path = Path("outputs/peers")
     """Folder of the results by set; delete a file if the recordings of the set have changed."""
     tasks: int = 9
-    """Largest number of tasks of each set, the first by name."""
+    """Largest number of tasks of each set; the first tasks by name are used."""
     predicted: int = 36
-    """Number of demonstrations predicted of each set, at most; spread evenly over the tasks."""
+    """Largest number of demonstrations predicted in each set, spread evenly over the tasks."""
     inner: int = 4
-    """Demonstrations predicted to choose the settings."""
+    """Number of demonstrations predicted to choose the settings."""
     seed: int = 0
-    """Of the bootstrap."""
+    """Seed of the bootstrap."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(kw_only=True)
 class Measured:
-    """Figures of one peer, one per predicted demonstration."""
+    """Measured values of one peer, one for each predicted demonstration."""
 
     rmse: list[float] = field(default_factory=list)
-    """Relative to the largest range of the demonstration."""
+    """RMSE relative to the largest range of the demonstration."""
     miss: list[float] = field(default_factory=list)
-    """Distance from the goal at the end, relative to the same."""
+    """Distance from the goal at the end, relative to the same range."""
     acceleration: list[float] = field(default_factory=list)
-    """Peak acceleration relative to the demonstrated."""
+    """Peak acceleration relative to the demonstrated one."""
     tuning: list[float] = field(default_factory=list)
     """CPU time of choosing the settings [s]."""
     fit: list[float] = field(default_factory=list)
@@ -91,7 +93,7 @@ class Results:
 
 
 def main(args: Args) -> None:
-    """Predict set by set, print the tables, write the figures."""
+    """Predict set by set, print the tables and write the measured values."""
     if any(find_spec(name) is None for name in ("movement_primitives", "mp_pytorch")):
         run_in_environment()
     torch.set_num_threads(1)
@@ -195,7 +197,7 @@ def predict(peer: Peer, motions: Array, i: int, inner: int, measured: Measured) 
 
 
 def tuned(peer: Peer, shown: Array, inner: int) -> Setting:
-    """Setting whose predictions of some demonstrations, each from the rest, err least."""
+    """Setting with the smallest error of predicting some demonstrations, each from the rest."""
     if len(peer.settings) == 1:
         return peer.settings[0]
     errors = np.zeros(len(peer.settings))
@@ -208,12 +210,12 @@ def tuned(peer: Peer, shown: Array, inner: int) -> Setting:
 
 
 def error(made: Array, wanted: Array) -> float:
-    """Root mean square of all samples and columns."""
+    """Root mean square over all samples and columns."""
     return float(np.sqrt(np.mean((made - wanted) ** 2)))
 
 
 def peak_acceleration(motion: Array) -> float:
-    """Largest second difference."""
+    """Largest second difference of a motion."""
     return float(np.linalg.norm(np.diff(motion, 2, axis=0), axis=1).max())
 
 
@@ -266,7 +268,7 @@ def show(name: str, results: Results, seed: int, figures: dict[str, float]) -> N
 
 
 def resamples(tasks: list[str], rng: np.random.Generator) -> list[Array]:
-    """Rows of each sample of the bootstrap: of tasks drawn with replacement, or of rows."""
+    """Rows of each bootstrap sample: rows of tasks drawn with replacement, or single rows."""
     rows = {task: np.flatnonzero(np.array(tasks) == task) for task in dict.fromkeys(tasks)}
     units = (
         list(rows.values()) if len(rows) >= FEW_TASKS else list(np.arange(len(tasks))[:, None])

@@ -1,12 +1,12 @@
-"""Compare policies on demonstrations that they did not learn from, at equal CPU time.
+"""Compare policies on held-out demonstrations, at equal CPU time.
 
-Of a LeRobot dataset every fifth episode is held out. Policies see its states go by and say
-what to do; reported is how far that is from what was shown, and how abruptly commands change
-where one chunk follows another, beside how abruptly the demonstrators moved. No robot moves:
-what a policy does is not seen by it, so this says nothing of how it recovers.
+Every fifth episode of a LeRobot dataset is held out. Policies observe its states one after
+another and predict actions. Reported are the error of these actions and the jerk where chunks
+meet, next to the jerk of the demonstrations. No robot moves and actions do not affect later
+states, so recovery from errors is not measured.
 
-Peers are the nearest neighbour, the chunk shown after the state most like the one seen, and a
-small ACT of LeRobot, which trains as long as ours by the clock of the CPU.
+Peers are the nearest neighbour, which repeats the chunk demonstrated after the most similar
+state, and a small ACT of LeRobot, which trains for the same CPU time as ours.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from hrc_learn import cli
 STATE, ACTION = "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
 WARM_UP = 50
-"""Steps of training in which the learning rate rises."""
+"""Number of training steps in which the learning rate rises."""
 CONSTANT = 1e-6
-"""Columns of the action that vary by less play no part."""
+"""Variation of an action's column below which the column is left out."""
 POLICIES = ("act", "diffusion", "dmp", "motion_chunk")
 type Episode = dict[str, Tensor]
 
@@ -48,23 +48,24 @@ class Args:
     data: tuple[Path, ...]
     """Folders of LeRobot datasets."""
     policies: tuple[str, ...] = ("nearest", "act", "dmp", "motion_chunk")
-    """nearest: neighbour; act, diffusion: small ones; dmp, motion_chunk: from a closed form."""
+    """nearest: nearest neighbour; act, diffusion: small networks; dmp, motion_chunk: ours,
+    which start from a closed form."""
     minutes: float = 1.0
-    """CPU time of building and training each."""
+    """CPU time of building and training each policy."""
     chunk: int = 50
-    """Actions predicted at once."""
+    """Number of actions predicted at once."""
     executed: tuple[int, ...] = (25, 10)
-    """Of these, how many are carried out before the next prediction."""
+    """Numbers of these actions that are executed before the next prediction."""
     every: int = 5
-    """Of the episodes every so many is held out."""
+    """Every n-th episode is held out."""
     batch_size: int = 64
-    """Samples in each step of training."""
+    """Number of samples in each training step."""
     state: str = STATE
     """Column of the states."""
     action: str = ACTION
     """Column of the actions."""
     seed: int = 0
-    """Of weights and batches."""
+    """Seed of weights and batches."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -115,7 +116,7 @@ def main(args: Args) -> None:
 def _actor(
     name: str, shown: list[Episode], fps: float, stats: dict[str, dict[str, Tensor]], args: Args
 ) -> tuple[Actor, int, float]:
-    """Who acts, the steps it was trained for, and the CPU time that took [s]."""
+    """Actor, number of training steps, and CPU time of the training [s]."""
     if name == "nearest":
         begun = time.process_time()
         return Nearest(shown, stats, args.chunk), 0, time.process_time() - begun
@@ -154,20 +155,22 @@ def _jerk(x: Float[Tensor, "T A"], fps: float) -> Float[Tensor, "T3 A"]:
 
 
 def _at_seams(jerk: Float[Tensor, "T3 A"], executed: int) -> Float[Tensor, "n A"]:
-    """Third difference k is of the actions k to k + 3; a seam is before action m executed."""
+    """Third differences at seams. Difference k is of the actions k to k + 3; a seam is before
+    every `executed`-th action.
+    """
     k = torch.arange(len(jerk))
     return jerk[(k + 3 >= executed) & ((k + 3) % executed < 3)]
 
 
 class Actor(Protocol):
-    """Acts on one state after the other."""
+    """Executes actions for one state after another."""
 
     def begin(self, executed: int) -> None:
-        """Begin an episode, with so many actions carried out of each chunk."""
+        """Begin an episode; `executed` actions of each chunk are executed."""
         ...
 
     def act(self, state: Float[Tensor, "F"]) -> Float[Tensor, "A"]:
-        """What to do in a state, which is that after the last action."""
+        """Action in a state, which follows the last action."""
         ...
 
 
@@ -189,18 +192,18 @@ def learn(
     seed: int = 0,
     state_noise: float = 0.0,
 ) -> Learned:
-    """A policy of LeRobot or ours, trained from memory as lerobot-train does it.
+    """Train a policy of LeRobot or ours from memory, as lerobot-train does.
 
     Args:
-        name: Of a policy that `config_of` knows.
-        shown: Demonstrations to learn from, with the environment's state where it is known.
-        fps: Their frames a second.
+        name: Name of a policy in `config_of`.
+        shown: Demonstrations to learn from, with the environment's state if it is known.
+        fps: Frames per second of the demonstrations.
         minutes: CPU time of building and training.
-        chunk: Actions predicted at once.
-        executed: Of these, how many are to be carried out.
-        batch_size: Samples in each step of training.
-        seed: Of weights and batches.
-        state_noise: Of `motion_chunk`.
+        chunk: Number of actions predicted at once.
+        executed: Number of these actions that are executed.
+        batch_size: Number of samples in each training step.
+        seed: Seed of weights and batches.
+        state_noise: Noise on the state in the training of `motion_chunk`.
     """
     torch.manual_seed(seed)
     stats = statistics(shown)
@@ -211,7 +214,8 @@ def learn(
     config = config_of(name, shown[0], fps, chunk, executed, state_noise)
     stands_in = ENVIRONMENT in config.input_features and ENVIRONMENT not in shown[0]
     if stands_in:
-        # ACT and Diffusion demand images or the environment's state: they get the state there.
+        # ACT and Diffusion require images or the environment's state: the state is passed as
+        # such.
         stats = stats | {ENVIRONMENT: stats[STATE]}
         shown = [e | {ENVIRONMENT: e[STATE]} for e in shown]
     begun = time.process_time()
@@ -233,14 +237,14 @@ class Learned:
     before: Any
     after: Any
     stands_in: bool
-    """Whether the state stands in for that of the environment."""
+    """True if the state is also passed as the environment's state."""
     steps: int = 0
-    """It was trained for."""
+    """Number of training steps."""
     seconds: float = 0.0
-    """CPU time that took."""
+    """CPU time of the training [s]."""
 
     def save(self, folder: Path) -> None:
-        """As a checkpoint of LeRobot."""
+        """Save the policy as a LeRobot checkpoint."""
         for part in (self.policy, self.before, self.after):
             part.save_pretrained(folder)
 
@@ -255,7 +259,7 @@ class Learned:
 
 
 class Nearest:
-    """The chunk that was shown after the state most like the one seen."""
+    """Repeats the chunk that was demonstrated after the most similar state."""
 
     def __init__(
         self, shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
@@ -286,7 +290,7 @@ def config_of(
     executed: int,
     state_noise: float = 0.0,
 ) -> Any:
-    """Settings of a policy that predicts so many actions and carries out so many of them."""
+    """Configuration of a policy with these numbers of predicted and executed actions."""
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies import ACTConfig, DiffusionConfig
 
@@ -347,7 +351,7 @@ def train(
     batch_size: int,
     seed: int,
 ) -> int:
-    """As lerobot-train does it, with batches from memory, until so much CPU time has passed.
+    """Train as lerobot-train does, with batches from memory, for a given CPU time.
 
     The learning rate falls along a cosine over that time.
     """

@@ -1,11 +1,11 @@
 """Compare the policy `dmp` with a small ACT, trained on the same demonstrations.
 
-A scripted expert shows a job in simulation, such as grasping an object that lies anywhere and
-is seen once. Policies learn from one demonstration and from more, and then do the job from
-beginnings they have not seen. Reported are successes, by MuJoCo's contacts, the distance of
-the end effector from the path that the expert takes from there, and how abruptly commands
-change where one chunk follows another. For those that are trained, the file of figures also
-says what the loss was at first, half-way and at last.
+A scripted expert demonstrates a task in simulation, such as grasping an object at a random
+place that is observed once. Policies learn from one demonstration or more, and then perform the
+task from new starts. Reported are the success rate by MuJoCo's contacts, the distance of the
+end effector from the expert's path, and the change of commands where chunks meet. For trained
+policies, the file of measured values also contains the loss at the beginning, at half time and
+at the end of the training.
 """
 
 from __future__ import annotations
@@ -35,51 +35,52 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 from hrc_learn import cli
 from hrc_learn.kinematics import panda
 
-# LeRobot takes ten seconds to import: only once there is something to do.
+# LeRobot takes ten seconds to import, so it is imported only when needed.
 if TYPE_CHECKING:
     from hrc_learn.lerobot.envs import ArmEnvConfig
 
 STATE, ACTION = "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
 HELD_OUT = 1000
-"""Number of the first beginning that no policy learns from."""
+"""Number of the first start that no policy learns from."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     data: Path
-    """Folder of the demonstrations; recorded into it where it does not hold them."""
+    """Folder of the demonstrations, which are recorded if they are missing."""
     task: Literal["grasping", "placing"] = "grasping"
-    """What is shown and done."""
+    """Task of the demonstrations and policies."""
     demonstrations: tuple[int, ...] = (1, 10)
-    """How many to learn from."""
+    """Numbers of demonstrations to learn from."""
     beginnings: int = 10
-    """How many to do the job from that were not learned from."""
+    """Number of new starts from which the task is performed."""
     policies: tuple[str, ...] = ("dmp-fit", "dmp", "act")
-    """dmp-fit: in closed form; dmp: trained from there; act: a small one."""
+    """dmp-fit: in closed form; dmp: trained from the closed form; act: a small ACT."""
     steps: int = 1000
-    """Of training, over which the learning rate falls to nothing along a cosine."""
+    """Number of training steps, over which the learning rate falls to zero along a cosine."""
     batch_size: int = 32
-    """Samples in each step of training."""
+    """Number of samples in each training step."""
     fps: int = 25
-    """Commands a second."""
+    """Commands per second."""
     seed: int = 0
-    """Of weights and batches."""
+    """Seed of weights and batches."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """How a policy did from beginnings it had not seen."""
+    """Results of a policy from new starts."""
 
     success: float
     """Share."""
     path_mm: float
-    """Of the end effector from the expert's at the same time, root mean square [mm]."""
+    """Distance of the end effector from the expert's path at the same time, root mean square
+    [mm]."""
     seam: float
-    """Largest change of the joints' commanded velocity where chunks meet, over the largest
-    within chunks."""
+    """Largest change of the joints' commanded velocity where chunks meet, relative to the
+    largest change within chunks."""
     jerk: float
     """Root mean square of the third difference of the joints' commands where chunks meet
     [rad/s^3]."""
@@ -89,11 +90,11 @@ class Figures:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Done:
-    """What came of one beginning."""
+    """Result from one start."""
 
     success: bool
     joints: Float[Tensor, "T 7"]
-    """As measured before each command [rad]."""
+    """Joint positions measured before each command [rad]."""
     commands: Float[Tensor, "T 7"]
     """[rad]"""
 
@@ -129,7 +130,7 @@ def _recorded(args: Args, env: ArmEnvConfig, first: int, count: int) -> Path:
         robot = replace(env.robot_config(), seed=first)
         shown = record_expert(folder, robot, count)
         for _, succeeded in track(shown, f"Recording {folder.name}", total=count):
-            # One shown again from elsewhere would no longer belong to its beginning.
+            # A demonstration from another start would not belong to this number.
             if not succeeded:
                 raise RuntimeError(f"the expert failed from a beginning after {first}")
     return folder
@@ -155,9 +156,9 @@ def _measure(
 def _policy(
     name: str, dataset: Path, args: Args
 ) -> tuple[Any, Callable[[Tensor | None], Any], dict[str, float]]:
-    """A trained policy's settings, what maps states to actions, and the losses of training.
+    """Settings of a trained policy, its map from states to actions, and its training losses.
 
-    Of None instead of a state, the policy resets.
+    None instead of a state resets the policy.
     """
     from lerobot.datasets import LeRobotDatasetMetadata
     from lerobot.policies import make_policy, make_pre_post_processors
@@ -184,9 +185,10 @@ def _policy(
 
 
 def _blind_to_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Statistics by which a component that never changed, as in one demonstration, is no input.
+    """Statistics with which a component that never changes is not used as an input.
 
-    LeRobot divides by its spread of nothing, and the policy would be thrown anywhere.
+    In a single demonstration, components may be constant. LeRobot would divide by their spread
+    of zero, and the policy's actions would be arbitrary.
     """
     from hrc_learn.lerobot.policy.observation_encoder import SMALLEST_SPREAD
 
@@ -194,7 +196,7 @@ def _blind_to_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _observation(state: Tensor) -> dict[str, Tensor]:
-    """ACT demands images or the environment's state: it gets the state there as well."""
+    """Observation with the state also as the environment's state, which ACT requires."""
     return {STATE: state, ENVIRONMENT: state}
 
 
@@ -204,7 +206,7 @@ def _config(name: str, width: int) -> Any:
 
     from hrc_learn.lerobot import DMPConfig
 
-    # One second a chunk, of which half is carried out.
+    # A chunk lasts one second; half of it is executed.
     common = {"chunk_size": 25, "n_action_steps": 12, "device": "cpu", "push_to_hub": False}
     match name:
         case "dmp" | "dmp-fit":
@@ -213,7 +215,8 @@ def _config(name: str, width: int) -> Any:
             return ACTConfig(
                 **common,
                 input_features={ENVIRONMENT: PolicyFeature(FeatureType.ENV, (width,))},
-                # By default it takes the environment's state as it is, here hundreds of pixels.
+                # By default, the environment's state is not normalised; here it has values of
+                # hundreds of pixels.
                 normalization_mapping=dict.fromkeys(
                     ("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD
                 ),
@@ -229,7 +232,9 @@ def _config(name: str, width: int) -> Any:
 
 
 def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
-    """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
+    """Train as lerobot-train does, with batches from memory; returns mean losses at stages of
+    it.
+    """
     from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     config = policy.config
@@ -287,11 +292,12 @@ def _path_error(made: Sequence[Tensor], shown: Sequence[Tensor]) -> float:
 
 
 def _seams(commands: Sequence[Tensor], chunk: int, fps: int) -> dict[str, float]:
-    """Of commands in chunks of so many: `Figures.seam` and `Figures.jerk`."""
+    """`Figures.seam` and `Figures.jerk` of commands that come in chunks of this length."""
     at_seams, within, jerk = [], [], []
     for q in commands:
         change = q.double().diff(n=2, dim=0).abs().amax(-1)
-        # Change k is of the commands k, k + 1 and k + 2; a seam is before command m chunk.
+        # Change k is of the commands k, k + 1 and k + 2; a seam is before every `chunk`-th
+        # command.
         crosses = (torch.arange(len(change)) + 2) % chunk < 2
         at_seams.append(change[crosses].max())
         within.append(change[~crosses].max())

@@ -1,8 +1,9 @@
-"""Pulls at the elbow as forces (the transposed Jacobian) and as the paper's velocities (its
-pseudo-inverse): how fast and how far the elbow moves, and whether against the pull.
+"""Compare two mappings of pulls at the elbow: forces (transposed Jacobian) and the paper's
+velocities (pseudo-inverse).
 
-A gizmo displaced as far asks for either: 150 N/m, at most 45 N, or 2 1/s, at most 0.25 m/s. The
-arm does as it is told, its end effector stays.
+Measured are the speed and displacement of the elbow, and motion against the pull. A gizmo with
+the same displacement requests a force (150 N/m, at most 45 N) or a velocity (2 1/s, at most
+0.25 m/s). The arm follows exactly, and its end effector stays in place.
 """
 
 import os
@@ -30,19 +31,20 @@ from hrc_learn.teleoperation.hand_guiding import ForceMapping, force_to_nullspac
 from hrc_learn.teleoperation.scripted_demonstrations import ELBOW_FORCES
 
 _MAPPINGS: tuple[ForceMapping, ...] = get_args(ForceMapping)
-_ELBOW = 4  # joint, counted from 1
-_FORCE = InteractionForceConfig().max_force  # [N]
-_STILL = 1e-4  # slower than this the elbow moves nowhere [m/s]
-# Of a motion in time: step [s], fastest joint [rad/s], room that is left before limits [rad].
+_ELBOW = 4  # pulled joint, counted from 1
+_FORCE = InteractionForceConfig().max_force  # force [N]
+_STILL = 1e-4  # speed below which the elbow counts as at rest [m/s]
+# Simulated motion: step [s], largest joint speed [rad/s], distance kept from joint limits
+# [rad].
 _DT, _FASTEST, _ROOM = 0.01, 1.0, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     directions: int = 2000
-    """Directions of a pull, in each place."""
+    """Number of pull directions at each place."""
     seeds: int = 10
-    """Of random pulls, 40 s each."""
+    """Number of seeds of random pulls, 40 s each."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -73,7 +75,9 @@ def main(args: Args) -> None:
 def _all_directions(
     postures: Sequence[Tensor], mapping: ForceMapping, count: int
 ) -> tuple[float, float]:
-    """Share of the pulls that move the elbow against them [%], and its median speed [mm/s]."""
+    """Fraction of the pulls that move the elbow against the pull [%], and median elbow speed
+    [mm/s].
+    """
     rng, config = np.random.default_rng(0), InteractionForceConfig(mapping=mapping)
     lower, upper = panda.limits.lower.numpy(), panda.limits.upper.numpy()
     against, speeds = 0, []
@@ -89,7 +93,7 @@ def _all_directions(
 
 
 def _scripts(workplace: Workplace, seeds: int, figures: dict[str, float]) -> Table:
-    """Pulls of scripted people, one after the other or each by itself."""
+    """Pulls of scripted people, one after another or each alone."""
     table = Table("scripted pulls", "mapping", "elbow mm, median", "p95", "time against [%]")
     alone = [
         (replace(pull, start=0.0),)
@@ -115,7 +119,9 @@ def _scripts(workplace: Workplace, seeds: int, figures: dict[str, float]) -> Tab
 def _pulled(
     start: Tensor, script: Sequence[ScriptedForce], mapping: ForceMapping
 ) -> tuple[float, float]:
-    """How far pulls move the elbow [mm], and the share of time against them [%]."""
+    """Displacement of the elbow by pulls [mm], and fraction of the time of motion against them
+    [%].
+    """
     q, pose, config = start, panda.forward(start), InteractionForceConfig(mapping=mapping)
     first, limits = panda.joint_origins(q)[_ELBOW - 1], panda.limits
     furthest, moving, against = 0.0, 0, 0

@@ -1,9 +1,9 @@
-"""A person who pushes the arm itself: where the elbow goes, and whether a held hand pauses.
+"""A person pushes the arm itself: displacement of the elbow, and pauses by pushes at the hand.
 
-The arm, with the nominal imperfections of a laboratory in MuJoCo, holds an object and goes to
-and fro along a path of the joints drawn at random. For some seconds a force acts on its elbow,
-along the way the null space lets it go, or on its hand, in any direction. Nothing but the
-torques of the joints tells of it.
+The arm, with the nominal imperfections of a laboratory in MuJoCo, holds an object and moves
+back and forth along a random joint path. For some seconds a force acts on its elbow, in the
+direction in which the null space can yield, or on its hand, in a random direction. Only the
+torques of the joints show the force.
 """
 
 from __future__ import annotations
@@ -34,34 +34,35 @@ from hrc_learn.teleoperation import Touch, TouchConfig
 from hrc_learn.teleoperation.scripted_expert import ScriptedForce
 
 ELBOW = 4
-"""Joint whose origin it is, counted from 1."""
+"""Joint whose origin is the elbow, counted from 1."""
 BEGIN, RISE = 1.0, 0.3
-"""When a push begins, and how long its force takes to come and to go [s]."""
+"""Start of a push, and time for which its force rises and falls [s]."""
 LASTS = {"elbow": 4.0, "hand": 1.6}
-"""How long it acts [s]."""
+"""Duration of a push [s]."""
 WAY, TIME = 0.3, 4.0
-"""Most that a joint goes [rad], and the time it has for it, there and back each [s]."""
+"""Largest displacement of a joint [rad], and the time for the way there, and again for the way
+back [s]."""
 ENOUGH = 0.15
-"""Way of an elbow that has got out of somebody's way [m]."""
+"""Displacement of an elbow that counts as moved out of the way [m]."""
 NOMINAL = Imperfections.nominal()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     pushes: int = 50
-    """Of elbow and hand each."""
+    """Number of pushes at the elbow, and of pushes at the hand."""
     first_seed: int = 0
-    """Of path, push and imperfections."""
+    """First seed of path, push and imperfections."""
     force: float = 20.0
     """[N]"""
     config: TouchConfig = field(default_factory=TouchConfig)
-    """What counts as a touch."""
+    """Thresholds of a touch."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 class Listener(Human):
-    """Touch, and when the task was paused."""
+    """Touch that records when the task was paused."""
 
     def __init__(self, touch: Touch):
         self._touch = touch
@@ -69,7 +70,7 @@ class Listener(Human):
         self.elbow_felt: list[float] = []
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the touch asks for."""
+        """Input requested by the touch."""
         asked = self._touch.read(state)
         if asked.pause:
             self.paused.append(state.time)
@@ -83,7 +84,7 @@ class Listener(Human):
 
 
 def main(args: Args) -> None:
-    """Push, print a table, write the figures."""
+    """Push, print a table, and write the measured values."""
     figures: dict[str, float] = {}
     seeds = range(args.first_seed, args.first_seed + args.pushes)
     for where in ("elbow", "hand"):
@@ -98,7 +99,7 @@ def main(args: Args) -> None:
 
 
 def push(where: Literal["elbow", "hand"], seed: int, args: Args) -> dict[str, Any]:
-    """One push, in SI units."""
+    """Results of one push, in SI units."""
     rng = np.random.default_rng([seed, 0])
     workplace = Workplace()
     world = World(workplace.scene, NOMINAL.draw(np.random.default_rng(seed)))
@@ -157,7 +158,7 @@ def push(where: Literal["elbow", "hand"], seed: int, args: Args) -> dict[str, An
 
 
 def apply(world: World, where: str, force: np.ndarray) -> None:
-    """Put the force on its body, as strong as it is by now."""
+    """Apply the force to its body, at its present strength."""
     data, body = world.data, world.model.body({"elbow": "link4", "hand": "hand"}[where]).id
     edge = min(data.time - BEGIN, BEGIN + LASTS[where] - data.time) / RISE
     at = data.xpos[body] if where == "elbow" else data.site("tcp").xpos
@@ -167,7 +168,7 @@ def apply(world: World, where: str, force: np.ndarray) -> None:
 
 
 def aside(cell: WorkCell) -> tuple[np.ndarray, np.ndarray]:
-    """Of elbow and hand from the path at each step on it [m]."""
+    """Distances of elbow and hand from the path at each step [m]."""
     on = np.isfinite(cell.log["path_joints"][:, 0])
     q, path = (
         torch.from_numpy(cell.log[name][on]) for name in ("joint_position", "path_joints")
@@ -178,7 +179,7 @@ def aside(cell: WorkCell) -> tuple[np.ndarray, np.ndarray]:
 
 
 def summary_of_elbow(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """How far elbows went, and hands."""
+    """Displacements of elbows and hands."""
     roomy = [row for row in rows if row["room"] >= ENOUGH]
     return {
         "elbow_pushes": float(len(rows)),
@@ -196,7 +197,7 @@ def summary_of_elbow(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def summary_of_hand(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """How many paused the task, and when."""
+    """Number of pushes that paused the task, and the times of the pauses."""
     paused = [row for row in rows if row["paused"] is not None and not row["stopped"]]
     return {
         "hand_pushes": float(len(rows)),

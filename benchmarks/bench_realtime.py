@@ -1,16 +1,17 @@
-"""A chunking policy carried out in closed loop, however often and however late it is asked.
+"""A chunking policy in closed loop, with different request rates and delays.
 
-`motion_chunk` learns from a dataset of `hrc record expert` and does its task in MuJoCo, in
-simulated time, from beginnings that were not shown. It is asked every 5, 10, 25 or 50 actions,
-is forgetful once in mid-task (`reset`, as LeRobot's DAgger does), or thinks for 300 ms, in
-which the arm goes on:
+`motion_chunk` learns from a dataset of `hrc record expert` and performs its task in MuJoCo, in
+simulated time, from starts that were not demonstrated. A chunk is requested every 5, 10, 25 or
+50 actions; or the policy is reset once during the task, as in LeRobot's DAgger; or each chunk
+takes 300 ms to compute, while the arm continues:
 
-    real-time   LeRobot's queue for real-time chunking: what is left of the last chunk is told
-    unaware     the same delay, but the policy is not told of it: each chunk begins anew from
-                what is seen, and is carried out from where it would be by then
+    real-time   LeRobot's queue for real-time chunking, which passes the rest of the last chunk
+    unaware     the same delay, but the policy does not know it: each chunk starts at the
+                observation, and its execution starts at the action that is due by then
 
-Reported are successes, the largest step from one action to the next where chunks meet, over the
-largest step in the demonstrations, of the component where that is most, and the same anywhere.
+Reported are the success rate, the largest step between actions where chunks meet, and the
+largest step anywhere. Steps are relative to the largest step in the demonstrations, for the
+component with the largest ratio.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from rich.table import Table
 from hrc_learn import cli
 
 FIRST_SEED = 50_000
-"""Beginnings that were not shown: demonstrations count from 0."""
+"""First seed of starts that were not demonstrated: demonstrations use seeds from 0 on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,24 +45,24 @@ class Args:
     data: Path
     """Dataset of `hrc record expert`."""
     scenario: str = "placing"
-    """That it shows."""
+    """Scenario of the dataset."""
     minutes: float = 1.0
     """CPU time of training."""
     rollouts: int = 10
-    """Of each kind, from the same beginnings."""
+    """Number of episodes of each kind, from the same starts."""
     periods: tuple[int, ...] = (5, 10, 25, 50)
-    """Actions carried out before the policy is asked again."""
+    """Numbers of actions executed before the next request."""
     delay: float = 0.3
-    """Time that the policy thinks [s]."""
+    """Time for which the policy computes [s]."""
     seed: int = 0
-    """Of weights and batches."""
+    """Seed of weights and batches."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass
 class Executed:
-    """What came of one kind of execution."""
+    """Results of one kind of execution."""
 
     successes: int = 0
     seam: float = 0.0
@@ -69,7 +70,7 @@ class Executed:
 
 
 type Stepper = Callable[[dict[str, Any]], tuple[np.ndarray, bool]]
-"""From an observation to an action, and whether a chunk begins with it."""
+"""Map from an observation to an action, and a flag for the first action of a chunk."""
 
 
 def main(args: Args) -> None:
@@ -152,7 +153,9 @@ def _roll_out(env: Any, step: Stepper, seed: int, largest: np.ndarray, total: Ex
 
 
 def _selecting(policy: Any, period: int, reset_at: int | None = None) -> Stepper:
-    """LeRobot's synchronous way: a chunk when the last one is used up, in no time."""
+    """Steps of LeRobot's synchronous execution: a chunk is requested when the last one is used
+    up, without delay.
+    """
     policy.config.n_action_steps = period
     policy.reset()
     calls = 0
@@ -169,10 +172,10 @@ def _selecting(policy: Any, period: int, reset_at: int | None = None) -> Stepper
 
 
 def _real_time(policy: Any, delay: int, horizon: int, *, told: bool) -> Stepper:
-    """LeRobot's queue of real-time chunking, in simulated time.
+    """Steps of LeRobot's queue for real-time chunking, in simulated time.
 
-    A chunk is begun when so many of the last one's actions have been carried out, and is there
-    after `delay` more.
+    A chunk is requested when a given number of the last chunk's actions have been executed, and
+    arrives after `delay` further actions.
     """
     from lerobot.policies.rtc.action_queue import ActionQueue
     from lerobot.policies.rtc.configuration_rtc import RTCConfig
@@ -195,7 +198,7 @@ def _real_time(policy: Any, delay: int, horizon: int, *, told: bool) -> Stepper:
     def step(batch: dict[str, Any]) -> tuple[np.ndarray, bool]:
         nonlocal thinking, done
         begins = False
-        if queue.empty():  # nothing moves before the first chunk is there
+        if queue.empty():  # the arm waits for the first chunk
             chunk = think(batch)
             queue.merge(chunk, chunk, 0)
             done, begins = 0, True

@@ -1,7 +1,8 @@
-"""Public recordings through `hrc import`: columns right, asked about and wrong, and training.
+"""Import public recordings with `hrc import`: count correct, unclear and wrong columns; train.
 
-The meaning of every column was found by hand, from the sources named here. The files are not
-part of the project: put each repository, or the files named, into a folder as OWNER+NAME.
+The meaning of every column was determined by hand, from the sources named in this file. The
+recordings are not part of the project: put each repository, or the named files, into a folder
+OWNER+NAME.
 
     python benchmarks/bench_recordings.py --folder FOLDER --train --json figures.json
 """
@@ -31,21 +32,22 @@ STATE_AND_ACTION = {"observation.state": "?", "action": "?"}
 
 @dataclass(frozen=True, kw_only=True)
 class Public:
-    """One public recording and what it holds."""
+    """One public recording and its contents."""
 
     path: str
-    """File or folder below the folder of all."""
+    """File or folder below the folder of all recordings."""
     licence: str
     expected: dict[str, str]
     """Quantity -> unit on disk; "?" for columns that nothing documents, kept as recorded."""
     options: ImportOptions = field(default_factory=ImportOptions)
-    """What its user has to know and say."""
+    """Options that a user has to know and give."""
     columns: tuple[str, ...] = ()
 
 
 RECORDINGS = (
     Public(
-        path="mosesnah-shared+ModularRobotControl/pour_demo1.npz",  # its text file as t and q
+        # columns t and q of the text file
+        path="mosesnah-shared+ModularRobotControl/pour_demo1.npz",
         licence="MIT",
         expected={"joint_position": "rad"},
     ),
@@ -67,7 +69,7 @@ RECORDINGS = (
         expected=STATE_AND_ACTION,
         options=ImportOptions(fps=5),
     ),
-    Public(  # xArm: millimetres and degrees, by the maker's SDK
+    Public(  # xArm: millimetres and degrees, by the manufacturer's SDK
         path="BAEK26+lfd/data/first_attempt_pouring",
         licence="none stated",
         expected={
@@ -78,7 +80,7 @@ RECORDINGS = (
         },
         options=ImportOptions(units={"position": "mm"}),
     ),
-    Public(  # UR: RTDE guide of the maker
+    Public(  # UR: the manufacturer's RTDE guide
         path="moelyaakoubi+GUI-RTDE/robot_data.csv",
         licence="none stated",
         expected={
@@ -153,7 +155,7 @@ def main(args: Args) -> int:
 
 
 def judged(path: Path, public: Public) -> Counter[str]:
-    """Quantities that are right, asked about and wrong without a word from the user."""
+    """Quantities that are correct, unclear (the import asks) and wrong, without user input."""
     silent = ImportOptions(fps=public.options.fps, duration=public.options.duration)
     try:
         return compared(plan_import([path], silent, public.columns), public)
@@ -162,7 +164,7 @@ def judged(path: Path, public: Public) -> Counter[str]:
 
 
 def compared(plan: ImportPlan, public: Public) -> Counter[str]:
-    """The same for a plan."""
+    """The same counts for a plan."""
     meaning, counts = plan.meaning, Counter[str]()
     found = {role: decision.unit for role, decision in meaning.decisions.items()}
     found |= dict.fromkeys(meaning.kept, "?")

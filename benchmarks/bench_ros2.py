@@ -59,7 +59,7 @@ def stream(seconds: float, hostile: float) -> dict[str, float]:
         words = ["-m", "hrc_learn.cli", "serve", "--ros2", "--duration", str(seconds)]
         command = [sys.executable, *words, "--json", str(of_node)]
         with _robot("--hostile", str(hostile), "--json", str(of_robot)):
-            # A stop by a fault is the defined one: the node stays, and its figures end there.
+            # A fault stops the arm as specified: the node stays, and its values end there.
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         node, seen = (
             json.loads(of_node.read_text("utf-8")),

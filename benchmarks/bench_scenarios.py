@@ -1,8 +1,8 @@
-"""What other libraries test or demonstrate, done with theirs and with ours.
+"""Tests and examples of other libraries, computed with these libraries and with ours.
 
 Scenarios are those of the tests and examples of movement-primitives 0.9.1 and MP_PyTorch 0.1.4
-(`SCENARIOS` names the files), set up anew; both columns are the same figure of the same data.
-What is not installed shows no figure.
+(`SCENARIOS` names the files), set up anew. Both columns are the same measure on the same data.
+The column of a library that is not installed is empty.
 """
 
 import os
@@ -45,7 +45,7 @@ class Args:
 
 @dataclass(frozen=True)
 class Scenario:
-    """One of theirs, and what is measured."""
+    """A scenario of another library, and its measure."""
 
     name: str
     figure: str
@@ -72,7 +72,7 @@ def main(args: Args) -> None:
         cli.write_json(args.json, {k: x for k, x in figures.items() if not np.isnan(x)})
 
 
-# Of movement-primitives.
+# Scenarios of movement-primitives.
 
 
 def waves(end: float, n: int, fast: float = 2.5, slow: float = 1.5) -> tuple[Tensor, Tensor]:
@@ -182,7 +182,7 @@ def their_coupling() -> float:
 
 
 def our_coupling() -> float:
-    """The first coordinate leads, the second follows at the distance."""
+    """The first coordinate is followed by the second at the distance."""
     dmp, gain = JointDMP.fit(*waves(2.0, 101), 50), 20.0
     state, apart = dmp.initial_state(), []
     wanted = torch.tensor([0.5], dtype=F64)
@@ -220,7 +220,7 @@ def their_obstacle() -> float:
 
 
 def our_obstacle() -> float:
-    """All starts in one batch; without a shape of its own, as theirs."""
+    """All starts in one batch, with a spherical obstacle as in the other library."""
     starts = torch.from_numpy(obstacle_starts())
     t = torch.linspace(0, 1, 101, dtype=F64)
     still = JointDMP.fit(t, torch.zeros(101, 3, dtype=F64), 10)
@@ -252,7 +252,7 @@ def their_via_points() -> float:
 
 
 def our_via_points() -> float:
-    """At times of their own, which theirs does not promise."""
+    """Via points at given times, which the other library does not guarantee."""
     t = torch.linspace(0, 3, 301, dtype=F64)
     ends = torch.from_numpy(line(2))
     s = (t / 3)[:, None]
@@ -313,7 +313,7 @@ def our_condition() -> float:
 
 
 def contexts() -> tuple[Tensor, Tensor, Tensor]:
-    """Waves that a context shifts and widens, and the context."""
+    """Waves that a context shifts and widens, and their contexts."""
     t, c = torch.linspace(0, 1, 101, dtype=F64), torch.linspace(0, 1, 12, dtype=F64)
     y = c[:, None] * (torch.pi * t).sin() ** 2 + (1 + c[:, None]) * t
     return t, y[..., None], c[:, None]
@@ -345,7 +345,7 @@ def wanted_at(t: np.ndarray, c: float) -> np.ndarray:
 
 
 def pose_demonstration() -> tuple[Tensor, Tensor, Tensor]:
-    """A reach along y, turning from one axis to another."""
+    """A reach along y that rotates from one axis to another."""
     t = torch.linspace(0, 1, 1001, dtype=F64)
     s = 0.5 * ((1.5 * torch.pi * (t - 0.5)).tanh() + 1)
     position = torch.stack([0 * t + 0.6, -0.2 + 0.4 * s, 0 * t + 0.45], -1)
@@ -394,7 +394,7 @@ def our_saved() -> float:
     return (again.rollout().position - dmp.rollout().position).abs().max().item()
 
 
-# Of MP_PyTorch.
+# Scenarios of MP_PyTorch.
 
 
 def their_prodmp(learn_tau: bool = False, dtype: torch.dtype = torch.float32) -> Any:
@@ -431,7 +431,8 @@ def our_weights() -> float:
 
 
 TAU = 3.17
-"""[s]; at 3.2 times fall on knots of their table, where it has no derivative."""
+"""Duration [s]; with 3.2, times would fall on knots of the other library's table, where it has
+no derivative."""
 
 
 def their_duration_gradient() -> float:
@@ -440,7 +441,7 @@ def their_duration_gradient() -> float:
     still = torch.zeros(1, 2, dtype=F64)
 
     def path(tau: Tensor) -> Tensor:
-        mp = their_prodmp(True, F64)  # one that has been used keeps its duration
+        mp = their_prodmp(True, F64)  # an instance that has been used keeps its duration
         mp.update_inputs(t, torch.cat([tau, weights], -1), None, t[:, 0], still, still)
         return mp.get_traj_pos()
 
@@ -458,7 +459,7 @@ def our_duration_gradient() -> float:
 
 
 def gradient_error(path: Callable[[Tensor], Tensor], tau: Tensor, h: float) -> float:
-    """Of the sum of squares, against central differences; relative."""
+    """Relative error of the gradient of the sum of squares, against central differences."""
     tau = tau.requires_grad_()
     exact = torch.autograd.grad(path(tau).square().sum(), tau)[0].sum()
     with torch.no_grad():
@@ -471,7 +472,7 @@ NOW, RATE = torch.tensor([[4.0, 5.5]]), torch.tensor([[-1.0, 2.0]])
 
 
 def state_error(position: Tensor, velocity: Tensor) -> float:
-    """Of where a motion begins that was to begin at `NOW` and `RATE`."""
+    """Error of the initial state of a motion that should start at `NOW` and `RATE`."""
     return max((position - NOW).abs().max(), (velocity - RATE).abs().max()).item()
 
 

@@ -1,21 +1,21 @@
-"""What smoothing makes of policies' chunks at the rate of the motors, beside what else is used.
+"""Compare ways to convert the chunks of policies to setpoints at the rate of the motors.
 
-Of each LeRobot dataset every fifth episode is held out. Policies of LeRobot and ours learn from
-the others, see the states of those held out go by, and chunk by chunk say what to do. Their
-actions are led to the motors in several ways, all from the same actions:
+Every fifth episode of each LeRobot dataset is held out. Policies of LeRobot and ours learn from
+the others, observe the states of the held-out episodes, and predict chunks of actions. The same
+actions are converted to setpoints in several ways:
 
-    hold         each action at once, as LeRobot does
-    line         from action to action, LeRobot's interpolation_multiplier
-    average      exponential moving average of actions, then as line
-    ensemble     ACT's temporal ensembling, LeRobot's own, then as line
-    spline       on a B-spline, without a filter
-    smooth D, L  `ActionUpsampler` on a curve of degree D, L actions late
+    hold         each action immediately, as in LeRobot
+    line         lines between actions, LeRobot's interpolation_multiplier
+    average      exponential moving average of actions, then lines
+    ensemble     ACT's temporal ensembling, from LeRobot, then lines
+    spline       a B-spline, without a filter
+    smooth D, L  `ActionUpsampler` with a curve of degree D, L actions late
 
-Reported at the rate of the motors: how many setpoints break a limit of velocity, acceleration
-or jerk, by how much at most; how late the motion is, which is the shift with which it is
-nearest to the actions as they were asked for; how far it is from them after this shift; and how
-far it is from what was demonstrated, without one. Limits are the demonstrators'.
-No robot moves: what a policy does is not seen by it.
+Reported at the rate of the motors are the number of setpoints beyond a limit of velocity,
+acceleration or jerk, and the largest excess; the delay of the motion, which is the shift with
+which it is nearest to the requested actions; its error to them after this shift; and its error
+to the demonstration, without a shift. Limits are those of the demonstrators. No robot moves,
+and actions do not affect later states.
 """
 
 from __future__ import annotations
@@ -55,39 +55,39 @@ AVERAGE = 0.3
 ENSEMBLE = 0.01
 """Coefficient of temporal ensembling, ACT's own."""
 LATEST = 6
-"""Actions up to which a motion may be late, to be found."""
+"""Largest delay of a motion that is searched for [actions]."""
 ROUNDING = 1 + 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     data: tuple[Path, ...]
-    """Folders of LeRobot datasets, one a robot."""
+    """Folders of LeRobot datasets, one per robot."""
     policies: tuple[str, ...] = ("act", "diffusion", "dmp", "motion_chunk")
-    """To learn from each; diffusion needs LeRobot's extra of that name."""
+    """Policies that learn from each dataset; diffusion needs LeRobot's extra of that name."""
     chunks: int = 1000
-    """In all: as many of each policy on each robot."""
+    """Number of all chunks, the same for each policy and robot."""
     minutes: float = 0.5
-    """CPU time of building and training each."""
+    """CPU time of building and training each policy."""
     chunk: int = 32
-    """Actions predicted at once."""
+    """Number of actions predicted at once."""
     executed: int = 16
-    """Of these, how many are carried out before the next prediction."""
+    """Number of these actions that are executed before the next prediction."""
     rate: float = 250.0
-    """Setpoints a second."""
+    """Setpoints per second."""
     every: int = 5
-    """Of the episodes every so many is held out."""
+    """Every n-th episode is held out."""
     batch_size: int = 64
-    """Samples in each step of training."""
+    """Number of samples in each training step."""
     seed: int = 0
-    """Of weights and batches."""
+    """Seed of weights and batches."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """What a policy asked for in an episode, and what was demonstrated; in actions."""
+    """Requested and demonstrated actions of an episode."""
 
     asked: np.ndarray
     ensembled: np.ndarray | None
@@ -96,12 +96,12 @@ class Played:
 
 @dataclass
 class Score:
-    """Of one way, over episodes."""
+    """Score of one way over all episodes."""
 
     setpoints: int = 0
     broken: int = 0
     excess: float = 0.0
-    """Largest difference quotient over its limit."""
+    """Largest difference quotient relative to its limit."""
     square_asked: float = 0.0
     square_shown: float = 0.0
     compared: int = 0
@@ -138,7 +138,7 @@ def main(args: Args) -> None:
 def _report(
     scores: dict[tuple[str, str], Score], figures: dict[str, float], robots: int, args: Args
 ) -> None:
-    """Print and keep what is known so far."""
+    """Print and keep the present results."""
     table = Table(
         *("policy", "way", "setpoints", "beyond limits", "largest, over the limit"),
         *("late [actions]", "RMSE to asked", "RMSE to shown"),
@@ -162,7 +162,7 @@ def _report(
 
 
 def _read(root: Path, args: Args) -> tuple[list[Episode], list[Episode], ActionLimits, float]:
-    """Episodes to learn from, those held out, limits, frame rate; of columns that move."""
+    """Episodes to learn from, held-out episodes, limits, frame rate; only columns that move."""
     from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     columns = read_episodes(root, (STATE, ACTION))
@@ -181,7 +181,9 @@ def _read(root: Path, args: Args) -> tuple[list[Episode], list[Episode], ActionL
 
 
 def _again(episodes: Sequence[Episode]) -> Iterator[Episode]:
-    """Over and over: policies that draw differ each time, and seams lie elsewhere."""
+    """Repeat the episodes endlessly: policies that sample differ each time, and seams lie
+    elsewhere.
+    """
     turn = 0
     while True:
         for episode in episodes:
@@ -190,15 +192,14 @@ def _again(episodes: Sequence[Episode]) -> Iterator[Episode]:
 
 
 def _learn(name: str, shown: Sequence[Episode], fps: float, args: Args) -> Any:
-    """A policy, its processors, and the spread of actions."""
+    """Trained policy, its processors, and the spread of actions."""
     from lerobot.policies import get_policy_class, make_pre_post_processors
 
     import hrc_learn.lerobot  # noqa: F401  registers ours
 
     stats = statistics(shown)
-    if (
-        name not in OURS
-    ):  # LeRobot's demand images or the environment's state: they get the state
+    # LeRobot's policies require images or the environment's state.
+    if name not in OURS:
         stats = stats | {ENVIRONMENT: stats[STATE]}
         shown = [e | {ENVIRONMENT: e[STATE]} for e in shown]
     config = config_of(name, shown[0], fps, args.chunk, args.executed)
@@ -241,7 +242,7 @@ def _play(name: str, learned: Any, episode: Episode, args: Args) -> Played:
 def _ways(
     played: Sequence[Played], limits: ActionLimits, args: Args
 ) -> Iterator[tuple[str, list[np.ndarray]]]:
-    """Setpoints of each episode, in each way."""
+    """Setpoints of each episode, for each way."""
     asked = [p.asked for p in played]
     for way, degree in (("hold", 0), ("line", 1), ("spline", 3)):
         yield way, [_upsampled(a, degree, limits.fps, args.rate) for a in asked]
@@ -253,7 +254,7 @@ def _ways(
         )
     for degree, latency in ((3, 2.0), (3, 1.0), (1, 1.0)):
         upsampler = ActionUpsampler(limits, args.rate, degree=degree, latency=latency)
-        # All episodes at once, the shorter ones with their last action repeated.
+        # All episodes at once; shorter ones are extended by their last action.
         longest = max(len(a) for a in asked)
         padded = np.stack(
             [np.pad(a, ((0, longest - len(a)), (0, 0)), "edge") for a in asked], 1
@@ -290,7 +291,9 @@ def _add(
     spread: np.ndarray,
     rate: float,
 ) -> None:
-    """Add the episodes of a robot to a score; errors are in spreads of the actions shown."""
+    """Add the episodes of a robot to a score; errors are relative to the spread of the
+    demonstrated actions.
+    """
     bounds = [np.array(x) for x in (limits.velocity, limits.acceleration, limits.jerk)]
     shifts = np.arange(round(LATEST * rate / limits.fps) + 1)
     errors, counts = np.zeros(len(shifts)), np.zeros(len(shifts))

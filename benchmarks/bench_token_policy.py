@@ -1,23 +1,24 @@
 """Compare tokens of action chunks by the policies that learn to write them: ours, FAST's, bins.
 
-One small decoder-only transformer reads what is observed, without images, and the last two
-actions, and writes the tokens of the next chunk, greedily. It learns from the same chunks for
-the same CPU time, whatever the code: the numbers of steps follow from the costs of steps that
-take turns, since other programs change the speed of the machine. Ours has the reconstruction
-error of FAST's recipe at its default scale and also 1024 tokens; bins (RT-2) have 256 levels
-for each column of every k-th action, with k such that a chunk takes at most 80 tokens, and
-straight lines between.
+One small decoder-only transformer reads the observation, without images, and the last two
+actions. It writes the tokens of the next chunk, greedily. All codes use the same chunks and the
+same CPU time: the numbers of training steps follow from the costs of steps, which are measured
+in turn, because other programs change the speed of the machine. Our code has the reconstruction
+error of FAST's recipe at its default scale and also 1024 tokens. Bins (RT-2) have 256 levels
+for each column of every k-th action, with straight lines between; k is chosen such that a chunk
+needs at most 80 tokens.
 
-Tasks are public environments (bench_environments.py): success and the largest reward of
-episodes from unseen starts, which execute half of each chunk and end after twice the mean
-demonstration. Sets are LeRobot datasets of people: error of the first half second of chunks of
-held-out episodes, relative to half the range of each column. Sequences of FAST that do not
-decode repeat the last action; `relaxed` cuts or pads their coefficients, as LeRobot does.
+Tasks are public environments (bench_environments.py). Reported are success and the largest
+reward of episodes from unseen starts, which execute half of each chunk and end after twice the
+mean duration of the demonstrations. Sets are LeRobot datasets of people. Reported is the error
+of the first half second of chunks of held-out episodes, relative to half the range of each
+column. Sequences of FAST that do not decode repeat the last action; `relaxed` truncates or pads
+their coefficients, as LeRobot does.
 
     tools/make_environments.sh
     .venv-environments/bin/python benchmarks/bench_token_policy.py --sets unitree/pour
 
-Every finished run is a line of `--runs`; runs that are there already are not repeated.
+Every finished run is a line of `--runs`; existing runs are not repeated.
 """
 
 from __future__ import annotations
@@ -57,17 +58,18 @@ MOST_FITTED, MOST_LEARNED = 4000, 12_000
 SECONDS, JUDGED = 1.0, 0.5
 """Duration of chunks of sets, and of the part that is judged [s]."""
 EVERY = 5
-"""Of the episodes of a set, every so many is held out."""
+"""Every n-th episode of a set is held out."""
 FIRST_SEED = 10_000
 """Seed of the first unseen start: demonstrations count from 0."""
 LATE = 2.0
-"""Length of an episode that has failed, relative to the mean demonstration."""
+"""Time limit of an episode, relative to the mean duration of the demonstrations."""
 TOGETHER = 25
-"""Environments that run side by side, so that one pass of the network serves all."""
+"""Number of environments that run in parallel, so that one pass of the network serves all."""
 DECIMALS = 5
-"""Actions are rounded, so that columns of few values keep few values."""
+"""Number of decimals to which actions are rounded, so that columns with few values keep few
+values."""
 UNIT = 16
-"""Tokens of a chunk in the unit of CPU time."""
+"""Number of tokens of a chunk in the unit of CPU time."""
 type Episode = dict[str, Tensor]
 
 
@@ -93,26 +95,26 @@ class Args:
     demos: Path = Path("outputs/environments")
     """Folder of the tasks' demonstrations, made if missing."""
     runs: Path = Path("outputs/token_policy.jsonl")
-    """Receives a line for each run."""
+    """File that receives a line for each run."""
     json: Path | None = None
-    """Receives means and intervals as one flat object."""
+    """File for means and intervals, one flat JSON object of numbers."""
 
 
 class Job:
-    """A task or a set: what is learned from, how it is encoded and how it is judged."""
+    """A task or a set: its data, their code and the evaluation."""
 
     name: str
     learned: Windows
     fps: float
 
     def __init__(self, name: str, episodes: Sequence[Episode], fps: float, chunk: int):
-        """Lay the episodes out in units of half the range of each moving column."""
+        """Scale the episodes to half the range of each moving column."""
         self.name, self.fps, self.chunk = name, fps, chunk
         actions = np.concatenate([e[ACTION].numpy() for e in episodes]).astype(float)
         low, high = np.quantile(actions, (0.01, 0.99), axis=0)
         self.moves = high > low
         self.centre, self.half = (low + high) / 2, np.where(self.moves, (high - low) / 2, 1)
-        # What an episode begins with stands for the actions before it.
+        # The first action of an episode represents the actions before it.
         first = np.stack([_seen(e)[0] for e in episodes])
         begun = np.stack([self.normalised(e[ACTION].numpy()[0]) for e in episodes])
         self._mean, self._spread = first.mean(0), first.std(0) + 1e-3
@@ -127,13 +129,13 @@ class Job:
         return ((actions - self.centre) / self.half)[..., self.moves].round(DECIMALS)
 
     def restored(self, y: Float[np.ndarray, "*n D"]) -> Float[np.ndarray, "*n A"]:
-        """Actions of normalised ones."""
+        """Actions from normalised ones."""
         whole = np.broadcast_to(self.centre, (*y.shape[:-1], len(self.centre))).copy()
         whole[..., self.moves] += y * self.half[self.moves]
         return whole
 
     def begun(self, seen: Float[np.ndarray, "*n F"]) -> Float[np.ndarray, "*n D"]:
-        """Action that episodes begin with, normalised, predicted from what is first seen."""
+        """First action of episodes, normalised, predicted from the first observation."""
         x = (seen - self._mean) / self._spread
         return (self._weights[0] + x @ self._weights[1:]).round(DECIMALS)
 
@@ -167,7 +169,7 @@ class Job:
         return made, ids, figures
 
     def judged(self, policy: Policy, relaxed: bool) -> dict[str, float]:
-        """Figures of a policy."""
+        """Measured values of a policy."""
         raise NotImplementedError
 
 
@@ -291,7 +293,7 @@ def main(args: Args) -> None:
 
 
 def measured(job: Job, code: str, seed: int, args: Args) -> dict[str, Any]:
-    """Figures of one run: code, training, judgement and time of inference."""
+    """Measured values of one run: code, training, evaluation and time of inference."""
     made, ids, figures = job.encoded(code)
     settings = {"seed": seed, "width": args.width, "layers": args.layers}
     unit = np.random.default_rng(seed).integers(VOCABULARY, size=(len(ids), UNIT)).tolist()
@@ -368,7 +370,7 @@ def show(runs: list[dict[str, Any]], args: Args, console: Console) -> None:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and half its 95 % interval by Student's distribution."""
+    """Mean and half-width of its 95 % interval, by Student's distribution."""
     n = len(values)
     if n < 2:
         return (values[0] if values else math.nan), math.nan
@@ -391,7 +393,7 @@ def _name(source: str) -> str:
 
 
 def _read(path: Path) -> Iterator[dict[str, Any]]:
-    """Finished runs; a line that was cut off is left out."""
+    """Finished runs; an incomplete line is left out."""
     for line in path.read_text("utf-8").splitlines() if path.exists() else ():
         try:
             yield json.loads(line)

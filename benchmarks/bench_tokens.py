@@ -1,10 +1,10 @@
 """Compare tokens of action chunks on LeRobot datasets: ours, FAST's, BEAST's recipe and bins.
 
-Each tokenizer is fitted to four of five episodes and encodes chunks of one second of the
-others. FAST's recipe (Pertsch et al. 2025: DCT, rounding, byte-pair encoding, with the scale of
-10 that LeRobot takes by default) needs `pip install tokenizers`. The others are set to its root
-mean square error: ours by the tolerance, B-spline coefficients in 256 levels (BEAST, Zhou et
-al. 2025) by their number, bins (RT-2) by their width. Errors are relative to half the range
+Each tokenizer is fitted to four of five episodes and encodes chunks of one second of the other
+episodes. FAST's recipe (Pertsch et al. 2025: DCT, rounding, byte-pair encoding, with LeRobot's
+default scale of 10) needs `pip install tokenizers`. All other tokenizers are adjusted to its
+root mean square error: ours by the tolerance, B-spline coefficients in 256 levels (BEAST, Zhou
+et al. 2025) by their number, bins (RT-2) by their width. Errors are relative to half the range
 between the quantiles of 1 and 99 % of each column, as FAST normalises.
 
     python benchmarks/bench_tokens.py --datasets so101/pick unitree/pour
@@ -37,7 +37,7 @@ VOCABULARY = 1024
 LEVELS = 256
 """Levels of a coefficient in BEAST's recipe, and bins of RT-2."""
 WRONG = 0.05
-"""Share of tokens that are replaced to see whether chunks still decode."""
+"""Fraction of tokens that are replaced, to test if chunks still decode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class Args:
     feature: str = "action"
     """Feature to encode."""
     scale: float = 10.0
-    """Scale of FAST's coefficients; errors are compared at that of FAST."""
+    """Scale of FAST's coefficients; all tokenizers are compared at its error."""
     seconds: float = 1.0
     """Duration of a chunk [s]."""
     fitted: int = 4000
@@ -55,7 +55,7 @@ class Args:
     measured: int = 200
     """Largest number of chunks to encode."""
     random: int = 0
-    """Random sequences to decode with each of our tokenizers."""
+    """Number of random sequences to decode with each of our tokenizers."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -101,12 +101,12 @@ class Fast:
         return [self.code.encode(self.text(q)).ids for q in self.rounded(chunks)]
 
     def decode(self, ids: list[int]) -> Float[np.ndarray, "T D"] | None:
-        """Chunk of tokens; None if they do not make as many coefficients as it has."""
+        """Chunk from tokens; None if the number of coefficients is wrong."""
         q = np.array([ord(c) for c in self.code.decode(ids)]) + self.least
         return self.restored(q[None])[0] if len(q) == np.prod(self.shape) else None
 
     def restored(self, q: Int[np.ndarray, "N K"]) -> Float[np.ndarray, "N T D"]:
-        """Chunks of coefficients."""
+        """Chunks from coefficients."""
         from scipy.fft import idct
 
         q = q.reshape(-1, *self.shape).clip(self.least, self.most)
@@ -128,7 +128,9 @@ def main(args: Args) -> None:
 
 
 def compare(dataset: Path, args: Args) -> dict[str, float]:
-    """Tokens per chunk at FAST's error, and what becomes of broken sequences."""
+    """Tokens per chunk at FAST's error, and the fraction of damaged sequences that do not
+    decode.
+    """
     every = [entry.index for entry in open_folder(dataset).episodes]
     unseen = held_out(every, 5)
     kept = [i for i in every if i not in unseen]
@@ -148,7 +150,7 @@ def compare(dataset: Path, args: Args) -> dict[str, float]:
     fast = Fast(train.motions[:, 1:], args.scale)
     y = test.motions[:, 1:]
     ids = fast.encode(y)
-    # Of its coefficients: some of its own sequences do not decode.
+    # The number of coefficients: some of FAST's own sequences do not decode.
     made = fast.restored(fast.rounded(y))
     rmse = float(np.sqrt(np.mean((made - y) ** 2)))
     counts = float(np.mean([len(row) for row in ids]))
@@ -186,9 +188,9 @@ def matched(
     *,
     start_known: bool = True,
 ) -> tuple[MotionTokenizer, float, float]:
-    """Tokenizer of about this error, its tokens per chunk at this error, and its own error.
+    """Tokenizer with about this error, its tokens per chunk at this error, and its own error.
 
-    The logarithms of two near errors and their tokens are interpolated.
+    The tokens are interpolated between two near errors, on logarithmic scales.
     """
     state = torch.from_numpy(test.motions[:, 0]), torch.from_numpy(test.start_velocity)
     state = state if start_known else ()
@@ -215,7 +217,9 @@ def matched(
 
 
 def beast(train: Chunks, test: Chunks, rmse: float) -> float:
-    """Tokens per chunk of B-spline coefficients in equal levels, at most at this error."""
+    """Tokens per chunk of B-spline coefficients in equal levels, with an error of at most
+    `rmse`.
+    """
     s = torch.linspace(0, 1, test.motions.shape[1] - 1, dtype=torch.float64)
     for count in range(4, len(s) + 1):
         B = spline(s, count).numpy()
@@ -229,7 +233,7 @@ def beast(train: Chunks, test: Chunks, rmse: float) -> float:
 
 
 def at_random(tokenizer: MotionTokenizer, train: Chunks, count: int) -> dict[str, float]:
-    """Shares of random sequences that do not decode or leave the limits, and largest seams."""
+    """Fractions of random sequences that fail to decode or exceed limits, and largest seams."""
     rng = torch.Generator().manual_seed(0)
     low, high = (torch.from_numpy(f(train.motions, axis=(0, 1))) for f in (np.min, np.max))
     low, high = low - (high - low) / 10, high + (high - low) / 10

@@ -1,8 +1,9 @@
-"""Touches that nobody made: how often an arm that does its job takes itself for being touched.
+"""False touches: how often an untouched arm detects a touch during its job.
 
-The whole job with one object, with the nominal imperfections of a laboratory, led directly in
-MuJoCo. `Touch` listens all along, as on a real arm, and what it asks for is not done; while a
-scripted person leads the elbow without touching the arm, and without anybody.
+The whole job with one object, with the nominal imperfections of a laboratory, commanded
+directly in MuJoCo. `Touch` reads the torques during the job, as on a real arm, but its requests
+are not executed. Each job runs once with a scripted person who guides the elbow without
+touching the arm, and once without a person.
 """
 
 from __future__ import annotations
@@ -42,26 +43,26 @@ class Args:
     models: Path
     """Folder of `hrc demo`, with `aiming` and `placing`."""
     first_seed: int = 0
-    """Of the object's place, of images and imperfections."""
+    """First seed of object place, images and imperfections."""
     jobs: int = 50
-    """Seeds from there on, each with and without the person."""
+    """Number of seeds; each job runs with and without the person."""
     config: TouchConfig = field(default_factory=TouchConfig)
-    """What counts as a touch."""
+    """Thresholds of a touch."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 class Listener(Human):
-    """The person of the job, beside an arm that listens for touches."""
+    """The person of the job, together with the detection of touches."""
 
     def __init__(self, person: Human, touch: Touch):
         self._person, self._touch = person, touch
         self._before: tuple[str, bool, bool] = ("nothing", False, False)
         self.felt: Counter[str] = Counter()
-        """Beginnings: of pushes at the elbow, of pauses, of stops."""
+        """Number of detected pushes at the elbow, pauses and stops."""
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the person asks for."""
+        """Input of the person."""
         asked = self._touch.read(state)
         now = (self._touch.place, asked.pause, bool(asked.stop))
         self.felt["elbow pushed"] += now[0] == "elbow" != self._before[0]
@@ -77,7 +78,7 @@ class Listener(Human):
 
 
 def main(args: Args) -> None:
-    """Do the jobs and count."""
+    """Run the jobs and count."""
     aiming = VisualServoSkill.load(args.models / "aiming")
     placing = PlacingSkill.load(args.models / "placing", panda)
     table = Table("", "jobs done", "hours", "elbow pushed", "task paused", "arm stopped")
@@ -111,7 +112,7 @@ def main(args: Args) -> None:
             felt.update(listeners[0].felt)
             Console().print(name, seed, run.failure, dict(listeners[0].felt))
             del run
-            gc.collect()  # of half a gigabyte of images, which refer to each other's world
+            gc.collect()  # half a gigabyte of images, which refer to each other's world
         kinds = ("elbow pushed", "task paused", "arm stopped")
         table.add_row(name, str(done), f"{hours:.2f}", *(str(felt[kind]) for kind in kinds))
         key = name.replace(" ", "_")

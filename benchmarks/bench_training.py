@@ -1,7 +1,7 @@
-"""Measure fits of more demonstrations than memory should hold: time, memory, and digits.
+"""Measure fits of demonstrations larger than memory: time, memory and accuracy.
 
-Writes a synthetic dataset with our own writer, reads it once from disk, episode by episode,
-and fits a movement primitive and an image Jacobian to it.
+Writes a synthetic dataset with this package's writer, reads it once from disk, episode by
+episode, and fits a movement primitive and an image Jacobian to it.
 """
 
 import math
@@ -36,7 +36,7 @@ class Args:
     n_basis: int = 50
     """Number of basis functions."""
     dataset: Path | None = None
-    """Keep the dataset here, or read the one that is; a temporary one without."""
+    """Folder of the dataset, which is kept, or read if it exists. None: a temporary folder."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -74,14 +74,14 @@ def main(args: Args) -> None:
 
 
 def _timed[T](work: Callable[[], T]) -> tuple[float, T]:
-    """CPU time [s], which other work on the machine does not change much, and the result."""
+    """CPU time [s], on which other programs have little effect, and the result."""
     began = time.process_time()
     result = work()
     return time.process_time() - began, result
 
 
 def _peak_memory() -> float:
-    """Of this process so far [MB]."""
+    """Peak memory of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -93,7 +93,7 @@ def _write(folder: Path, args: Args) -> None:
 
 
 def _demonstration(episode: int, frames: int, rng: np.random.Generator) -> Demonstration:
-    """A motion like all others but for its ends, duration, stamps and noise, watched."""
+    """A motion with its own ends, duration, stamps and noise, seen by a camera."""
     duration = rng.uniform(0.8, 1.2) * frames / 100
     steps = 1 + 0.2 * rng.uniform(-1, 1, frames)
     stamps = np.concatenate([[0.0], np.cumsum(steps[1:])])

@@ -1,9 +1,9 @@
-"""What logging costs the control loop, writing a recording costs a run, and a camera a frame.
+"""Cost of logging for the control loop, of writing a recording, and of a camera image.
 
-The row logged is that of the collaboration task: 62 numbers and a flag in 13 columns. The
-floor is one bare NumPy row of the same width. `log_live_us` is the row again, while
-another thread sends all of it to a viewer: CPU time of the loop's thread alone, without what it
-waits for the interpreter. Medians of CPU time on one thread, of calls made in turn.
+The logged row is that of the collaboration task: 62 numbers and a flag in 13 columns. The floor
+is one bare NumPy row of the same width. `log_live_us` is the time of the row while another
+thread sends all rows to a viewer: CPU time of the loop's thread alone, without its waiting time
+for the interpreter. Medians of CPU time on one thread, of calls made in turn.
 """
 
 import os
@@ -26,22 +26,23 @@ from hrc_learn.log import CameraRecording, RunRecording, StepLog
 from hrc_learn.vision import CameraModel, Marker, MarkerDetector, SyntheticCamera
 from hrc_learn.viz.run_dashboard import LogStream, live_sender, record_run
 
-STEPS = 200  # timed together, since one takes less than the clock resolves
+# number of calls timed together, since one is shorter than the resolution of the clock
+STEPS = 200
 TARGETS = {"log_step_us": 5.0, "log_live_us": 5.0, "camera_ms": 4.0, "detect_ms": 4.0}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     repeats: int = 200
-    """Repeats of every call."""
+    """Number of calls of each kind."""
     seconds: float = 60.0
-    """Length of the run that is written as a recording, at 125 steps a second."""
+    """Duration of the run that is written as a recording, at 125 steps per second."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> None:
-    """Measure, print a table with the targets, write the figures."""
+    """Measure, print a table with the targets, and write the measured values."""
     cv2.setNumThreads(1)
     figures = measure_log(args.repeats) | measure_live(args.repeats)
     figures |= measure_vision(args.repeats)
@@ -54,7 +55,7 @@ def main(args: Args) -> None:
 
 
 def measure_log(repeats: int) -> dict[str, float]:
-    """Microseconds a step."""
+    """Microseconds per step."""
     values = step_values()
     width = sum(np.size(value) for value in values.values())
     rows, row = np.zeros((STEPS, width)), np.zeros(width)
@@ -77,7 +78,7 @@ def measure_log(repeats: int) -> dict[str, float]:
 
 
 def measure_live(repeats: int) -> dict[str, float]:
-    """Microseconds of the loop's thread for a step, of which another thread sends every one."""
+    """Microseconds of the loop's thread per step, while another thread sends every step."""
     values = step_values()
     log, spent = StepLog(), []
     columns = [name for name in values if name != "time"]
@@ -97,7 +98,7 @@ def measure_live(repeats: int) -> dict[str, float]:
 
 
 def step_values() -> dict[str, np.ndarray | float | bool]:
-    """What a step of the collaboration task logs."""
+    """Values that a step of the collaboration task logs."""
     joints = {f"joint_{name}": np.zeros(7) for name in ("position", "command", "effort")}
     pixels = {name: np.zeros(2) for name in ("feature", "target")}
     return {
@@ -115,14 +116,15 @@ def step_values() -> dict[str, np.ndarray | float | bool]:
 
 
 def measure_vision(repeats: int) -> dict[str, float]:
-    """Milliseconds a frame of 1440x1080, one marker 80 px wide."""
+    """Milliseconds per image of 1440x1080, one marker 80 px wide."""
     model = CameraModel().look_at(np.array([0.5, 0.0, 1.3]), np.array([0.5, 0.0, 0.0]))
     pose = np.eye(4)
     pose[:3, 3] = [0.55, 0.1, 0.3]
     marker = Marker(7, 0.06)
     camera = SyntheticCamera(model, [marker], lambda: {7: pose}, rng=np.random.default_rng(0))
     image = camera.read()
-    tracking, blind = MarkerDetector([7]), MarkerDetector([7, 8])  # 8 is not there
+    # marker 8 is not in the image
+    tracking, blind = MarkerDetector([7]), MarkerDetector([7, 8])
     timings = time_calls(
         {
             "camera_ms": camera.read,
@@ -135,7 +137,7 @@ def measure_vision(repeats: int) -> dict[str, float]:
 
 
 def measure_recording(seconds: float) -> dict[str, float]:
-    """Seconds of CPU and megabytes of one recording, with three images a second."""
+    """CPU seconds and megabytes of one recording, with three images per second."""
     run = long_run(seconds)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.rrd"
@@ -144,7 +146,7 @@ def measure_recording(seconds: float) -> dict[str, float]:
 
 
 def long_run(seconds: float) -> RunRecording:
-    """A run with the most voluminous fields filled."""
+    """A run in which the largest fields are filled."""
     times = np.arange(0.0, seconds, 1 / 125)
     steps = len(times)
     model = CameraModel()

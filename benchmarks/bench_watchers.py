@@ -1,10 +1,10 @@
-"""The page with many watchers while one drags: delay of efforts, memory, survival.
+"""Measure the page with many watching clients while one client drags: delay, memory, survival.
 
-`hrc page` runs in a process of its own. Each watcher opens what a browser opens: a session that
-wants the scene, and a view. The leader drags a link 60 times a second; the delay is the time
-until the status names the motion that was sent.
+`hrc page` runs in its own process. Each watching client opens the same sockets as a browser: a
+session that receives the scene, and a view. The controlling client drags a link 60 times per
+second; the delay is the time until the status contains the motion that was sent.
 
-python benchmarks/bench_watchers.py --minutes 60 --watchers 24 --figures minutes.jsonl
+    python benchmarks/bench_watchers.py --minutes 60 --watchers 24 --figures minutes.jsonl
 """
 
 import asyncio
@@ -43,7 +43,7 @@ class Args:
     watchers: int = 24
     """Number of clients that watch."""
     figures: Path | None = None
-    """File for the values of every minute, one JSON object a line, written as they come."""
+    """File for the values of every minute, one JSON object per line, written immediately."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 

@@ -1,10 +1,10 @@
-"""What a step of the simulated work cell costs: alone, pulled at, beside a worker, and both.
+"""Cost of a step of the simulated work cell: alone, with pulls, with a worker, and with both.
 
-The arm holds its pose with the imperfections of an ordinary laboratory, while the simulated
-world, the worker in it and his sensor go on and all is logged, as in `hrc run collaboration`
-between its servoing. The floor is a step of the same world by itself. Medians and 95th
-percentiles of CPU time on one thread, of steps made in turn, and how many operations PyTorch is
-asked for in a step, which no load on the machine changes.
+The arm holds its pose with nominal imperfections, while the simulated world, the worker and the
+tracker advance and everything is logged, as in `hrc run collaboration` outside its servoing.
+The floor is a step of the same world alone. Reported are medians and 95th percentiles of CPU
+time on one thread, for steps made in turn, and the number of PyTorch operations per step, which
+does not depend on the load of the machine.
 """
 
 import os
@@ -33,7 +33,7 @@ from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 
 _CASES = {"alone": (), "pulled": ("pulls",), "worker": ("worker",), "both": ("pulls", "worker")}
-# To either side in turn, each for a second: the elbow never comes to rest.
+# To each side in turn, for one second: the elbow never comes to rest.
 _PULLS = tuple(
     ScriptedForce(
         start=float(k), duration=1.2, towards=(0.4, (-10.0, 10.0)[k % 2], 0.5), max_force=60.0
@@ -45,9 +45,9 @@ _PULLS = tuple(
 @dataclass(frozen=True, kw_only=True)
 class Args:
     repeats: int = 300
-    """Steps timed of each kind."""
+    """Number of timed steps of each kind."""
     seed: int = 0
-    """Of the worker, his visit and all errors."""
+    """Seed of the worker, the visit and all errors."""
     save: Path | None = None
     """File that keeps the measured values for a later --compare."""
     compare: Path | None = None
@@ -88,11 +88,11 @@ def bare_step(seed: int) -> Callable[[], None]:
 
 
 def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
-    """A step of the work cell, with the worker, if he comes, as he puts down what he brought.
+    """A step of the work cell, with the worker, if any, while the worker puts an object down.
 
     Args:
-        seed: Of the worker, his visit and all errors.
-        parts: What goes on in it: "pulls", "worker".
+        seed: Seed of the worker, the visit and all errors.
+        parts: Activities in the cell: "pulls", "worker".
     """
     workplace, sizes = Workplace(), Imperfections.nominal()
     rng = np.random.default_rng([seed, 2])
@@ -105,7 +105,7 @@ def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
     config = replace(config, safety=sizes.plant(config.safety))
     watch = None
     if visit is not None:
-        # There at once: two seconds before he lets go of it.
+        # Skip the approach: start two seconds before the worker releases the object.
         world.data.time = visit.released - 2.0
         tracker = WorkerSensor(
             visit.ends_at, visit.worker.radius, lambda: world.time, sizes, rng
@@ -129,12 +129,12 @@ def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
         clearance=workplace.arm_clearance,
         watch=watch,
     )
-    cell.hold_pose(0.5)  # until he is seen, and the first pull is under way
+    cell.hold_pose(0.5)  # until the worker is observed, and the first pull has begun
     return lambda: cell.hold_pose(config.dt)
 
 
 def _world(workplace: Workplace, seed: int) -> World:
-    """At home, as a laboratory has it."""
+    """World with the arm at home, with the imperfections of a laboratory."""
     errors = Imperfections.nominal().draw(np.random.default_rng(seed))
     world = World(workplace.scene, errors)
     world.reset(workplace.home_joints().numpy())
