@@ -35,12 +35,12 @@ def guessed_network() -> RBFImageJacobian:
 
 @runtime_checkable
 class ProjectiveCamera(Protocol):
-    """Whatever says where a camera sees the marker on the end effector."""
+    """A camera that projects the marker on the end effector."""
 
     def project(
         self, tool: Pose
     ) -> tuple[Float[Tensor, "*batch rows"], Bool[Tensor, "*batch"]]:
-        """Marker in the image [px], and whether it is inside the image."""
+        """Pixel of the marker [px], and a flag for points inside the image."""
         ...
 
 
@@ -51,24 +51,25 @@ class Imperfections:
     frame_steps: int = 1
     """Control steps from one image to the next."""
     latency_frames: int = 0
-    """Images by which a measurement is late."""
+    """Delay of a measurement, in images."""
     noise: float = 0.0
     """Standard deviation of each pixel coordinate [px]."""
     nan_fraction: float = 0.0
-    """Fraction of images whose measurement is NaN though it claims to be visible."""
+    """Fraction of images whose measurement is NaN although it is marked as visible."""
     loss_rate: float = 0.0
     """Rate at which occlusions of the marker begin [1/s]."""
     loss_time: float = 3.0
-    """Longest time it stays covered [s]; the mean is half of it."""
+    """Longest time for which the marker stays covered [s]; the mean is half of it."""
     encoder_noise: float = 0.0
     """Standard deviation of each joint position reading [rad]."""
 
 
 @dataclass(kw_only=True)
 class VirtualCamera:
-    """Turns tool poses into measurements, with the imperfections of camera and encoders.
+    """Converts tool poses into measurements, with the imperfections of camera and encoders.
 
-    It remembers the last images, for their latency, and how long the marker stays covered.
+    It stores the last images, for their delay, and the remaining time for which the marker is
+    covered.
     """
 
     camera: ProjectiveCamera

@@ -1,10 +1,10 @@
 """Force and pressure of every contact between an arm and a worker, from their recorded motion.
 
-Independent of the controller: contacts, Jacobians and mass matrices are MuJoCo's, velocities
-differences of the recorded positions, limits written down anew from the table, and an impact is
-integrated as two masses with the spring of the body region between them. Every step of a
-contact counts as an impact of its own. A part of the body that furniture holds cannot yield:
-what the arm advances while it touches it compresses the spring as well.
+The evaluation is independent of the controller. Contacts, Jacobians and mass matrices come from
+MuJoCo; velocities are differences of the recorded positions; the limits are entered separately
+from the table. An impact is integrated as two masses with the spring of the body region between
+them. Every step of a contact counts as a separate impact. A part of the body that furniture
+supports cannot yield: the motion of the arm during the contact also compresses the spring.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from hrc_learn.sim.worker import WorkerConfig
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
-# Force [N], pressure [N/cm^2], both quasi-static, spring [N/mm] and mass [kg]: ISO/TS
-# 15066:2016, tables A.2 and A.3, the strictest place of each region; zero: no contact is
+# Force [N] and pressure [N/cm^2], both quasi-static, spring [N/mm] and mass [kg]: ISO/TS
+# 15066:2016, tables A.2 and A.3, the strictest value of each region; zero: no contact is
 # allowed.
 LIMITS = {
     "head": (0, 0, 75, 4.4),
@@ -40,16 +40,16 @@ LIMITS = {
     "shank": (130, 210, 60, 75),
     "foot": (130, 210, 60, 75),
 }
-# Below this speed a part of the arm is at rest, as servos creep [m/s].
+# Speed below which a part of the arm counts as at rest, as servos creep [m/s].
 _AT_REST = 0.01
-# Gap behind a part of the body up to which furniture holds it [m].
+# Gap behind a part of the body below which furniture supports it [m].
 _BEHIND = 0.02
-# Distance from the axis of the base up to which a worker may touch the arm: no part of a Panda
-# with its load is further away [m].
+# Distance from the axis of the base within which a worker may touch the arm: no part of a Panda
+# with its load is farther away [m].
 _REACH = 1.2
 # Pose of a grasped object in the frame of the tool.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-# Time between two contacts of the same parts that counts as one [s].
+# Time between two contacts of the same parts below which they count as one contact [s].
 _SAME = 0.1
 
 
@@ -69,7 +69,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Contact:
-    """The hardest moment of a contact."""
+    """The moment of a contact with the largest force relative to its limit."""
 
     time: float
     """[s]"""
@@ -78,7 +78,7 @@ class Contact:
     part: str
     """Part of the worker."""
     arm_speed: float
-    """Speed of the arm towards the worker [m/s]; up to 1 cm/s it is at rest."""
+    """Speed of the arm towards the worker [m/s]; below 1 cm/s the arm counts as at rest."""
     speed: float
     """Relative speed [m/s]."""
     mass: float
@@ -86,13 +86,13 @@ class Contact:
     force: float
     """Peak force [N]."""
     of_limit: float
-    """Peak force or pressure as a fraction of its limit; infinite where none is allowed."""
+    """Peak force or pressure as a fraction of its limit; infinite if no contact is allowed."""
     clamped: bool
-    """True if furniture holds the part."""
+    """True if furniture supports the part."""
 
     @property
     def by_arm(self) -> bool:
-        """True if the arm moves towards the worker; else the worker runs into it."""
+        """True if the arm moves towards the worker; False if the worker moves into the arm."""
         return self.arm_speed > _AT_REST
 
 
@@ -198,7 +198,7 @@ class _Replay:
         return sorted([*closed, *hardest.values()], key=lambda contact: contact.time)
 
     def _touching(self, k: int, advance: dict[tuple[str, str], float]):
-        """Pairs that touch at a step, with the contact that it would be."""
+        """Pairs of parts that touch at a step, and the contact of each."""
         world, motion = self._world, self._motion
         model, data = world.model, world.data
         data.qpos[:] = self._posture
@@ -264,7 +264,7 @@ class _Replay:
         )
 
     def _arm_body(self, geom: int, holding: bool) -> int | None:
-        """Body of the arm that a geom moves with; None for the base and for what lies about."""
+        """Body of the arm that a geom moves with; None for the base and for other objects."""
         model = self._world.model
         if geom == self._object:
             return model.body("hand").id if holding else None
@@ -297,7 +297,7 @@ class _Replay:
         return (after - before) / (2 * dt)
 
     def _held(self, point: np.ndarray, normal: np.ndarray, reach: float) -> bool:
-        """True if a ray from the contact through the part soon meets furniture."""
+        """True if a ray from the contact through the part meets furniture within the gap."""
         for centre, half in self._boxes:
             with np.errstate(divide="ignore", invalid="ignore"):
                 near = (centre - half - point) / normal

@@ -1,4 +1,4 @@
-"""Closed loops of the controller in batches: experiments by name, and their bounds."""
+"""Experiments with the controller in batches of closed loops, by name, and their bounds."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ _PANDA = ArmChoice()
 
 @dataclass(frozen=True, kw_only=True)
 class BatchedTrials:
-    """One kind of trials; `run` takes a configuration with a seed."""
+    """A kind of trials; `run` takes a configuration with a seed."""
 
     label: str
     config: Any
     run: Callable[[Any], Any]
     suite: str = "acceptance"
     whole: bool = False
-    """Whether it is run as it is, not with a chosen number of trials in chunks."""
+    """True if the experiment runs as a whole, not in chunks of a chosen number of trials."""
     main: bool = False
-    """Whether its success rate has to be known to a tenth of a percent."""
+    """True if its success rate must be accurate to a tenth of a percent."""
 
 
 def join[Result](parts: Sequence[Result]) -> Result:
-    """The trials of several results: tensors with one entry a trial."""
+    """The trials of several results: tensors with one entry per trial."""
     first = parts[0]
     columns = {
         field.name: torch.cat([getattr(part, field.name) for part in parts])
@@ -72,7 +72,7 @@ def _grasp(
     **changes: Any,
 ) -> BatchedTrials:
     def run(config: TrialConfig) -> TrialResult:
-        if mujoco:  # whose import takes a second
+        if mujoco:  # importing it takes a second
             from mujoco_trials import run_mujoco_trials
 
             return run_mujoco_trials(estimator, config)
@@ -88,7 +88,9 @@ def _printed(
     estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator],
     **changes: Any,
 ) -> BatchedTrials:
-    """The paper's regions and gains, without a planned approach, behind the safety filter."""
+    """Configuration of the paper's regions and gains, without a planned approach, with the
+    safety filter.
+    """
     settings = {"suite": "paper", "law": "printed", "duration": 12.0} | changes
     return _grasp(label, estimator, **settings)
 
@@ -96,7 +98,7 @@ def _printed(
 def _in_mujoco(
     experiment: Callable[..., BatchedTrials], *args: Any, **changes: Any
 ) -> BatchedTrials:
-    """The same in the simulator, whose images have noise of their own."""
+    """The same experiment in the simulator, whose images have their own noise."""
     images = replace(TrialConfig().imperfections, noise=0.0)
     settings: dict[str, Any] = {"imperfections": images, "contacts": True} | changes
     return experiment(*args, suite="mujoco", mujoco=True, **settings)
@@ -134,12 +136,13 @@ def _plant(label: str, **changes: Any) -> BatchedTrials:
 
 
 def flip_row(J: Tensor) -> Tensor:
-    """The sign of the first image row turned round."""
+    """The Jacobian with the opposite sign of the first image row."""
     return J * J.new_tensor([[-1.0], [1.0]])
 
 
 _FIRM_BOX = {"stiffness": (4e-3, 4e-3, 4e-3)}
-"""The k_c of our own regions, ten times Table I's, and a hundred times in z."""
+"""Box stiffness k_c of our own regions: ten times Table I's in x and y, a hundred times in z.
+"""
 
 
 EXPERIMENTS: Mapping[str, BatchedTrials] = {
@@ -230,30 +233,30 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
     ),
     "stress_plant_worse": _plant("the same half as much again as was declared", worse=1.5),
 }
-"""What can be run."""
+"""All experiments by name."""
 
 
 def run_chunk(name: str, count: int, seed: int, robot: ArmChoice = _PANDA) -> Any:
-    """Run some trials of an experiment; a whole one has its own number of them.
+    """Run some trials of an experiment; an experiment that runs as a whole has its own number.
 
     Args:
-        name: Of the experiment.
-        count: Of trials.
-        seed: Of all that is random.
-        robot: The arm, of experiments that take another (`takes_another_arm`).
+        name: Name of the experiment.
+        count: Number of trials.
+        seed: Seed of all random numbers.
+        robot: Arm, for experiments with other arms (`takes_another_arm`).
     """
     experiment = EXPERIMENTS[name]
     changes: dict[str, Any] = {"seed": seed}
     if not experiment.whole:
         changes["count"] = count
     if robot != _PANDA:
-        # The Panda's figures are of the paper's pull, in which some arms stop on their way.
+        # For the Panda, the paper's pull applies; with it, some other arms stop on their way.
         changes |= {"robot": robot, "pull": "saturated"}
     return experiment.run(replace(experiment.config, **changes))
 
 
 def takes_another_arm(name: str) -> bool:
-    """Whether an experiment is about kinematics alone, and so about any arm's."""
+    """True if an experiment uses kinematics alone, and so applies to any arm."""
     experiment = EXPERIMENTS[name]
     return isinstance(experiment.config, TrialConfig) and experiment.suite != "mujoco"
 
@@ -261,7 +264,7 @@ def takes_another_arm(name: str) -> bool:
 def chunks(name: str, count: int, seed: int, size: int) -> list[tuple[str, int, int]]:
     """Arguments of `run_chunk` that together make up `count` trials.
 
-    Each chunk has a seed of its own, so the figures do not depend on who runs which chunk.
+    Each chunk has its own seed, so the results do not depend on the process that runs a chunk.
     """
     if EXPERIMENTS[name].whole:
         return [(name, count, seed)]
@@ -278,10 +281,10 @@ type Figures = Mapping[str, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Criterion:
-    """A bound on one figure of an experiment, or of `compared`."""
+    """A bound on one value of an experiment, or of `compared`."""
 
     number: str
-    """Of the acceptance figure."""
+    """Number of the acceptance criterion."""
     experiment: str
     metric: Metric[Figures]
 
@@ -293,12 +296,12 @@ def _criteria(
     at_least: Mapping[str, float] | None = None,
     at_most: Mapping[str, float] | None = None,
 ) -> list[Criterion]:
-    """One criterion for each figure of an experiment: its name, and its bound."""
+    """One criterion for each value of an experiment, given by name and bound."""
     lower, upper = at_least or {}, at_most or {}
 
     def criterion(figure: str) -> Criterion:
         def value(figures: Figures) -> float | None:
-            # None where the experiment was not run: the row is left out.
+            # None if the experiment was not run: the row is left out.
             return figures.get(f"{experiment}_{figure}")
 
         name = figure.replace("_", " ")
@@ -320,7 +323,7 @@ _STRESSES = ("stress", "stress_nan", "stress_late", "stress_lost", "stress_1khz"
 
 
 def _robust(number: str, names: Sequence[str], success: float = 0.98) -> list[Criterion]:
-    """Success rates under a disturbance, without breaking a limit."""
+    """Bounds on success rates under a disturbance, and on limit violations."""
     bounds = {"success": success}
     return [
         c for name in names for c in _criteria(number, name, at_least=bounds, at_most=_SAFE)
@@ -367,11 +370,11 @@ CRITERIA: tuple[Criterion, ...] = (
     *_criteria("limits", "stress_plant", at_most=_IRREGULAR | {"beyond_acceleration": 0.0}),
     *_criteria("limits", "stress_plant_worse", at_most=_IRREGULAR),
 )
-"""All bounds. Figures 6 and 8, placing and the whole pipeline, need the simulator."""
+"""All bounds. Criteria 6 and 8 (placing, the whole pipeline) need the simulator."""
 
 
 def compared(figures: Mapping[str, float]) -> dict[str, float]:
-    """How much faster adaptation is than none, from figures of two experiments."""
+    """Ratio of times without and with adaptation, from the values of two experiments."""
     gains: dict[str, float] = {}
     for key, with_ in figures.items():
         if key.startswith("near_vision_phase_roll"):

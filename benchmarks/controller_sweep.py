@@ -1,8 +1,8 @@
 """Run thousands of simulated grasps as batches; compare success, time and safety with targets.
 
-Random starts, targets and uncalibrated cameras, turned by up to 180 degrees from what the
-controller believes, against the kinematics of the arm. The exit status is 1 if a target was
-missed. `controller_experiments.py` lists the experiments and their targets.
+Starts, targets and uncalibrated cameras are random; cameras are rotated by up to 180 degrees
+from the controller's initial assumption. The arm is simulated kinematically. The exit status is
+1 if a target was missed. `controller_experiments.py` lists the experiments and their targets.
 """
 
 from collections.abc import Callable, Iterator
@@ -36,11 +36,11 @@ from hrc_learn.viz import palette
 from hrc_learn.viz.figures import STYLE, WIDTH
 
 CHUNK = 250
-"""Trials in one batch: their tensors stay in the cache."""
+"""Number of trials in one batch: their tensors stay in the cache."""
 TABLE_WIDTH = 132
-"""Characters of a printed table; a log file has no width of its own."""
+"""Width of a printed table [characters]; a log file has no width."""
 PANELS = 4
-"""Panels in a row of the figure."""
+"""Number of panels in a row of the figure."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,13 +62,13 @@ class Args:
     robot: str = "panda"
     """Arm, for experiments about kinematics alone."""
     ray: bool = False
-    """Spread the trials over processes or machines with Ray; the figures stay the same."""
+    """Distribute the trials over processes or machines with Ray; the results stay the same."""
     out: Path | None = None
-    """Folder for the figures and the picture."""
+    """Folder for the measured values and the picture."""
     overwrite: bool = False
     """Replace that folder."""
     figure: Path | None = None
-    """Receives a picture of the times to the target, as .png or .svg."""
+    """File for a picture of the times to the target, as .png or .svg."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -171,7 +171,7 @@ def run_with_ray(jobs: list[Job]) -> Iterator[Any]:
 
 
 def show_tables(names: list[str], figures: dict[str, float]) -> list[Criterion]:
-    """Print the figures beside their targets; returns the missed ones."""
+    """Print the values next to their targets; returns the missed criteria."""
     console = Console()
     console = Console(width=max(console.width, TABLE_WIDTH))
     grasps = [name for name in names if f"{name}_success" in figures]

@@ -1,7 +1,8 @@
-"""Disturbance trials: does the tool stay while a person pushes, and the limits under stress?
+"""Disturbance trials: deviation of the tool while a person pushes, and limits under stress.
 
-The controller in batches of closed loops: a person's null-space force on the elbow; and random
-goals, cameras, null-space inputs and faults.
+The controller runs in batches of closed loops. In the first kind of trials, a person's
+null-space force acts on the elbow; in the second kind, goals, cameras, null-space inputs and
+faults are random.
 """
 
 from __future__ import annotations
@@ -36,19 +37,19 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics import panda
 
 ELBOW = 4
-"""Joint that is pushed."""
+"""Joint that is pushed, counted from 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffortConfig:
-    """How the person pushes while the arm servoes on its target."""
+    """Pushes of the person while the arm servoes to its target."""
 
     count: int = 60
     seed: int = 0
     force: float = 6.0
-    """Of the person; the elbow's Jacobian maps it to the null-space input d [N]."""
+    """Force of the person [N]; the elbow's Jacobian maps it to the null-space input d."""
     away: float = 7.0
-    """Time of pushing one way, as in the paper [s]."""
+    """Time of pushing in one direction, as in the paper [s]."""
     back: float = 4.0
     """Time of pushing back [s]."""
     dt: float = 0.001
@@ -64,9 +65,9 @@ class EffortResult:
     elbow: Float[Tensor, "trials"]
     """Displacement of the elbow [m]."""
     deviation: Float[Tensor, "trials"]
-    """Displacement of the tool, on target at the start [m]."""
+    """Displacement of the tool, which is at its target at the start [m]."""
     turn: Float[Tensor, "trials"]
-    """Turn of the tool [rad]."""
+    """Rotation of the tool [rad]."""
 
     def summary(self) -> dict[str, float]:
         """Medians and 95th percentiles in mm and degrees."""
@@ -81,10 +82,10 @@ class EffortResult:
 
 
 def run_effort_trials(config: EffortConfig) -> EffortResult:
-    """Push the elbow of many arms, each servoing on a target where its tool already is."""
+    """Push the elbow of many arms, each servoing to a target that its tool has reached."""
     rng = torch.Generator().manual_seed(config.seed)
     noise = torch.randn(config.count, 7, generator=rng, dtype=torch.float64)
-    # 0.2 rad on each joint: postures that differ, all within the limits and off the table.
+    # 0.2 rad on each joint: different postures, all within the limits and above the table.
     q = panda.ready + 0.2 * noise
 
     def elbow_position(q: Tensor) -> Tensor:
@@ -145,17 +146,18 @@ def _self_motion(q: Tensor) -> Tensor:
 
 
 Fault = Literal["none", "nan", "late", "lost"]
-"""NaN in 1 % of images and of joint readings; images 100 ms late and joint states that stay
-away for 100 ms; a marker covered every other second for up to 3 s."""
+"""Faults of a trial. "nan": NaN in 1 % of images and joint readings. "late": images are delayed
+by 100 ms, and joint states are missing for 100 ms. "lost": the marker is covered every other
+second, for up to 3 s."""
 
-_FRAME = 0.03  # interval of images [s]
-_LATE = 0.1  # delay of images, and for how long joint states stay away [s]
-_EFFORT_TIME = 0.4  # after which the null-space input is drawn again [s]
+_FRAME = 0.03  # period of images [s]
+_LATE = 0.1  # delay of images, and time for which joint states are missing [s]
+_EFFORT_TIME = 0.4  # time after which the null-space input is drawn again [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class StressConfig:
-    """How trials are drawn."""
+    """Distribution of the trials."""
 
     count: int = 1000
     seed: int = 0
@@ -198,7 +200,7 @@ class StressResult:
 
 
 def ticks_beyond(beyond: Int[Tensor, "trials kinds"]) -> dict[str, float]:
-    """Number of trials, and by kind of limit that of the ticks beyond it, by name."""
+    """Number of trials, and number of ticks beyond each kind of limit, by name."""
     names = ("position", "velocity", "acceleration", "jerk", "speed")
     totals = zip(names, beyond.sum(0).tolist(), strict=False)
     return {
@@ -243,13 +245,15 @@ def run_stress_trials(config: StressConfig) -> StressResult:
 
 
 def all_finite(everything: object) -> Bool[Tensor, "trials"]:
-    """Where no tensor of a tree with the trials before holds a NaN or an infinity."""
+    """True for trials in which all tensors of a tree are finite; trials are their first
+    dimension.
+    """
     leaves = [leaf for leaf in _pytree.tree_leaves(everything) if leaf.dim() > 1]
     return torch.stack([leaf.isfinite().flatten(1).all(-1) for leaf in leaves]).all(0)
 
 
 def uniform(rng: torch.Generator, *shape: int) -> Tensor:
-    """Numbers from 0 to 1."""
+    """Random numbers from 0 to 1."""
     return torch.rand(shape, generator=rng, dtype=torch.float64)
 
 
@@ -258,7 +262,7 @@ def random_controller(
     rng: torch.Generator,
     estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator] = CompositeEstimator,
 ) -> tuple[AdaptiveController, PinholeCamera]:
-    """Cameras over the workspace, goals anywhere, within reach or not."""
+    """Controller with cameras above the workspace and goals anywhere, in reach or not."""
     turn = 2 * torch.pi * uniform(rng, count)
     middle = torch.tensor((0.3, 0.4, 0.3), dtype=torch.float64)
     camera = PinholeCamera.above(
@@ -278,7 +282,7 @@ def random_controller(
 
 
 class _JointReadings:
-    """Joint positions as the controller reads them, and which are stale."""
+    """Joint positions as read by the controller, and flags of stale readings."""
 
     def __init__(self, config: StressConfig, rng: torch.Generator):
         self.fault, self.dt, self.rng = config.fault, config.dt, rng

@@ -1,4 +1,4 @@
-"""How exact movement primitives are: reproduction, orientations, gradients."""
+"""Accuracy of movement primitives: reproduction, orientations, gradients."""
 
 import math
 from collections.abc import Callable
@@ -15,14 +15,14 @@ from hrc_learn.geometry import quaternion
 TURNS = (10, 90, 179, 181, 200, 359, 361, 450, 720)
 """Angles [deg] of noise-free rotations."""
 STEP = 1e-5
-"""Of central differences, relative to inputs of size one."""
+"""Step of central differences, for inputs of size one."""
 
 
 def measure_reproduction(folder: Path) -> dict[str, float]:
     """Median error over recordings, relative to the largest range of each.
 
     Args:
-        folder: Of `read_recordings`.
+        folder: Folder for `read_recordings`.
     """
     shown = [one for several in read_recordings(folder).values() for one in several]
     figures = {}
@@ -37,21 +37,21 @@ def measure_reproduction(folder: Path) -> dict[str, float]:
 
 
 NOISE, FRAME_RATE = 2e-3, 30.0
-"""Of a cheap arm's encoders, as a share of the range (of one radian 2 mrad); and of the samples
-that a camera's rate leaves [1/s]."""
+"""Noise of an inexpensive arm's encoders, as a fraction of the range (2 mrad of one radian),
+and rate of the samples, as of a camera [1/s]."""
 FIXED_COUNTS = (10, 20, 50, 100)
 
 
 @torch.no_grad()
 def measure_noise(folder: Path) -> dict[str, float]:
-    """What a fit without options makes of noisy recordings, the first of each file.
+    """Errors of a fit with default options to noisy recordings, the first of each file.
 
-    Positions are scaled to a range of one, resampled, and noise is added. Errors are those to
-    the recording as it was; its peak acceleration is that of a fit with as many functions as it
-    bears, 200 at most.
+    Positions are scaled to a range of one and resampled, and noise is added. Errors are
+    relative to the original recording. Its peak acceleration is that of a fit with the largest
+    number of basis functions that it supports, at most 200.
 
     Args:
-        folder: Of `read_recordings`.
+        folder: Folder for `read_recordings`.
     """
     rng = np.random.default_rng(0)
     peaks, errors = [], []
@@ -82,7 +82,7 @@ def measure_noise(folder: Path) -> dict[str, float]:
 
 
 def measure_turns() -> dict[str, float]:
-    """Largest RMSE [deg] of noise-free turns about one axis."""
+    """Largest RMSE [deg] of noise-free rotations about one axis."""
     s = torch.linspace(0, 1, 1000, dtype=torch.float64)
     axis = torch.tensor([0.48, 0.60, 0.64], dtype=torch.float64)
     errors = []
@@ -95,7 +95,7 @@ def measure_turns() -> dict[str, float]:
 
 
 def measure_gradient_error() -> dict[str, float]:
-    """Derivatives of motions against central differences, relative, in float64."""
+    """Relative difference of derivatives of motions from central differences, in float64."""
     rng = torch.Generator().manual_seed(0)
     s = torch.linspace(0, 1, 100, dtype=torch.float64)
     vector = torch.stack([torch.sin(3 * s), s**2, torch.cos(2 * s)], dim=-1)
@@ -127,7 +127,9 @@ def measure_gradient_error() -> dict[str, float]:
 def _gradient_error(
     function: Callable[..., Tensor], inputs: tuple[Tensor, ...], rng: torch.Generator
 ) -> float:
-    """Of a random sum of the outputs along a random direction of each input; the largest."""
+    """Largest relative error of the gradient of a random sum of the outputs, along a random
+    direction of each input.
+    """
     inputs = tuple(x.detach().clone().requires_grad_() for x in inputs)
     seed = torch.randn(function(*inputs).shape, generator=rng, dtype=torch.float64)
     gradients = torch.autograd.grad(function(*inputs), inputs, seed)

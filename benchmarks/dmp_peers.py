@@ -1,4 +1,4 @@
-"""What other libraries take for the same demonstration, where they are installed."""
+"""Times and errors of other libraries on the same demonstration, if they are installed."""
 
 import importlib.util
 from collections.abc import Callable
@@ -12,7 +12,7 @@ type Demonstration = tuple[Tensor, Tensor]
 
 
 def measure_peers(demonstration: Demonstration, n_basis: int) -> dict[str, float]:
-    """Figures of all that can be imported; says which cannot."""
+    """Measured values of all installed libraries; prints the missing ones."""
     figures = {}
     for package, measure in PEERS.items():
         if importlib.util.find_spec(package) is None:
@@ -23,7 +23,7 @@ def measure_peers(demonstration: Demonstration, n_basis: int) -> dict[str, float
 
 
 def measure_movement_primitives(demonstration: Demonstration, n_basis: int) -> dict[str, float]:
-    """Its default, a fourth-order method in Cython."""
+    """Values of movement_primitives with its default, a fourth-order method in Cython."""
     from movement_primitives.dmp import DMP  # pyright: ignore[reportMissingImports]
 
     time, position = (column.double().numpy() for column in demonstration)
@@ -46,7 +46,9 @@ def measure_movement_primitives(demonstration: Demonstration, n_basis: int) -> d
 
 
 def measure_mp_pytorch(demonstration: Demonstration, n_basis: int) -> dict[str, float]:
-    """Its ProDMP: weights to a trajectory by a table, as here."""
+    """Values of ProDMP in MP_PyTorch, which maps weights to a trajectory by a table, as this
+    package.
+    """
     from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
 
     time, position = (column.float() for column in demonstration)

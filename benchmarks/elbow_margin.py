@@ -20,13 +20,13 @@ from hrc_learn.teleoperation import ScriptedForce
 type Clearance = Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
 """Distance [m] between an arm at given joint positions [rad] and its surroundings."""
 
-# Step of a self-motion at the elbow [m], at the joints [rad], and the largest number of steps.
+# Step of a self-motion at the elbow [m], step at the joints [rad], and largest number of steps.
 _STEP, _STEP_JOINTS, _MAX_STEPS = 0.005, 0.05, 300
-# Elbow velocity per force below which the elbow moves no further [m/s/N]: a few per cent of
+# Elbow velocity per force below which the elbow counts as blocked [m/s/N]: a few per cent of
 # that of a free elbow.
 _STILL = 5e-4
-# Distances at which the margin of a pull ends: of a joint from its limit [rad], and of the arm
-# from its surroundings [m].
+# Distances at which the margin of a pull ends: distance of a joint from its limit [rad], and of
+# the arm from its surroundings [m].
 _NEAR_LIMIT, _NEAR = 0.1, 0.03
 FAR = 0.15
 """Displacement of the elbow by a pull that counts as followed [m]."""
@@ -47,7 +47,9 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Count the pulls with a margin of 150 mm, and those among them that moved that far."""
+    """Count the pulls with a margin of 150 mm, and the pulls among these that moved the elbow
+    that far.
+    """
     experiment = CollaborationExperiment(
         placing=args.placing, aiming=args.aiming, pulls="random"
     )
@@ -104,7 +106,7 @@ def elbow_margin(
         ):
             break
         q = q + self_motion * min(_STEP / speed, _STEP_JOINTS / float(self_motion.norm()))
-        # Newton step back to the pose, from which the step along the tangent departed.
+        # Newton step back to the pose, which the step along the tangent has left.
         q = q + torch.linalg.pinv(chain.jacobian(q)) @ chain.forward(q).twist_to(pose)
     return farthest
 

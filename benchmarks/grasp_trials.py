@@ -44,53 +44,56 @@ from hrc_learn.kinematics.inverse import best_postures, solutions_from
 from hrc_learn.regions import JointRegion
 
 TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
-"""Centre and half edges of the table [m], as simulated."""
+"""Centre and half edges of the simulated table [m]."""
 PEDESTAL = ((-0.03, 0.0, -0.36), (0.12, 0.12, 0.36))
-"""The same of what the arm stands on [m]."""
+"""Centre and half edges of the arm's pedestal [m]."""
 
 
 ROLL_CLASSES = ((0, 30), (30, 60), (60, 90), (90, 135), (135, 180))
 """Camera roll from the paper's camera [deg], one class for each fifth of the trials."""
 
 CENTRE = (0.2, 0.5, 0.3)
-"""Of the Cartesian region: the middle of the paper's RBF centers in x and y [m]."""
+"""Centre of the Cartesian region: the middle of the paper's RBF centres in x and y [m]."""
 
 MARKER = (0.05, 0.0, -0.08)
-"""In the frame of the tool centre point [m]."""
+"""Marker in the frame of the tool centre point [m]."""
 _HALF_SIDE = 0.024
 CORNERS = tuple(
     (x * _HALF_SIDE, y * _HALF_SIDE, 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))
 )
-"""Of the marker, from its centre in the tool's frame [m]."""
+"""Corners of the marker relative to its centre, in the tool's frame [m]."""
 
-# From which postures of arms without an inverse in closed form are sought.
+# Number of starts for the inverse kinematics of arms without a closed form.
 _STARTS = 200
-# Where an arm with its tool down is tried: heights, as those of a Franka arm [m], and shares
-# of the distance from the base. A long tool, or a wrist that bends little, reaches less far.
+# Candidate centres for an arm with its tool pointing down: heights, as for a Franka arm [m],
+# and fractions of the distance from the base. An arm with a long tool, or with a wrist that
+# bends little, has a shorter reach.
 _HEIGHTS, _NEARER = (CENTRE[2], 0.2, 0.1), (1.0, 0.85, 0.7)
 _SPREAD = (0.08, 0.08, 0.05)
-"""Of targets, either way from the centre along each axis [m]."""
+"""Largest distance of targets from the centre along each axis, either way [m]."""
 
 
 class TrialArm:
-    """An arm that servoes, and where, by its reach.
+    """An arm for servoing, with a region that depends on its reach.
 
     Attributes:
         arm: The arm.
-        scale: Distances, as shares of those for a Franka arm; at most 1.
-        task: What of its tool's pose is led: of five joints position and axis.
-        centre: Of the Cartesian region [m].
-        down: Orientation of the tool there: the paper's, of others than Franka's straight down.
-        postures: Joint positions with that pose, the best first [rad]. Of arms without an
-            inverse in closed form the nearest to its ready posture are first, if any is among
-            those from which it gets to all targets.
+        scale: Distances, as fractions of those for a Franka arm; at most 1.
+        task: Controlled part of the tool's pose: with five joints, position and axis.
+        centre: Centre of the Cartesian region [m].
+        down: Orientation of the tool there: the paper's orientation for Franka's arms, straight
+            down for others.
+        postures: Joint positions with that pose, the best first [rad]. For arms without a
+        closed
+            inverse, the postures from which the arm reaches all targets, if there are any,
+            ordered by their distance from the ready posture.
     """
 
     def __init__(self, arm: Arm):
-        """Place table and region before an arm.
+        """Place table and region in front of an arm.
 
         Raises:
-            UnreachableError: It does not get there with its tool pointing down.
+            UnreachableError: The arm does not reach the region with its tool pointing down.
         """
         self.arm, self.chain = arm, arm.chain
         self.task: TaskSpace = "pose" if len(arm.joint_names) >= 6 else "position+axis"
@@ -114,17 +117,18 @@ class TrialArm:
                 f"the {arm.name} does not get its tool to {self.centre.tolist()} m, pointing "
                 "down"
             )
-        # The first place from which it gets to all targets, else the first there is.
+        # The first centre from which the arm reaches all targets, otherwise the first reachable
+        # centre.
         self.centre, self.down, self.postures, _ = max(possible, key=lambda place: place[-1])
 
     def _place(
         self, centre: tuple[float, float, float]
     ) -> tuple[Tensor, Tensor, Float[Tensor, "postures joints"], bool] | None:
-        """Centre, orientation and postures there; and whether it gets to all targets."""
+        """Centre, orientation and postures there; and True if the arm reaches all targets."""
         self.centre = self.scaled(centre)
         found = self._solutions(self.task)
         if len(found) and self.task != "pose":
-            # Its joints decide how the tool is turned about its axis.
+            # The joints determine the rotation of the tool about its axis.
             self.down = self.chain.forward(best_postures(self.chain, found)[0]).orientation
             found = self._solutions("pose")
         if len(found) == 0:
@@ -135,16 +139,17 @@ class TrialArm:
         reaching = postures[self._reaches_targets(postures)]
         if len(reaching) == 0:
             return self.centre, self.down, postures, False
-        # A start near the ready posture then has the shortest way to servo from.
+        # The nearest posture to the ready posture comes first: servoing then has the shortest
+        # way.
         far = (reaching - self.chain.ready).norm(dim=-1)
         return self.centre, self.down, reaching[far.argsort()], True
 
     def _reaches_targets(
         self, postures: Float[Tensor, "postures joints"]
     ) -> Bool[Tensor, " postures"]:
-        """Whether targets in all corners are reached from postures, and not at the last reach.
+        """Flags of postures from which the arm reaches targets in all corners nonsingularly.
 
-        An arm that is stretched out to a target is singular there, so that it gets no closer.
+        An arm stretched out towards a target is singular there and comes no closer.
         """
         signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
         corners = Pose(
@@ -163,17 +168,17 @@ class TrialArm:
         return found[found.isfinite().all(-1)]
 
     def scaled(self, lengths: tuple[float, ...]) -> Float[Tensor, " n"]:
-        """Lengths as they are for this arm [m]."""
+        """Lengths scaled for this arm [m]."""
         return self.scale * torch.tensor(lengths, dtype=torch.float64)
 
     def clearance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
-        """Distance from itself, the table and the pedestal [m]; negative in contact.
+        """Distance of the arm from itself, the table and the pedestal [m]; negative in contact.
 
         Args:
             q: Joint position [rad].
         """
         distance = self.arm.body.self_distance(q)
-        if not self._above.capsules:  # of a description without shapes
+        if not self._above.capsules:  # no capsules: a description without shapes
             return distance
         below = self.centre - self.scaled(CENTRE)
         for body, (centre, half_size), lower in (
@@ -186,15 +191,16 @@ class TrialArm:
 
     @cached_property
     def _above(self) -> CapsuleArm:
-        """Without link 1, which always is as near to what the arm stands on."""
+        """Arm without link 1, whose distance from the pedestal never changes."""
         body = self.arm.body
         return CapsuleArm(self.chain, [c for c in body.capsules if c.link > 1])
 
     @cached_property
     def _above_pedestal(self) -> CapsuleArm:
-        """Without links either whose capsule meets the pedestal in most postures.
+        """Arm without link 1 and links whose capsules overlap the pedestal in most postures.
 
-        That of a thick upper arm, which turns about a low shoulder, tells nothing.
+        The capsule of a thick upper arm that rotates about a low shoulder gives no useful
+        distance.
         """
         limits, rng = self.chain.limits, torch.Generator().manual_seed(0)
         share = torch.rand(_STARTS, len(limits.lower), generator=rng, dtype=torch.float64)
@@ -208,7 +214,7 @@ class TrialArm:
         return CapsuleArm(self.chain, [c for c in self._above.capsules if tells(c)])
 
 
-_PANDA_REACH = 0.95  # [m], as `reach_of` it
+_PANDA_REACH = 0.95  # [m], as computed by `reach_of`
 
 
 def reach_of(arm: Arm) -> float:
@@ -227,23 +233,23 @@ def clear_posture(
     least: float = 0.03,
     samples: int = 25,
 ) -> Float[Tensor, "*batch n"]:
-    """The first posture whose straight path in joint space keeps clear of contacts.
+    """The first posture whose straight path in joint space is free of contacts.
 
-    A joint-space approach follows that path. Where none is clear, the posture whose path comes
-    least near to a contact.
+    A joint-space approach follows that path. If no path is free, the posture whose path has the
+    largest clearance.
 
     Args:
         postures: Candidates [rad], the best first.
         start: Present joint positions [rad].
         clearance: Distance from all contacts [m] at joint positions (*points, n).
-        least: Distance to keep [m]; nearer to the start what the start has is enough.
-        samples: Points looked at along the path.
+        least: Distance to keep [m]; near the start, the clearance of the start is sufficient.
+        samples: Number of points checked along the path.
     """
     flat = start.reshape(-1, start.shape[-1])
     best = postures[:1].expand_as(flat).clone()
     found = torch.full_like(flat[:, 0], -torch.inf)
     wanted = torch.minimum(clearance(flat), found.new_tensor(least))
-    # Without the start itself, where the arm is anyway.
+    # Without the start itself, where the arm is already.
     fraction = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
     for posture in postures:
         missing = (found < wanted).nonzero().flatten()
@@ -258,21 +264,21 @@ def clear_posture(
 
 @cache
 def trial_arm(choice: ArmChoice) -> TrialArm:
-    """An arm, ready for trials."""
+    """An arm that is prepared for trials."""
     return TrialArm(choice.arm())
 
 
-# At the joints' speeds the arm moves less than 5 cm in between [s].
+# Time in which the arm moves by less than 5 cm at its highest joint speeds [s].
 _SECONDS_BETWEEN_CONTACT_CHECKS = 0.024
-# Starts are drawn again below this distance from contact [m].
+# Distance from contact below which a start is drawn again [m].
 _START_CLEARANCE = 0.01
-# Times that all starts are drawn, none of them free, before the arm is refused.
+# Number of draws of all starts without a contact-free start after which the arm is refused.
 _MOST_DRAWS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialConfig:
-    """How trials are drawn. Lengths [m], angles [rad]."""
+    """Distribution of the trials. Lengths [m], angles [rad]."""
 
     count: int = 1000
     seed: int = 0
@@ -280,7 +286,7 @@ class TrialConfig:
     starts: Literal["near", "global"] = "near"
     """Ready posture with 0.4 rad of noise on each joint, or anywhere within the limits."""
     tilt: tuple[float, float] = (0.0, 0.35)
-    """Of the camera's axis from the vertical."""
+    """Range of the angle of the camera's axis with the vertical."""
     imperfections: Imperfections = field(
         default_factory=lambda: Imperfections(frame_steps=4, latency_frames=1, noise=0.5)
     )
@@ -289,11 +295,11 @@ class TrialConfig:
     dt: float = 0.008
     """Control step [s]."""
     feature: Literal["centre", "corners"] = "centre"
-    """Of the marker: the paper's single point, or the four corners."""
+    """Feature of the marker: the paper's single point, or the four corners."""
     pull: Literal["paper", "saturated"] = "paper"
-    """Of the marker to its target: the paper's ends at the ellipse, where an arm that comes in
-    from afar may stop at a wall of its box; the other, which the work cell's servoing has,
-    holds wherever the marker is seen (`VisionRegion`)."""
+    """Potential of the vision region. The paper's pull vanishes outside the ellipse, so an arm
+    that comes from a distance may stop at a wall of its box. "saturated", as in the work cell,
+    pulls wherever the marker is visible (`VisionRegion`)."""
     law: Literal["recommended", "printed"] = "recommended"
     """The paper's law as printed has Table I's gains and no joint-space approach."""
     half_size: tuple[float, float, float] = HALF_SIZE
@@ -301,10 +307,10 @@ class TrialConfig:
     stiffness: tuple[float, float, float] = (4e-4, 4e-4, 4e-5)
     """k_c of the law as printed."""
     initial_jacobian: Callable[[Tensor], Tensor] = lambda J: J
-    """Change of the paper's initial image Jacobian."""
+    """Modification of the paper's initial image Jacobian."""
     contacts: bool = False
-    """Look for contacts of the arm with itself, the table and the pedestal, at a third more
-    time. Starts are free of them in any case."""
+    """Check for contacts of the arm with itself, the table and the pedestal, which takes a
+    third more time. Starts are free of contacts in any case."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,15 +319,16 @@ class TrialResult:
 
     roll_class: Int[Tensor, "trials"]
     on_target: Bool[Tensor, "trials"]
-    """Final pixel error below 5 px, wherever the tool is: what a person sees who looks at the
-    image alone."""
+    """Final pixel error below 5 px, wherever the tool is: success as seen in the image alone.
+    """
     success: Bool[Tensor, "trials"]
-    """Final pixel error below 5 px with the tool in the region, no limit broken. Of corners the
-    mean counts: the law turns the tool into its orientation cone, not further."""
+    """Final pixel error below 5 px, tool in the region, and no limit exceeded. With corners,
+    the mean error counts: the law rotates the tool into its orientation cone and not further.
+    """
     time: Float[Tensor, "trials"]
-    """Until the pixel error stayed below 5 px [s]; infinite if it did not."""
+    """Time until the pixel error stayed below 5 px [s]; infinite if it did not."""
     vision_time: Float[Tensor, "trials"]
-    """Of that, since the camera took over [s]."""
+    """Part of that time after the camera took over [s]."""
     violations: Int[Tensor, "trials"]
     """Steps that broke a limit of position, velocity, acceleration or jerk."""
     touched: Bool[Tensor, "trials"]
@@ -329,11 +336,11 @@ class TrialResult:
     touched_itself: Bool[Tensor, "trials"]
     """Contact of the arm with itself; False if not checked."""
     peak_speed: Float[Tensor, "trials"]
-    """Largest joint velocity over its limit."""
+    """Largest joint velocity relative to its limit."""
     hand_overs: Int[Tensor, "trials"]
-    """How often the camera took over or let go."""
+    """Number of times that the camera took over or released control."""
     jacobian_error: Float[Tensor, "trials"]
-    """Of the linear part of the image Jacobian's estimate at the end, relative."""
+    """Relative error of the linear part of the estimated image Jacobian at the end."""
 
     def summary(self) -> dict[str, float]:
         """Rates, medians and totals, by name."""
@@ -364,10 +371,11 @@ def _rate(flags: Tensor) -> float:
 
 
 def _median(times: Tensor) -> float:
-    """Median where infinity, for never, is a value like any other; of no trials it is NaN."""
+    """Median in which infinity (never) counts as a value; NaN without trials."""
     if not len(times):
         return math.nan
-    times = torch.where(times.isnan(), math.inf, times)  # never taken over: inf - inf
+    # never taken over: infinity minus infinity
+    times = torch.where(times.isnan(), math.inf, times)
     return times.quantile(0.5, interpolation="higher").item()
 
 
@@ -387,8 +395,8 @@ def run_trials(
     """Run all trials of a configuration.
 
     Args:
-        make_estimator: From the network that starts at the paper's initial Jacobian.
-        config: What to draw and how long to run.
+        make_estimator: Makes the estimator from the network with the paper's initial Jacobian.
+        config: Distribution and duration of the trials.
     """
     rng = torch.Generator().manual_seed(config.seed)
     scene = draw_scene(config, rng)
@@ -492,7 +500,7 @@ def grasp_controller(
 
 
 class Judge:
-    """Watches the closed loops and keeps what the result needs."""
+    """Observes the closed loops and collects the values of the result."""
 
     def __init__(self, scene: TrialScene, controller: AdaptiveController, config: TrialConfig):
         self.scene, self.controller, self.dt = scene, controller, config.dt
@@ -537,7 +545,7 @@ class Judge:
         self.hand_overs += active != self.active
         self.active = active
         box = self.controller.goals.position
-        # 5 % beyond the wall count as in the box: a potential ends at the wall, not inside.
+        # Positions up to 5 % beyond the wall count as inside: a potential ends at the wall.
         self.in_box = ((tool.position - box.centre).abs() <= 1.05 * box.half_size).all(-1)
         v = command.joint_velocity
         self.violations += self.watch.violations(q, v).any(-1) | ~v.isfinite().all(-1)

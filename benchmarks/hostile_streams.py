@@ -1,5 +1,7 @@
-"""Streams of hostile commands through the safety filter, as a 1 kHz driver sends what it makes
-of them: for others to check against the limits of their arms.
+"""Send streams of hostile commands through the safety filter.
+
+The commands that a 1 kHz driver would send are kept for independent checks against the limits
+of arms.
 """
 
 from __future__ import annotations
@@ -17,63 +19,67 @@ from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.kinematics import JointLimits, arm
 
 STREAMS = ("random", "bang-bang", "resonant", "outward", "chasing", "poisoned")
-"""Kinds of commands: new random velocities in each tick or held for a while; signs at ten times
-any limit that change after 1 to 300 ms; swings of 0.5 to 200 Hz; outwards wherever a joint is;
-the other way as soon as the arm does what it was told; all of them, with numbers that are none
-in a third of the ticks."""
+"""Kinds of commands.
+
+"random": new random velocities in each tick, or held for some time. "bang-bang": signs at ten
+times any limit that change after 1 to 300 ms. "resonant": oscillations of 0.5 to 200 Hz.
+"outward": towards the nearer limit. "chasing": reversed as soon as the arm obeys. "poisoned":
+all of these, with NaN or infinity in a third of the ticks.
+"""
 
 _POISONS = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e300, -1e30], dtype=torch.float64)
-# Told for all arms at once; the time that passes is the control step.
+# These inputs are common to all arms; the time step is the control step.
 _STEPS = torch.cat([_POISONS, _POISONS.new_tensor([0.0, -1e-3, 5.0])])
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamConfig:
-    """How streams are drawn."""
+    """Distribution of the streams."""
 
     arm: str = "fr3"
-    """By its name, as for `arm`."""
+    """Name of the arm, as for `arm`."""
     count: int = 120
-    """Of streams, as many of each kind."""
+    """Number of streams; each kind has the same number."""
     ticks: int = 1000
     """Of each."""
     seed: int = 0
     dt: float = 1e-3
     """Control step [s]."""
     noise: float = 1e-4
-    """Standard deviation of a reading of half of the arms; the others read exactly [rad]."""
+    """Standard deviation of a reading of half of the arms; the others read without error [rad].
+    """
     poison: float = 1 / 3
-    """Share of the ticks in which a number of a poisoned stream is none."""
+    """Fraction of the ticks in which a poisoned stream contains NaN or infinity."""
     event: float = 2e-3
-    """Share of the ticks with a stop, a stale reading, a person beside the tool, or a step that
-    is none; each."""
+    """Fraction of the ticks with a stop; the same for a stale reading, a person near the tool,
+    and an invalid step."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HostileStreams:
-    """What was sent, and where the arm was, from rest on."""
+    """Commands sent, and positions of the arms, from rest on."""
 
     position: Float[Tensor, "ticks streams n"]
-    """After each tick [rad]."""
+    """Position after each tick [rad]."""
     velocity: Float[Tensor, "ticks streams n"]
-    """Sent for it [rad/s]; zero in the first."""
+    """Velocity sent in each tick [rad/s]; zero in the first."""
     kind: Int[Tensor, "streams"]
     """Index into `STREAMS`."""
     poisoned: int
-    """Ticks with a number that was none."""
+    """Number of ticks with NaN or infinity."""
 
 
 @torch.inference_mode()
 def hostile_streams(config: StreamConfig, safety: SafetyFilter | None = None) -> HostileStreams:
-    """Send hostile commands through the filter to arms that do what they are told.
+    """Send hostile commands through the filter to arms that follow them exactly.
 
-    The arms start at rest, anywhere within their limits: a quarter of the joints within 30 mrad
-    of one.
+    The arms start at rest, anywhere within their limits: a quarter of the joints start within
+    30 mrad of a limit.
 
     Args:
-        config: How.
-        safety: The filter; None: one of the arm's limits and `config.safety`.
+        config: Distribution of the streams.
+        safety: The filter; None: a filter with the arm's limits and `config.safety`.
     """
     rng = torch.Generator().manual_seed(config.seed)
     robot, count, dt = arm(config.arm), config.count, config.dt
@@ -81,7 +87,7 @@ def hostile_streams(config: StreamConfig, safety: SafetyFilter | None = None) ->
     kind = torch.arange(count) % len(STREAMS)
     poisoned = (kind == STREAMS.index("poisoned")).unsqueeze(-1)
     noise = config.noise * (torch.arange(count) % 4 < 2).unsqueeze(-1)
-    # The tool's speed is capped on a third of the arms: on the others only the joints' limits.
+    # The tool's speed is capped on a third of the arms; the others have joint limits only.
     uncapped = (torch.arange(count) % 3 > 0).view(-1, 1, 1)
     command = _commands(config, robot.limits, kind, rng)
     q = _start(robot.limits, count, rng)
@@ -136,7 +142,7 @@ def _where(rng: torch.Generator, count: int, share: float, yes: float, no: float
 
 
 def _poisoned(given: Tensor, hit: Tensor, rng: torch.Generator) -> Tensor:
-    """A copy in which one number of each stream that is hit is none."""
+    """A copy with NaN or infinity in one number of each selected stream."""
     rows = hit.squeeze(-1).nonzero().flatten()
     columns = torch.randint(given.shape[-1], (len(rows),), generator=rng)
     given = given.clone()
@@ -147,7 +153,9 @@ def _poisoned(given: Tensor, hit: Tensor, rng: torch.Generator) -> Tensor:
 def _commands(
     config: StreamConfig, limits: JointLimits, kind: Tensor, rng: torch.Generator
 ) -> Callable[[float, Tensor, Tensor], Tensor]:
-    """Joint velocities by time, reading and the velocity sent last, a kind for each stream."""
+    """Joint velocities as a function of time, reading and last sent velocity; one kind per
+    stream.
+    """
     count, dt = config.count, config.dt
     shape = (count, 7)
     frequency = 0.5 * 400 ** uniform(rng, *shape)
@@ -163,7 +171,7 @@ def _commands(
         changes = uniform(rng, *shape) < dt / hold
         signs[0] = torch.where(changes, -signs[0], signs[0])
         signs[1] = torch.where(uniform(rng, *shape) < 0.2 * dt, -signs[1], signs[1])
-        # It has come to where it was sent, or stands: the other way.
+        # Reversed when the arm has reached the commanded velocity, or rests.
         arrived = ((v - last).abs() < 1e-3 * dt * limits.acceleration) & (
             uniform(rng, *shape) < 0.3
         )
@@ -183,7 +191,7 @@ def _commands(
                 20 * signs[2],
             ]
         )
-        # Poisoned streams are told all kinds, by turns of a second.
+        # Poisoned streams cycle through all kinds, one second each.
         turn = (kind + int(now)) % len(all_kinds)
         which = torch.where(kind < len(all_kinds), kind, turn)
         return all_kinds.gather(0, which.view(1, count, 1).expand(1, *shape))[0]

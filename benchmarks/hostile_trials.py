@@ -1,7 +1,7 @@
-"""Hostile trials: poisoned inputs, and plants that do less than the limits promise, later.
+"""Hostile trials: poisoned inputs, and plants slower and later than the limits declare.
 
-After each hostile phase the inputs are healthy again, and each arm has to move towards the
-ready posture: what was told wrongly must not be remembered.
+After each hostile phase the inputs are valid again, and each arm has to move towards the ready
+posture: wrong inputs must not have a lasting effect.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 
-# Beyond 1e12 nothing is a number to the controller.
+# The controller treats numbers beyond 1e12 as invalid.
 _POISONS = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e300, -1e30], dtype=torch.float64)
 _ESTIMATORS = {
     "kalman": KalmanEstimator,
@@ -46,13 +46,14 @@ _ESTIMATORS = {
     "paper": PaperEstimator,
     "fixed": FixedEstimator,
 }
-# What the filter commanded last: whoever is told otherwise can keep no limit of acceleration.
+# Last command of the filter, which is never poisoned: acceleration limits refer to it.
 _SPARED = ("safety.velocity", "safety.acceleration")
-# Healthy time after the hostile one [s]: at the 0.5 m/s of an approach the longest way takes
-# 3.5 s for its first half.
+# Duration of the valid phase after the hostile one [s]: at 0.5 m/s of an approach, the first
+# half of the longest way takes 3.5 s.
 _RECOVERY = 4.0
-_NEAR = 0.1  # from the ready posture, of any joint: there a run need not move [rad]
-_HOLD = 0.3  # for which a hostile command or person stays as it is [s]
+# Distance of all joints from the ready posture below which an arm need not move [rad].
+_NEAR = 0.1
+_HOLD = 0.3  # time for which a hostile command or person stays constant [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,16 +63,17 @@ class HostileResult:
     ticks: Int[Tensor, "trials"]
     """Hostile ticks."""
     poisoned: Int[Tensor, "trials"]
-    """Those with a number that was none, in a quantity of this arm or in the step."""
+    """Number of ticks with NaN, infinity or 1e300 in an input of this arm or in the step."""
     beyond: Int[Tensor, "trials kinds"]
-    """Ticks beyond the limits of position, velocity, acceleration and, where steps are regular,
-    jerk."""
+    """Number of ticks beyond the limits of position, velocity, acceleration and, if steps are
+    regular, jerk."""
     furthest: Float[Tensor, "trials"]
-    """Of any joint past a limit of position; negative: short of all [rad]."""
+    """Largest excess of any joint over a position limit; negative: distance to the nearest
+    limit [rad]."""
     unknown: Int[Tensor, "trials"]
     """Ticks with a NaN or an infinity in joint velocity or state."""
     stuck: Bool[Tensor, "trials"]
-    """Whether the arm was not half way to the ready posture 4 s later."""
+    """True if the arm had not covered half of its way to the ready posture after 4 s."""
 
     def summary(self) -> dict[str, float]:
         """Totals by name, and the furthest position in mrad."""
@@ -101,24 +103,24 @@ def _stuck(before: Tensor, after: Tensor) -> Bool[Tensor, "trials"]:
 
 @dataclass(frozen=True, kw_only=True)
 class PoisonConfig:
-    """How trials of the controller are drawn."""
+    """Distribution of the trials of the controller."""
 
     count: int = 250
     seed: int = 0
     duration: float = 4.0
-    """Of the hostile phase [s]."""
+    """Duration of the hostile phase [s]."""
     dt: float = 0.01
     """Control step [s]."""
     share: float = 1 / 3
-    """Of the ticks of each arm in which one number of its state or observation is none."""
+    """Fraction of the ticks in which one number of an arm's state or observation is invalid."""
     step_share: float = 0.1
-    """Of the ticks whose step is none, for all arms at once."""
+    """Fraction of the ticks with an invalid step, for all arms at once."""
     estimators: tuple[str, ...] = tuple(_ESTIMATORS)
-    """Of which image Jacobians are estimated, by as many arms each."""
+    """Estimators of the image Jacobian; each has the same number of arms."""
 
 
 def run_poison_trials(config: PoisonConfig) -> HostileResult:
-    """Poison arms, as many with each estimator, that people pull at, come near and leave."""
+    """Poison arms with each estimator, while people pull at them, approach and leave."""
     rng = torch.Generator().manual_seed(config.seed)
     names = config.estimators
     shares = [len(part) for part in torch.arange(config.count).tensor_split(len(names))]
@@ -197,7 +199,7 @@ def _poison(
 
 
 def _of_each_arm(goals: Goals, count: int) -> Goals:
-    """Goals with all their numbers apart for each arm."""
+    """Goals with separate numbers for each arm."""
 
     def apart(x: Tensor) -> Tensor:
         return x if x.dim() and len(x) == count else x.expand(count, *x.shape).clone()
@@ -212,10 +214,10 @@ def _normal(rng: torch.Generator, *shape: int) -> Tensor:
 def _poisoned(
     tree: Any, share: float, rng: torch.Generator, spared: tuple[str, ...]
 ) -> tuple[Any, Bool[Tensor, "trials"]]:
-    """A copy in which a share of the arms has one number that is none, anywhere.
+    """A copy in which a fraction of the arms has one invalid number at a random place.
 
     Returns:
-        The copy, and which arms.
+        The copy, and flags of these arms.
     """
     leaves, structure = _pytree.tree_flatten_with_path(tree)
     values = [x for _, x in leaves]
@@ -240,34 +242,34 @@ def _poisoned(
 
 @dataclass(frozen=True, kw_only=True)
 class PlantConfig:
-    """How trials of the safety filter with an imperfect plant are drawn."""
+    """Distribution of the trials of the safety filter with an imperfect plant."""
 
     count: int = 250
     seed: int = 0
     duration: float = 4.0
-    """Of the hostile phase [s]."""
+    """Duration of the hostile phase [s]."""
     dt: float = 0.01
     """Control step [s]."""
     braking: float = 0.3
-    """Least fraction of the limits of acceleration that a plant has; each has its own, up to
-    1. That of the adapter of a real arm."""
+    """Smallest fraction of the acceleration limits that a plant has; fractions are drawn up to
+    1. The default is that of a real arm's adapter."""
     delay: float = 0.02
     """Largest delay of a command [s]."""
     lag: float = 0.01
-    """Largest time constant of the servos after that [s]."""
+    """Largest time constant of the servos after the delay [s]."""
     jitter: float = 0.3
-    """Largest fraction by which a step is longer or shorter than it says."""
+    """Largest fraction by which a step is longer or shorter than declared."""
     encoder_offset: float = 2e-3
     """Largest error of a joint's zero [rad]."""
     encoder_noise: float = 1e-4
     """Standard deviation of a reading [rad]."""
     poison: float = 0.02
-    """Share of the ticks in which a reading, a command or a Jacobian is NaN."""
+    """Fraction of the ticks in which a reading, a command or a Jacobian is NaN."""
     worse: float = 1.0
-    """How many times slower, later and more irregular plants are than was declared."""
+    """Factor by which plants are slower, later and more irregular than declared."""
 
     def safety(self) -> SafetyConfig:
-        """What the filter is told."""
+        """Configuration of the filter, with the declared properties of the plant."""
         return SafetyConfig(
             braking=self.braking, delay=self.delay + self.lag, jitter=self.jitter
         )
@@ -279,11 +281,12 @@ _COMMANDS = 4  # kinds of hostile commands
 
 @torch.inference_mode()
 def run_plant_trials(config: PlantConfig) -> HostileResult:
-    """Command arms, by the filter, that follow as slowly, late and irregularly as declared.
+    """Command arms through the filter; they follow as slowly, late and irregularly as declared.
 
-    A quarter of the arms each is told random velocities, signs at ten times any limit that
-    change within steps, swings of 0.5 to 20 Hz, and to go on outwards wherever it is. Their
-    drivers draw up to the declared worst, and a third each has the worst.
+    Each quarter of the arms receives one kind of commands: random velocities, signs at ten
+    times any limit that change within steps, oscillations of 0.5 to 20 Hz, or velocities
+    towards the nearer limit. The properties of the plants are drawn up to the declared worst; a
+    third of the plants has the worst.
     """
     rng, count = torch.Generator().manual_seed(config.seed), config.count
     limits, dt = panda.limits, config.dt
@@ -348,7 +351,7 @@ def run_plant_trials(config: PlantConfig) -> HostileResult:
 def _hostile_commands(
     config: PlantConfig, rng: torch.Generator
 ) -> Callable[[float, Tensor], Tensor]:
-    """Joint velocities by time and reading, a kind for each arm [rad/s]."""
+    """Joint velocities as a function of time and reading, one kind per arm [rad/s]."""
     count, limits = config.count, panda.limits
     kind = (torch.arange(count) % _COMMANDS).unsqueeze(-1)
     frequency = 0.5 * 40 ** uniform(rng, count, 1)
@@ -371,14 +374,14 @@ def _hostile_commands(
 
 
 class _Plant:
-    """Joints that follow each command late, with a lag and a fraction of their acceleration."""
+    """Joints that follow each command with delay, lag and a fraction of their acceleration."""
 
     def __init__(self, config: PlantConfig, rng: torch.Generator):
         self.rng, self.noise = rng, config.encoder_noise
         self.jitter = min(config.worse * config.jitter, 0.9)
 
         def drawn() -> Tensor:
-            """0 to 1; the worst for a third of the arms."""
+            """Random numbers from 0 to 1; 1 (the worst) for a third of the arms."""
             return (1.5 * uniform(rng, config.count, 1)).clamp(max=1)
 
         least = config.braking / config.worse
@@ -398,7 +401,7 @@ class _Plant:
         return self.q + self.offset + self.noise * _normal(self.rng, *self.q.shape)
 
     def advance(self, command: Tensor) -> None:
-        """One fine step."""
+        """Advance by one step of the simulated joints."""
         self.told.append(command)
         place = (len(self.told) - 1 - self.late).expand(-1, self.q.shape[-1])
         wanted = torch.stack(tuple(self.told)).gather(0, place[None])[0]

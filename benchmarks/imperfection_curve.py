@@ -54,7 +54,7 @@ def main(args: Args) -> int:
         folder = args.out / f"size_{size:g}"
         words = ["run", args.experiment, "--out", str(folder), "--trials", str(args.trials)]
         words += ["--imperfections", str(size)]
-        # Exit status 1 only says that a bound was missed, as expected for large sizes.
+        # Exit status 1 means that a target was missed, as expected for large sizes.
         command = [sys.executable, "-m", "hrc_learn.cli", *words, "--overwrite", "--config"]
         command += ["film=false", f"processes={args.processes}"]
         subprocess.run(command, check=False)

@@ -79,8 +79,8 @@ class StartsConfig:
     count: int = 200
     """Number of closed loops."""
     largest_roll: float = math.pi
-    """Largest rotation of the camera about its axis, either way, so that no guess is right by
-    chance; 0: as in the demonstrations."""
+    """Largest rotation of the camera about its axis, either way. With a large rotation, no
+    guess is correct by chance; 0: as in the demonstrations."""
     tilt: float = 0.1
     """Largest tilt of the end effector at the start, either way about each axis."""
     reached: float = 5.0
@@ -186,7 +186,7 @@ class ClosedLoops:
         )
 
     def times(self, estimator: ImageJacobianEstimator) -> Float[Tensor, " starts"]:
-        """Time until the marker stays at its target [s]; infinite where it does not."""
+        """Time until the marker stays at its target [s]; infinite if it does not."""
         config, target = self.config, self.goals.vision.target
         controller = AdaptiveController(self.robot.chain, estimator, self.goals)
         reached = torch.full((len(self.start),), math.inf, dtype=torch.float64)
@@ -214,7 +214,9 @@ class ClosedLoops:
 
 
 class _Turned(KalmanEstimator):
-    """Starts from the learned Jacobian, rotated as the turned camera would have taught it."""
+    """Starts from the learned Jacobian, rotated as if it had been learned with the rotated
+    camera.
+    """
 
     def __init__(self, network: RBFImageJacobian, roll: Float[Tensor, " starts"]):
         super().__init__(network)

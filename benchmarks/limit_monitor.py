@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hrc_learn.kinematics import JointLimits
 
-# Relative excess tolerated: differences of rounded numbers exceed limits by it.
+# Tolerated relative excess: differences of rounded numbers exceed limits by this much.
 _MONITOR_TOLERANCE = 1 + 1e-9
 
 
@@ -17,7 +17,7 @@ _MONITOR_TOLERANCE = 1 + 1e-9
 class LimitMonitor:
     """Monitor of the motion limits of commanded joint velocities, from step to step.
 
-    It shares no code with the safety filter that has to keep them.
+    It shares no code with the safety filter, which has to keep these limits.
     """
 
     def __init__(

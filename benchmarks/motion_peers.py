@@ -1,7 +1,7 @@
 """Models of other libraries and papers that predict a motion from its start and goal.
 
-Each peer is fitted with several settings at once, so that settings share what they have in
-common. All demonstrations last one second, and are centred and scaled (`bench_peers.py`).
+Each peer is fitted with several settings at once, so that common computations are done once.
+All demonstrations last one second, and are centred and scaled (`bench_peers.py`).
 """
 
 from collections.abc import Callable, Sequence
@@ -23,9 +23,9 @@ type Predictor = Callable[[Array, Array], Array]
 type Setting = dict[str, Any]
 
 THINNED = 4
-"""Mixtures are fitted to every so-manieth sample."""
+"""Mixtures are fitted to every n-th sample."""
 FINE = 5
-"""Steps of integration per sample of movement_primitives, whose method is of first order."""
+"""Integration steps per sample of movement_primitives, whose method is of first order."""
 REFERENCE = 40
 """Reference points of kernelized primitives."""
 VIA_VARIANCE = 1e-6
@@ -47,7 +47,7 @@ def grid(**choices: Sequence[Any]) -> list[Setting]:
 
 
 def nearest(shown: Array, start: Array, goal: Array) -> int:
-    """Index of the demonstration whose start and goal are closest together."""
+    """Index of the demonstration with the smallest sum of distances of start and goal."""
     away = np.linalg.norm(shown[:, 0] - start, axis=1)
     return int((away + np.linalg.norm(shown[:, -1] - goal, axis=1)).argmin())
 
@@ -59,7 +59,7 @@ def times(shown: Array) -> Array:
 
 @torch.no_grad()
 def our_learn(shown: Array, _: Sequence[Setting]) -> list[Predictor]:
-    """`hrc_learn.learn` at its defaults, which include its own choice of the model."""
+    """`hrc_learn.learn` with its defaults, which include its own choice of the model."""
     t = times(shown)
     learned = learn([(t, one) for one in shown])
 
@@ -72,7 +72,7 @@ def our_learn(shown: Array, _: Sequence[Setting]) -> list[Predictor]:
 
 @torch.no_grad()
 def our_primitive(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
-    """Mean or nearest of our primitives, which take up start and goal along `approach=1`."""
+    """Mean or nearest of our primitives, adapted to start and goal with `approach=1`."""
     t = torch.from_numpy(times(shown))
     each = JointDMP.fit(t, torch.from_numpy(shown), 40, approach=1.0)
 
@@ -90,7 +90,7 @@ def our_primitive(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
 
 
 def their_dmp(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
-    """DMP of movement_primitives, with the mean weights or those of the nearest."""
+    """DMP of movement_primitives, with the mean weights or the weights of the nearest."""
     from movement_primitives.dmp import DMP  # pyright: ignore[reportMissingImports]
 
     t = times(shown)
@@ -121,7 +121,7 @@ def their_dmp(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
 
 
 def their_promp(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
-    """ProMP of movement_primitives, given position at start and end."""
+    """ProMP of movement_primitives, conditioned on the positions at start and end."""
     from movement_primitives.promp import ProMP  # pyright: ignore[reportMissingImports]
 
     t = times(shown)
@@ -168,10 +168,10 @@ def prodmp(columns: int, samples: int, count: int) -> Any:
 
 @torch.no_grad()
 def their_prodmp(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
-    """ProDMP of MP_PyTorch, with the mean weights or those of the nearest.
+    """ProDMP of MP_PyTorch, with the mean weights or the weights of the nearest.
 
-    Its goal parameter is moved by what the motion would miss the goal by, and its initial
-    velocity is that of the demonstrations: the library has no conditioning.
+    The goal parameter is shifted by the error of the final position, and the initial velocity
+    is that of the demonstrations, because the library has no conditioning.
     """
     n, T, D = shown.shape
     t, given = torch.from_numpy(times(shown)), torch.from_numpy(shown)
@@ -222,7 +222,7 @@ def task_mixture(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
 def kernel_primitive(shown: Array, settings: Sequence[Setting]) -> list[Predictor]:
     """Kernelized primitive through start and goal, about the regression of a mixture.
 
-    The mixture has one frame, the world, or frames at start and goal: the authors' way to
+    The mixture has one frame, the world, or frames at start and goal: the authors' method for
     places far from the demonstrations.
     """
     t, ends, at = times(shown), np.array([0.0, 1.0]), np.linspace(0, 1, REFERENCE)

@@ -1,5 +1,6 @@
-"""Grasp trials in MuJoCo: the starts, cameras and targets of `grasp_trials`, for an arm with
-servos and contacts, and a camera whose images are searched for the marker.
+"""Grasp trials in MuJoCo, with the starts, cameras and targets of `grasp_trials`.
+
+The arm has servos and contacts, and the marker is detected in images.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from hrc_learn.sim.scene import HAND_MARKER, CabinetConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.vision import CameraModel
 
-# Arm, table and camera, as in Experiment 2: the cabinet stands out of reach.
+# Arm, table and camera as in Experiment 2; the cabinet is out of reach.
 _SCENE = SceneConfig(objects=(), cabinet=CabinetConfig(front=-3.0))
 
 
@@ -43,8 +44,8 @@ def run_mujoco_trials(
     Contacts of the arm with the table and itself are those of the simulator.
 
     Args:
-        make_estimator: From the network that starts at the paper's initial Jacobian.
-        config: What to draw and how long to run. Noise comes on top of that of the images.
+        make_estimator: Makes the estimator from the network with the paper's initial Jacobian.
+        config: Distribution and duration of the trials. Its noise adds to that of the images.
 
     Raises:
         PhysicsError: A simulation diverged.
@@ -67,7 +68,7 @@ def run_mujoco_trials(
 
 
 def build_plant(scene: TrialScene, seed: int) -> tuple[Plant, TrialScene]:
-    """A world for each trial at its start, and the trials as this hand's marker has them."""
+    """A world for each trial at its start, and the trials with the marker of this hand."""
     worlds = [World(_SCENE) for _ in scene.start]
     for world, q in zip(worlds, scene.start.numpy(), strict=True):
         world.reset(q)
@@ -77,9 +78,9 @@ def build_plant(scene: TrialScene, seed: int) -> tuple[Plant, TrialScene]:
 
 
 def _moved_to(camera: PinholeCamera, marker: Float[Tensor, "3"]) -> PinholeCamera:
-    """The camera where it sees the marker of this hand as it saw that of the other trials.
+    """The camera, moved so that this hand's marker appears as the marker of the other trials.
 
-    With the gripper down, that is: there the same tool pose has the same pixel.
+    With the gripper pointing down, the same tool pose then has the same pixel.
     """
     down = quaternion.normalize(marker.new_tensor(GRIPPER_DOWN))
     shift = quaternion.rotate(down, marker - marker.new_tensor(MARKER))
@@ -88,15 +89,15 @@ def _moved_to(camera: PinholeCamera, marker: Float[Tensor, "3"]) -> PinholeCamer
 
 
 class Plant:
-    """Worlds in step, as the arm and the camera of a batch."""
+    """Worlds that advance in step, as the arms and cameras of a batch."""
 
     def __init__(self, worlds: list[World], camera: PinholeCamera, seed: int):
         """Open a camera in each world.
 
         Args:
-            worlds: At their starts.
-            camera: That of each.
-            seed: Of the noise of the images.
+            worlds: Worlds at their starts.
+            camera: Cameras of the worlds.
+            seed: Seed of the noise of the images.
         """
         self._worlds, self._pinhole = worlds, camera
         pose = np.tile(np.eye(4), (len(worlds), 1, 1))
@@ -111,7 +112,9 @@ class Plant:
             self._sensors.append(MarkerSensor(images, [HAND_MARKER]))
 
     def advance(self, q: Tensor, velocity: Tensor, dt: float) -> Float[Tensor, "trials 7"]:
-        """Let the arms follow their commands for a step; where their joints are then [rad]."""
+        """Let the arms follow their commands for a step; returns the joint positions afterwards
+        [rad].
+        """
         for world, v in zip(self._worlds, velocity.numpy(), strict=True):
             world.arm.command(v)
             world.advance(dt)
@@ -120,17 +123,18 @@ class Plant:
         )
 
     def project(self, tool: Pose) -> tuple[Float[Tensor, "trials 2"], Bool[Tensor, "trials"]]:
-        """Where the marker is detected in the images taken now [px]."""
+        """Pixels of the marker, detected in new images [px]."""
         feature, inside = self._pinhole.project(tool)
         found = torch.zeros_like(inside)
-        for k in inside.nonzero().flatten().tolist():  # outside there is nothing to search for
+        # a marker outside the image need not be searched for
+        for k in inside.nonzero().flatten().tolist():
             pixel = self._sensors[k].detect().get(HAND_MARKER)
             if pixel is not None:
                 feature[k], found[k] = torch.from_numpy(pixel), True
         return feature.masked_fill(~found.unsqueeze(-1), torch.nan), found
 
     def touched(self) -> Bool[Tensor, "trials"]:
-        """Whether the arm met the table or itself."""
+        """Flags of arms that touched the table or themselves."""
         return torch.tensor(
             [
                 bool(world.table_contacts.touches or world.self_contacts.touches)

@@ -1,8 +1,8 @@
-"""Three tasks of a newcomer, by the commands of the README alone.
+"""Three tasks of a newcomer, with the commands of the README alone.
 
-An SO-101 dataset, as `lerobot-record` leaves it, is seen in 3D; a policy that LeRobot trained
-on it is smoothed; a primitive is fitted to it and steered to a new goal. Dataset and policy are
-the newcomer's own, so that making them does not count. The table gives commands and time.
+An SO-101 dataset from `lerobot-record` is shown in 3D; a LeRobot policy that was trained on it
+is smoothed; a primitive is fitted to it and played to a new goal. The newcomer already has
+dataset and policy, so their creation is not counted. The table lists commands and time.
 
     python benchmarks/newcomer_tasks.py
 """
@@ -21,7 +21,7 @@ from rich.table import Table
 from hrc_learn import cli
 from hrc_learn.cli._run import write_values
 
-# The dataset is that of the tests of the SO-101's page.
+# The dataset is that of the tests of the SO-101 page.
 sys.path.append(str(ROOT / "tests"))
 from test_code_blocks import so101_dataset  # pyright: ignore[reportMissingImports]
 
@@ -31,7 +31,7 @@ TASKS = {
     "policy smoothed": ("hrc smooth",),
     "primitive steered": ("hrc fit", "hrc play"),
 }
-"""Beginnings of the commands that each task takes."""
+"""First words of the commands that each task needs."""
 TRAIN = (
     "--policy.discover_packages_path=hrc_learn.lerobot --policy.type=motion_chunk "
     "--policy.device=cpu --policy.push_to_hub=false --wandb.enable=false "
@@ -48,7 +48,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    """Run the tasks, print a table, write the figures; ends at the first command that fails."""
+    """Run the tasks, print a table and write the values; end at the first failing command."""
     named = commands_of((ROOT / "README.md").read_text("utf-8"))
     named = [line for line in named if "PATH" in line or "--model" in line]
     console, figures = Console(), {}

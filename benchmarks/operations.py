@@ -1,4 +1,4 @@
-"""Counting what PyTorch is asked to do, which no load on the machine changes."""
+"""Count the operations of PyTorch, which do not depend on the load of the machine."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,7 +23,9 @@ class _Counter(TorchDispatchMode):
 
 
 def count_operations(call: Callable[[], object]) -> int:
-    """ATen operations of a call, views and conversions included; caches are filled first."""
+    """Number of ATen operations of a call, views and conversions included; caches are filled
+    first.
+    """
     call()
     with _Counter() as counter:
         call()

@@ -82,7 +82,7 @@ class PrintedEstimator(PaperEstimator):
         self.register_buffer("column", column[:, None].clone())
 
     def update(self, state: WeightState, measurement: Measurement) -> WeightState:
-        """Initial weights where the feature is first seen, then the law."""
+        """Set the initial weights when the feature is first seen, then apply the law."""
         total = self.network.basis(measurement.pose).sum(-1)[..., None, None]
         waiting = (state.weight == 0).all(-1, keepdim=True).all(-2, keepdim=True)
         begins = waiting & measurement.valid[..., None, None]

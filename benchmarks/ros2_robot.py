@@ -1,4 +1,4 @@
-"""The simulated workplace as a robot of ROS 2 with the topics of stock controllers.
+"""Publish the simulated workplace as a ROS 2 robot with the topics of standard controllers.
 
 python benchmarks/ros2_robot.py --interface trajectory
 """
@@ -25,7 +25,7 @@ from hrc_learn.sim import SceneConfig
 from hrc_learn.sim.world import World
 
 _BEHIND = 0.5
-"""Largest delay that is made up for on a busy machine [s]."""
+"""Largest delay that is caught up on a busy machine [s]."""
 _GAIN = 20.0
 """Gain of the position controller [1/s]."""
 
@@ -33,14 +33,14 @@ _GAIN = 20.0
 class Ros2Robot:
     """Steps a world in real time, publishes its joints and follows commands.
 
-    As ros2_control's, a velocity holds until another one comes: nothing times out here.
-    Commands that ask for more than the joints' limits are counted and carried out.
+    As with ros2_control, a velocity holds until the next one: there is no timeout. Commands
+    beyond the joints' limits are counted and executed.
 
     Attributes:
         world: The world.
         violations: Number of steps in which a joint was beyond its limits of position or speed.
         commands: Number of commands received.
-        state: Newest reading; the world's own must not be read while it is stepped.
+        state: Newest reading. Use it instead of the world's own while the world is stepped.
         late: Delay of the last step behind real time [s].
     """
 
@@ -88,7 +88,7 @@ class Ros2Robot:
         self._thread.start()
 
     def _meets_trouble(self, act: Any) -> bool:
-        """True if a message is lost, or kept for 50 ms."""
+        """True if a message is lost, or delayed by 50 ms."""
         chance = self._chance.random()
         if chance < self._hostile:
             self._late.append((time.monotonic() + 0.05, act))
@@ -122,7 +122,7 @@ class Ros2Robot:
         self._path = (begin + np.array(times), positions)
 
     def pause(self) -> None:
-        """Fall silent: joint states are not published, while the arm goes on."""
+        """Stop publishing joint states, while the arm continues."""
         self._silent = True
 
     def resume(self) -> None:
@@ -195,11 +195,11 @@ class Args:
     robot: str = "panda"
     """Arm by name, or its description."""
     interface: Literal["velocity", "position", "trajectory"] = "velocity"
-    """Controller that listens on /forward_velocity_controller/commands or `command`."""
+    """Controller that listens on /forward_velocity_controller/commands or on `command`."""
     command: str = Ros2Config.command
     """Topic of the controller."""
     hostile: float = 0.0
-    """Fraction of states and commands that are lost, and as many that come 50 ms late."""
+    """Fraction of states and commands that are lost; the same fraction is delayed by 50 ms."""
     duration: float = float("inf")
     """Duration [s]."""
     json: Path | None = None

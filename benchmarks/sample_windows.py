@@ -8,11 +8,11 @@ from torch import Tensor
 
 
 class SampleWindows:
-    """Samples of all frames of episodes, with the steps around each that a policy asks for.
+    """Samples of all frames of episodes, with the neighbouring frames that a policy needs.
 
-    The same batches as of LeRobot's loader, which looks up every action of every chunk by
-    itself, some 200 samples a second; few demonstrations fit into memory, where a batch is one
-    gather.
+    The batches equal those of LeRobot's loader, which looks up every action of every chunk
+    separately and reaches some 200 samples per second. Few demonstrations fit into memory,
+    where a batch is one gather operation.
     """
 
     def __init__(

@@ -1,9 +1,10 @@
 """Load every URDF and MJCF file of installed packages, and compare with Pinocchio and MuJoCo.
 
-Of each file: the arm of its only end or, where several are offered, the arm of each of them;
-whether Pinocchio and MuJoCo load the file; and the largest difference of the flange's pose and
-Jacobian from theirs in random states. What comes of a file is an arm, or one line that says why
-not; anything else is shown with its traceback and ends this with status 1.
+Each file yields the arm of its only end or, if there are several ends, the arm of each.
+Reported are also whether Pinocchio and MuJoCo load the file, and the largest difference of the
+flange's pose and Jacobian from theirs in random states. The allowed results of a file are an
+arm, or one line with the reason of a refusal. Any other error is shown with its traceback, with
+exit status 1.
 """
 
 import os
@@ -35,11 +36,11 @@ _OFFERED = "likeliest first: "
 @dataclass(frozen=True, kw_only=True)
 class Args:
     folder: Path = Path(sysconfig.get_paths()["purelib"])
-    """Searched with all that is below it."""
+    """Folder to search, with all its subfolders."""
     states: int = 20
-    """Random joint positions in which an arm is compared."""
+    """Number of random joint positions in which an arm is compared."""
     ends: int = 10
-    """Of the ends of a robot so many at most are taken for a tool."""
+    """Largest number of ends of a robot that are tried as a tool."""
     json: Path | None = None
     """Receives the counts as one flat object."""
 
@@ -56,9 +57,9 @@ class _Outcome:
 
 
 def main(args: Args) -> int:
-    """Load, compare, count, print."""
+    """Load the files, compare, count and print."""
     torch.set_num_threads(1)
-    warnings.simplefilter("ignore")  # of meshes and grippers
+    warnings.simplefilter("ignore")  # about meshes and grippers
     counts, worst = Counter[str](), 0.0
     for path in sorted(args.folder.rglob("*")):
         if path.suffix not in (".urdf", ".xml", ".mjcf") or not _describes_a_robot(path):
@@ -94,7 +95,7 @@ def main(args: Args) -> int:
 
 
 def _describes_a_robot(path: Path) -> bool:
-    """True for a URDF or MJCF file by its first element, however broken otherwise."""
+    """True if the first element is that of a URDF or MJCF file, even if the rest is broken."""
     try:
         return ElementTree.parse(path).getroot().tag in ("robot", "mujoco")
     except (ElementTree.ParseError, ValueError):
@@ -121,14 +122,15 @@ def _read(path: Path, args: Args) -> _Outcome:
             if not found.theirs[name]:
                 try:
                     off = largest_difference(described, q, reader(described))
-                except (KeyError, IndexError, ValueError):  # a joint or frame has no name there
+                # the library has no joint or frame of that name
+                except (KeyError, IndexError, ValueError):
                     continue
                 found.differences.append(off)
     return found
 
 
 def _arms(path: Path, most: int) -> list[Arm]:
-    """The arm of a file, or those of the ends that it offers."""
+    """Arms of a file: of its only end, or of several ends."""
     try:
         return [arm(path)]
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Cycles of a served arm's protocol: a record of them, and packets lost on purpose."""
+"""Record the cycles of a served arm's protocol, and drop packets on purpose."""
 
 import random
 from typing import NamedTuple
@@ -21,10 +21,10 @@ class DrivenCycle(NamedTuple):
 
 
 class CycleLog(list[DrivenCycle]):
-    """All cycles of motions from now on, each noted as the next one begins."""
+    """All cycles of motions, each recorded when the next one begins."""
 
     def __init__(self, server: ArmServer):
-        """Take notes before each step of the arm."""
+        """Record a cycle before each step of the arm."""
         super().__init__()
         self._robot, self._link = server.robot, server.link
         self._step, self._robot.step = self._robot.step, self._noted_step
@@ -46,7 +46,7 @@ class LossyLink:
     """
 
     def __init__(self, server: ArmServer, loss: float):
-        """Get between the server and its sockets.
+        """Insert the link between the server and its sockets.
 
         Args:
             server: Server of the arm.
@@ -64,7 +64,7 @@ class LossyLink:
 
     def _on_state(self) -> None:
         if self._drops():
-            # The package cannot leave one out, and has to count it.
+            # The package cannot skip a packet, so it must count the dropped one.
             self._link._FrankaServer__message_id += 1
         else:
             self._send()

@@ -101,7 +101,7 @@ class TaskMixture:
 
 @dataclass(frozen=True)
 class KernelPrimitive:
-    """Kernelized movement primitive: a Gaussian process about reference points.
+    """Kernelized movement primitive: a Gaussian process around reference points.
 
     xi(t) = k(t) (K + lambda Sigma)^-1 mu    (Huang et al. 2019, eq. 20)
     """
@@ -118,7 +118,7 @@ class KernelPrimitive:
     """lambda."""
 
     def through(self, time: Array, position: Array, variance: float) -> "KernelPrimitive":
-        """The same with the reference at these times (M,) replaced by `position` (M, D)."""
+        """The same primitive with the reference `position` (M, D) at these times (M,)."""
         index = np.abs(self.time[:, None] - time).argmin(0)
         times, mean, covariance = self.time.copy(), self.mean.copy(), self.covariance.copy()
         times[index], mean[index] = time, position

@@ -1,4 +1,4 @@
-"""Timing that a shared machine disturbs as little as possible."""
+"""Measure times with little influence of other programs on the machine."""
 
 import statistics
 import time
@@ -17,10 +17,10 @@ class Timing:
 
 
 def time_calls(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, Timing]:
-    """Time calls in turn, so that whatever slows the machine slows them alike.
+    """Time calls in turn, so that other programs on the machine slow all of them alike.
 
-    CPU time of this thread is taken: other processes do not count, other threads must not
-    work (`torch.set_num_threads(1)`).
+    The time is the CPU time of this thread. Other processes do not count; other threads must
+    not work (`torch.set_num_threads(1)`).
     """
     for call in calls.values():
         call()

@@ -1,4 +1,4 @@
-"""Codes of action chunks that a policy may write: ours, FAST's recipe and the bins of RT-2."""
+"""Codes of action chunks that a policy writes: ours, FAST's recipe and the bins of RT-2."""
 
 import math
 from typing import NamedTuple, Protocol
@@ -16,13 +16,13 @@ CODES = ("ours", "fast", "bins")
 SCALE = 10.0
 """Scale of FAST's coefficients, LeRobot's default."""
 MOST_COMPARED = 300
-"""Largest number of chunks to compare errors on."""
+"""Largest number of chunks on which errors are compared."""
 MOST_BINS = 80
-"""Largest number of bins of a chunk."""
+"""Largest number of bins in a chunk."""
 
 
 class Windows(NamedTuple):
-    """Chunks of T actions of D columns, and what is known before each of them."""
+    """Chunks of T actions with D columns, and the information before each chunk."""
 
     seen: Float[np.ndarray, "N F"]
     """Observations."""
@@ -33,12 +33,12 @@ class Windows(NamedTuple):
     chunk: Float[np.ndarray, "N T D"]
 
     def some(self, most: int) -> "Windows":
-        """At most so many of them, evenly spread."""
+        """At most `most` of the chunks, evenly spread."""
         index = np.unique(np.linspace(0, len(self.seen) - 1, most).round().astype(int))
         return Windows(*(x[index] for x in self))
 
     def inputs(self) -> Float[Tensor, "N I"]:
-        """What the network reads."""
+        """Inputs of the network."""
         known = np.concatenate([self.seen, self.start, self.velocity], 1)
         return torch.from_numpy(known).float()
 
@@ -59,13 +59,15 @@ class Code(Protocol):
         ...
 
     def encode(self, chunks: Chunks) -> list[list[int]]:
-        """Tokens that a network has to write for each chunk."""
+        """Tokens of each chunk, as targets of a network."""
         ...
 
     def decode(
         self, ids: Int[np.ndarray, "B L"], last: Windows, relaxed: bool
     ) -> tuple[Float[np.ndarray, "B T D"], Bool[np.ndarray, "B"]]:
-        """Chunks, and which sequences do not decode, after what `last` knows."""
+        """Chunks, and flags of sequences that do not decode; `last` holds the information
+        before them.
+        """
         ...
 
 
@@ -78,7 +80,7 @@ class OurCode:
         Args:
             chunks: Motions from the last action on.
             size: Number of tokens.
-            start_known: False: tokens encode also where chunks start.
+            start_known: False: tokens also encode the start of a chunk.
         """
         self.start_known = start_known
         some = _thinned(chunks)
@@ -123,7 +125,7 @@ class FastCode:
         return np.array(made), failed
 
     def _padded(self, row: list[int]) -> Float[np.ndarray, "T D"]:
-        """Chunk of as many coefficients as it has; missing ones are zero."""
+        """Chunk from its coefficients; missing coefficients are zero."""
         q = np.array([ord(c) for c in self.fast.code.decode(row)], int) + self.fast.least
         size = math.prod(self.fast.shape)
         return self.fast.restored(np.pad(q[:size], (0, max(0, size - len(q))))[None])[0]
@@ -133,7 +135,7 @@ class Bins:
     """256 equal levels for each column of every k-th action, and straight lines between."""
 
     def __init__(self, chunks: Chunks):
-        """Take the levels' range from chunks."""
+        """Determine the levels' range from chunks."""
         T, D = chunks.motions[0, 1:].shape
         stride = next(k for k in range(1, T + 1) if T % k == 0 and T // k * D <= MOST_BINS)
         self.at = np.arange(0, T + 1, stride)
@@ -175,7 +177,7 @@ def code_of(name: str, chunks: Chunks) -> Code:
 
 
 def _thinned(chunks: Chunks) -> Chunks:
-    """Some chunks, to compare errors on."""
+    """Some chunks, on which errors are compared."""
     every = math.ceil(len(chunks.motions) / MOST_COMPARED)
     return chunks._replace(
         motions=chunks.motions[::every], start_velocity=chunks.start_velocity[::every]

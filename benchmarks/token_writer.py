@@ -13,11 +13,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 BATCH, RATE, WARM_UP, DECAY = 64, 3e-3, 50, 0.01
-"""Chunks of a batch; AdamW's learning rate, steps until it is reached, and weight decay."""
+"""Number of chunks in a batch; AdamW's learning rate, number of steps until it is reached, and
+weight decay."""
 
 
 class Block(nn.Module):
-    """Layer of a transformer with causal attention, normalised before."""
+    """Transformer layer with causal attention and normalisation before each part."""
 
     def __init__(self, width: int, heads: int = 4):
         super().__init__()
@@ -42,7 +43,7 @@ class Block(nn.Module):
 
 
 class Writer(nn.Module):
-    """Decoder-only transformer whose first position is what is observed."""
+    """Decoder-only transformer whose first position is the observation."""
 
     mean: Tensor
     spread: Tensor
@@ -66,7 +67,7 @@ class Writer(nn.Module):
     def forward(
         self, inputs: Float[Tensor, "B I"], ids: Int[Tensor, "B L"]
     ) -> Float[Tensor, "B L1 S"]:
-        """Scores of the token at each place, and of one more."""
+        """Scores of the token at each position and of the next one."""
         x = torch.cat([self._first(inputs), self.embed(ids)], 1)
         x = x + self.place.weight[: x.shape[1]]
         for block in self.blocks:
@@ -75,7 +76,7 @@ class Writer(nn.Module):
 
     @torch.no_grad()
     def write(self, inputs: Float[Tensor, "B I"], end: int | None) -> Int[Tensor, "B L"]:
-        """Most probable tokens, one after another, until `end` or the greatest length."""
+        """Most probable tokens, one after another, until `end` or the maximum length."""
         x, past, ids = self._first(inputs), [[] for _ in self.blocks], []
         finished = torch.zeros(len(inputs), dtype=torch.bool)
         for place in self.place.weight:
@@ -93,14 +94,14 @@ class Writer(nn.Module):
         return torch.stack(ids, 1)
 
     def _first(self, inputs: Float[Tensor, "B I"]) -> Float[Tensor, "B 1 W"]:
-        # Unseen inputs far beyond the demonstrated ones would decide alone.
+        # Inputs far beyond the demonstrated ones would dominate the output.
         x = (inputs - self.mean) / self.spread
         return self.read(x.clamp(-10, 10))[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained network and the code of what it writes."""
+    """A trained network, and the code of its tokens."""
 
     writer: Writer
     code: Code
@@ -108,7 +109,7 @@ class Policy:
     def act(
         self, last: Windows, relaxed: bool
     ) -> tuple[Float[np.ndarray, "B T D"], Bool[np.ndarray, "B"]]:
-        """Chunks that follow, and which sequences did not decode."""
+        """The next chunks, and flags of sequences that did not decode."""
         ids = self.writer.write(last.inputs(), self.code.end)
         return self.code.decode(ids.numpy(), last, relaxed)
 
@@ -146,10 +147,11 @@ class Training:
         )
 
     def step(self, share: float) -> float:
-        """Learn from a batch; the loss [nat] of a token.
+        """Learn from a batch; returns the loss per token [nat].
 
         Args:
-            share: Done part of the training, 0 to 1; the rate falls along a cosine over it.
+            share: Completed fraction of the training, 0 to 1; the learning rate falls along a
+            cosine.
         """
         self._done += 1
         rate = RATE * min(1, self._done / WARM_UP) * (1 + math.cos(math.pi * share)) / 2
@@ -168,7 +170,9 @@ class Training:
         return loss.item()
 
     def run(self, steps: int) -> list[float]:
-        """Train for so many steps; mean loss [nat] of a token in each tenth of them."""
+        """Train for this number of steps; returns the mean loss per token [nat] of each tenth
+        of them.
+        """
         losses = [self.step(k / steps) for k in range(steps)]
         self.writer.eval()
         return [float(part.mean()) for part in np.array_split(losses, 10)]

@@ -1,4 +1,4 @@
-"""One cycle of the pick-and-place job as a path of the joints, as the job's own planner has it.
+"""Plan one cycle of the pick-and-place job as a joint path, with the job's own planner.
 
 home -> above the object -> down, close -> lift -> home -> shelf -> release -> home
 """
@@ -32,15 +32,15 @@ from hrc_learn.skills.pick_and_place import RELEASE_TIME, PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan, plan_candidates
 from hrc_learn.skills.work_cell import BlockedPathError
 
-# Time of servoing above the object, the median of grasping (docs/benchmarks/experiments.md)
+# Duration of servoing above the object: the median of grasping (docs/benchmarks/experiments.md)
 # [s].
 _SERVOING = 1.5
-# Speed of the last descent to the board, which feels for it [m/s]:
+# Speed of the final descent to the board, which ends at contact [m/s]:
 # `WorkCell.move_until_contact`.
 _FEELING_SPEED = 0.02
 # Default speed of straight lines [m/s]: `WorkCell.move_straight`.
 _LIFTING_SPEED = 0.15
-# Places tried for each cycle.
+# Number of object places tried for each cycle.
 _ATTEMPTS = 20
 
 

@@ -1,7 +1,7 @@
-"""Many arms at their job, each near a worker, stepped in one batch.
+"""Run many arms at their job, each near a worker, in one batch.
 
 The joints follow commands with delay and servo lag, and encoders and trackers have errors as in
-`Imperfections`; forces are not simulated. Everything else is what a work cell runs: the person
+`Imperfections`; forces are not simulated. All other parts are those of a work cell: the person
 watch and `ArmLoop`.
 """
 
@@ -42,12 +42,13 @@ from hrc_learn.skills.person_watch import (
 )
 from hrc_learn.teleoperation import ScriptedForce
 
-# Distance of pairs of capsules that are not computed [m].
+# Distance above which a pair of capsules is not computed [m].
 _FAR = 10.0
-# Change of speed of a point of the arm, its load included, in one step [m/s]: by the
-# accelerations of a Panda's joints, on levers from 0.85 m at the first down, for 10 ms.
+# Largest change of the speed of a point of the arm or its load in one step of 10 ms [m/s]: the
+# acceleration limits of a Panda's joints, with levers from 0.85 m at the first joint down to
+# zero.
 _FASTER = 0.3
-# Arms whose distances are computed together: their tensors stay in the cache.
+# Number of arms whose distances are computed together: their tensors stay in the cache.
 _BLOCK = 48
 # Largest distance that is recorded as the smallest one [m].
 _RANGE = 0.5
@@ -55,8 +56,8 @@ _RANGE = 0.5
 _ELBOW_LINKS = (2, 3, 4, 5)
 CRUSHING_GAP = 0.12
 """Gap between arm and body that avoids crushing [m]: ISO 13854:2017, table 1."""
-_STEP = 1e-4  # of a difference quotient along a motion [s]
-_PARTS = 3  # spheres that cover a capsule in bounds of distances
+_STEP = 1e-4  # step of a difference quotient along a motion [s]
+_PARTS = 3  # number of spheres that cover a capsule in bounds of distances
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,8 +90,8 @@ class Reaction:
     way_making: WayMakingConfig = field(default_factory=lambda: WayMakingConfig(mode="none"))
     """Source of null-space motion."""
     stop_distance: float | None = None
-    """Distance within which the arm rests, without any other reaction [m]. None: it keeps the
-    protective distance, slower or at rest."""
+    """Distance within which the arm rests, without any other reaction [m]. None: the arm keeps
+    the protective distance and slows down or stops for it."""
     mode: PersonMode = "ssm"
     """Separation monitoring, or power and force limiting."""
     padding: float = math.inf
@@ -110,8 +111,8 @@ class WorkerRuns:
     violations: Int[Tensor, " runs"]
     """Steps in which the arm could not have stopped before the worker (`margin_to_stop`)."""
     margin: Float[Tensor, " runs"]
-    """Smallest margin of the distance over the stopping distance [m]; infinite if the worker
-    came nowhere near."""
+    """Smallest difference between the distance and the stopping distance [m]; infinite if the
+    worker was never near."""
     closing: Float[Tensor, " runs"]
     """Smallest distance between a part of the arm and a part of the worker that it approached
     [m]."""
@@ -128,11 +129,12 @@ class WorkerRuns:
     unsolved: Int[Tensor, " runs"]
     """Steps in which the constraint solver ran out of iterations, and the arm braked."""
     touches: Int[Tensor, " runs"]
-    """Contacts into which the arm moved, as `contact_forces` finds them."""
+    """Number of contacts into which the arm moved, from `contact_forces`."""
     run_into: Int[Tensor, " runs"]
-    """Contacts in which the worker ran into an arm at rest."""
+    """Number of contacts in which the worker moved into an arm at rest."""
     exceedances: Int[Tensor, " runs"]
-    """Contacts into which the arm moved with more than the allowed force or pressure."""
+    """Number of contacts into which the arm moved with more than the allowed force or pressure.
+    """
     of_limit: Float[Tensor, " runs"]
     """Largest force or pressure of such a contact, as a fraction of its limit."""
 
@@ -181,7 +183,9 @@ def run_near_workers(
 
 
 class _Batch:
-    """The arms. `live` lists those whose cycle has not ended; the loop's state is of these."""
+    """The arms. `live` lists the arms whose cycle has not ended; the state of the loop contains
+    only these arms.
+    """
 
     def __init__(self, job: Job, reaction: Reaction, config: ArmLoopConfig):
         self._job, self._reaction = job, reaction

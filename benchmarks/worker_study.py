@@ -1,11 +1,11 @@
-"""A thousand jobs near a worker: the cost of keeping the protective distance, and what making
-way saves, compared with arms that stop and wait.
+"""A thousand jobs near a worker: cost of the protective distance, and benefit of way-making.
 
-Another worker comes in each run, puts something on the table, reaches for markers under the arm
-and walks away. The arms keep the protective distance of ISO 10218-2:2025 from what a tracker
-sees, and their null space makes way or not; others stop and wait while the worker is nearer
-than a fixed distance. The exit status is 1 if an arm that keeps the distance violated it, or
-touched a worker with more than the allowed force or pressure.
+In each run, a different worker comes, puts an object down, reaches for markers under the arm
+and walks away. Some arms keep the protective distance of ISO 10218-2:2025 from the tracked
+worker, with or without null-space motion that makes way. For comparison, others stop and wait
+while the worker is within a fixed distance. The exit status is 1 if an arm that keeps the
+protective distance violated it, or touched a worker with more than the allowed force or
+pressure.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ Mode = Literal["none", "expert", "automatic", "both"]
 MODES: tuple[Mode, ...] = ("none", "expert", "automatic", "both")
 """Sources of null-space motion: `WayMakingConfig.mode`."""
 
-# Runs at once: their tables of visits take some 2 GB.
+# Number of parallel runs: their tables of visits need about 2 GB.
 _BATCH = 250
 # Readings of the encoders after which their noise repeats.
 _READINGS = 1000
-# Reaction time of the expert to the worker's reaching [s]: as in bench_constraints.py.
+# Reaction time of the expert after the worker begins to reach [s]: as in bench_constraints.py.
 _REACTION = 0.4
-# Force with which the expert draws the elbow away [N], and distance of the point that it is
-# drawn towards, so far that the direction stays [m]: `random_pulls`.
+# Force with which the expert pulls the elbow away [N], and distance of the point towards which
+# it is pulled [m]: so far that the direction stays constant (`random_pulls`).
 _FORCE, _FAR_AWAY = 60.0, 10.0
 # Largest distance of the object from the middle of the table, along x and y [m].
 _REACH = (0.10, 0.08)
@@ -89,7 +89,7 @@ _COLUMNS = (
     ("less, same\ndistance", "shorter_at_same_distance", "{:.1%}"),
     ("less,\nsafe stop", "shorter_than_safe_stop", "{:.1%}"),
 )
-# Width of the table: a log file has none of its own.
+# Width of the table: a log file has no width.
 _WIDTH = 150
 
 
@@ -98,7 +98,7 @@ class Args:
     placing: Path
     """Folder of the placing skill."""
     aiming: Path
-    """Folder of the visual-servoing skill, whose orientation above the table is taken."""
+    """Folder of the visual-servoing skill, whose orientation above the table is used."""
     runs: int = 1000
     """Runs of each reaction, with the same workers in all of them."""
     seed: int = 0
@@ -117,7 +117,7 @@ class Args:
     imperfections: float = 1.0
     """Size of the imperfections, relative to the nominal ones; 0: none."""
     out: Path | None = None
-    """Folder for the figures and the picture."""
+    """Folder for the measured values and the picture."""
     overwrite: bool = False
     """Replace that folder."""
     figure: Path | None = None
@@ -127,7 +127,7 @@ class Args:
 
 
 def main(args: Args) -> int:
-    """Run the study, print its table, write the figures."""
+    """Run the study, print its table, and write the measured values."""
     if args.cycles < 1 or any(not distance > 0 for distance in args.stop_distances):
         raise ValueError("--cycles and --stop-distances must be positive.")
     torch.set_num_threads(1)
@@ -319,7 +319,7 @@ class WorkerStudy:
             return np.nan
         kept = [smallest_distance(runs) for runs in self.stopping.values()]
         times = [float(runs.cycle_time.median()) for runs in self.stopping.values()]
-        # Arms that rest sooner keep more distance, but for chance.
+        # Except for chance, arms that stop at a larger distance keep more distance.
         order = np.argsort(kept)
         return float(
             np.interp(
@@ -347,15 +347,7 @@ def measure_contacts(
     dt: float,
     padding: float = math.inf,
 ) -> None:
-    """Force and pressure of the contacts of each run, by an evaluator of its own.
-
-    Args:
-        job: Task of the arms, and the workers near them.
-        trace: Positions of the arms, and which of them hold the object, at each step.
-        runs: Receives the figures.
-        dt: Control step [s].
-        padding: Stiffness of a padding of the arm [N/mm].
-    """
+    """Force and pressure of the contacts of each run, from an independent evaluation."""
     scene = job.workplace.scene
     for run, body in enumerate(job.bodies):
         steps = min(len(trace), round(float(runs.cycle_time[run]) / dt)) if len(trace) else 0
@@ -375,12 +367,14 @@ def measure_contacts(
 
 
 def key(mode: Mode, person: PersonMode) -> str:
-    """Name of a reaction, and the begin of the names of its figures."""
+    """Name of a reaction, which is also the prefix of the names of its values."""
     return mode if person == "ssm" else f"{mode}_{person.replace('+', '_')}"
 
 
 def smallest_distance(runs: WorkerRuns) -> float:
-    """5 % quantile over the runs of the distance that was closed in on [m]."""
+    """5 % quantile over the runs of the smallest distance to which the arm approached the
+    worker [m].
+    """
     return float(runs.closing.quantile(0.05))
 
 
@@ -484,8 +478,9 @@ def cycle_time_figure(
 
     Args:
         making_way: Smallest distance [m] and cycle time [s] of arms that keep the protective
-            distance, by who moves the null space.
-        stopping: Those of arms that stop and wait, by the distance within which they rest [m].
+            distance, by the source of null-space motion.
+        stopping: Smallest distance and cycle time of arms that stop and wait, by the distance
+            within which they rest [m].
         undisturbed: Cycle time without a worker [s].
     """
     with matplotlib.rc_context(STYLE):
@@ -506,7 +501,7 @@ def cycle_time_figure(
             colour = palette.SERIES[k % len(palette.SERIES)]
             axes.plot(1e3 * nearest, time, "D", color=colour, label=f"null space: {mode}")
         axes.axhline(undisturbed, color=palette.BLACK, lw=1, ls="--", label="undisturbed")
-        axes.set_xlabel("smallest distance the arm closed in to, 5 % of the runs [mm]")
+        axes.set_xlabel("smallest distance to which the arm approached, 5 % of the runs [mm]")
         axes.set_ylabel("cycle time, median [s]")
         axes.legend(loc="upper left", fontsize=8)
     return figure

@@ -1,6 +1,6 @@
 """Visits of many workers as tables over time: true positions and tracker observations.
 
-A batch of runs looks them up once a control step, where a simulator would compute each anew.
+A batch of runs looks up its workers once per control step, instead of computing each anew.
 """
 
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit
 from hrc_learn.sim.worker import IMAGE_RATE, PARTS
 
-# A worker who has left stands still. The tables hold this much of that time, and repeat its
-# last part, a whole number of images and of control steps [s].
+# A worker who has left stands still. The tables contain this time after leaving, and repeat its
+# last part: a whole number of images and of control steps [s].
 _AFTER, _REPEATED = 2.0, 1.0
 
 
@@ -57,7 +57,7 @@ class WorkerTables:
     newest: Int[Tensor, "runs steps"]
     """Number of the newest image that has arrived by each control step; -1: none yet."""
     observed: Int[Tensor, " runs"]
-    """Control steps from which on the last ones are repeated."""
+    """Control step from which the last observations are repeated."""
 
     @classmethod
     def of(
@@ -67,13 +67,13 @@ class WorkerTables:
         chances: Sequence[np.random.Generator],
         dt: float,
     ) -> "WorkerTables":
-        """Compute the visits, each seen by a tracker of its own.
+        """Compute the visits, each observed by its own tracker.
 
         Args:
             visits: Visits, one for each arm.
             sizes: Noise, delay and loss of the tracker.
             chances: Sources of its noise, one for each visit.
-            dt: Control step, of which a second is a whole number [s].
+            dt: Control step [s]; a second is a whole number of control steps.
         """
         truth, seen = [], []
         for visit, chance in zip(visits, chances, strict=True):
@@ -129,7 +129,7 @@ class WorkerTables:
         """Newest observations of the workers near some of the arms at a control step.
 
         Returns:
-            The observations, and their age [s]; NaN as long as there is none.
+            The observations, and their age [s]; NaN before the first observation.
         """
         until, period = self.observed[runs], round(_REPEATED / self.dt)
         beyond = step - until
