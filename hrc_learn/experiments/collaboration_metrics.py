@@ -110,7 +110,7 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
     # Steps in which the arm could not have stopped before reaching the worker.
     never("separation violations", _near_worker(lambda near: int((near.margin < 0).sum()))),
     Metric(
-        "force of contacts, of the limit",
+        "contact force relative to its limit",
         _near_worker(lambda near: float(near.force.max(initial=0.0))),
     ),
     never("contacts over the limit", lambda run: _too_hard(run)),

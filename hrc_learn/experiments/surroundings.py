@@ -436,7 +436,7 @@ class GivingPerson:
         world.move_worker(self.ends_at(now))
         if not self._gone:
             pose = np.eye(4)
-            pose[:3, 3] = self.hand_over.thing_at(now)
+            pose[:3, 3] = self.hand_over.object_position(now)
             world.carry(self._item.name, pose)
 
     def _go_on(self, tool: np.ndarray, now: float, passed: float) -> None:

@@ -89,7 +89,7 @@ class HandOver:
             carried=tuple((begin + time, end + time) for begin, end in self.carried),
         )
 
-    def thing_at(self, time: float) -> Float[np.ndarray, "3"]:
+    def object_position(self, time: float) -> Float[np.ndarray, "3"]:
         """Middle of the object, in the hand or laid down [m]."""
         latest = [span for span in self.carried if span[0] <= time]
         first, last = latest[-1] if latest else self.carried[0]

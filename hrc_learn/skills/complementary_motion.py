@@ -173,7 +173,7 @@ class ComplementaryMotion:
         posture, width = self._wished()
         self.offset_velocity = (self.joints - posture - offset) / self._dt
         self.posture = posture
-        self.human.tell(self._feedback.told(state, pushed=pushed))
+        self.human.tell(self._feedback.end_step(state, pushed=pushed))
         return self.joints.numpy(), width
 
     def _take(self, wish: Float[Tensor, " joints"], width: float) -> None:

@@ -59,6 +59,8 @@ class PersonWatchConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
+        if math.isnan(self.contact):
+            raise ValueError("contact is NaN: give a distance [m]; a negative one turns it off")
 
 
 class PersonWatch:

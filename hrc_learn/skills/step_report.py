@@ -134,7 +134,7 @@ class PersonFeedback:
             mention = mentioned is not None and bool(mentioned)
             self.note(cause, float(kept), mention=mention, **details)
 
-    def told(
+    def end_step(
         self,
         state: ArmState,
         jacobian: Float[Tensor, "6 joints"] | None = None,
@@ -145,7 +145,7 @@ class PersonFeedback:
         load: GraspedBox | None = None,
         contact_expected: bool = False,
     ) -> Feedback:
-        """Feedback of this step; the next step begins without hindrances.
+        """Return the feedback of this step; the next step begins without hindrances.
 
         Args:
             state: Reading of the arm.

@@ -534,7 +534,7 @@ class WorkCell:
         if (watched := reading.people) is not None:
             separation, scale = self.config.safety.separation, float(self.pace.people_scale)
             columns = columns | separation_columns(watched, separation, velocity, scale)
-        told = self._feedback.told(
+        feedback = self._feedback.end_step(
             self.state,
             self.jacobian,
             pushed=reading.explain,
@@ -544,9 +544,11 @@ class WorkCell:
             contact_expected=self.time < self._contact_expected,
         )
         effort = self.human_input.effort(len(self.joints))
-        self.log.append(**step_columns(self.state, velocity, effort, report, told), **columns)
+        self.log.append(
+            **step_columns(self.state, velocity, effort, report, feedback), **columns
+        )
         self._arm.command(velocity.numpy())
-        self.human.tell(told)
+        self.human.tell(feedback)
         self._advance(self.config.dt)
         self._read()
 

@@ -336,7 +336,7 @@ class HandGuidedArm:
             self._feedback.note("task", in_null_space)
         if (cause := filter_hindrance(report)) is not None:
             self._feedback.note(cause, float(fraction_kept(desired, velocity)))
-        self._human.tell(self._feedback.told(state, J, pushed=pushed))
+        self._human.tell(self._feedback.end_step(state, J, pushed=pushed))
         return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
 
     def _posture_velocity(

@@ -264,7 +264,7 @@ def test_a_worker_is_measured_by_margin_force_distance_and_wait(run, mode):
     assert values["contacts_with_the_worker"] == 2
     assert values["min_distance_mm"] == pytest.approx(200.0)
     assert values["separation_violations"] == 2
-    assert values["force_of_contacts_of_the_limit"] == pytest.approx(1.01)
+    assert values["contact_force_relative_to_its_limit"] == pytest.approx(1.01)
     assert values.get("contacts_over_the_limit") == (None if mode == "ssm" else 1)
     # 0, 0.5, 1 and 0.25 of four steps.
     assert values["waited_for_the_worker_s"] == pytest.approx(0.175)

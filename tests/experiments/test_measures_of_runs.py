@@ -106,7 +106,7 @@ def test_contacts_over_the_limit_count_only_where_contacts_are_allowed(mode):
         "cell": SimpleNamespace(config=SimpleNamespace(safety=separation)),
     }
     assert value("contacts over the limit", **run) == (None if mode == "ssm" else 2)
-    assert value("force of contacts, of the limit", **run) == 2.0
+    assert value("contact force relative to its limit", **run) == 2.0
     assert value("contacts over the limit", **run | {"near_worker": None}) is None
 
 

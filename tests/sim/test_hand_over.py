@@ -36,12 +36,12 @@ def test_lays_it_down_takes_it_up_and_holds_it_out(seed):
     assert plan.reaches[3].end < taken < plan.reaches[4].begin + 1e-9
     # On the bench it rests where he left it, its lower side on the top.
     for time in np.linspace(laid, taken - 1e-6, 4).tolist():
-        np.testing.assert_allclose(plan.thing_at(time), plan.thing_at(laid))
-    assert plan.thing_at(laid)[2] - TOP == pytest.approx(THICKNESS, abs=0.01)
+        np.testing.assert_allclose(plan.object_position(time), plan.object_position(laid))
+    assert plan.object_position(laid)[2] - TOP == pytest.approx(THICKNESS, abs=0.01)
     # In his hand it goes along.
     for time in (plan.visit.begin, laid, taken, plan.visit.end, plan.visit.end + 5):
-        np.testing.assert_allclose(plan.thing_at(time) - grip(plan, time), HELD_OUT)
-    np.testing.assert_allclose(plan.thing_at(plan.visit.end), plan.place, atol=0.02)
+        np.testing.assert_allclose(plan.object_position(time) - grip(plan, time), HELD_OUT)
+    np.testing.assert_allclose(plan.object_position(plan.visit.end), plan.place, atol=0.02)
     assert 0.2 < EDGE - plan.place[1] < 0.45
     # A movement that can be watched: a dozen images of an ordinary camera.
     last = plan.reaches[-1]
@@ -56,14 +56,17 @@ def test_brings_it_to_the_robot_lets_go_and_leaves():
     # Nothing that he has done is otherwise.
     for time in np.linspace(0, now, 40).tolist():
         np.testing.assert_allclose(brought.visit.ends_at(time), plan.visit.ends_at(time))
-    np.testing.assert_allclose(brought.thing_at(brought.visit.end), there, atol=5e-3)
+    np.testing.assert_allclose(brought.object_position(brought.visit.end), there, atol=5e-3)
     path = np.stack(
-        [brought.thing_at(t) for t in np.arange(now - 0.1, brought.visit.end, 0.01).tolist()]
+        [
+            brought.object_position(t)
+            for t in np.arange(now - 0.1, brought.visit.end, 0.01).tolist()
+        ]
     )
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / 0.01
     assert speed.max() < plan.speeds.reaching
     gone = brought.left(brought.visit.end + 2.0)
-    np.testing.assert_allclose(gone.thing_at(gone.visit.end + 9), there, atol=5e-3)
+    np.testing.assert_allclose(gone.object_position(gone.visit.end + 9), there, atol=5e-3)
     there_at_last = gone.visit.posture(np.array(gone.visit.end)).place
     np.testing.assert_allclose(there_at_last, plan.leaving)
     assert gone.visit.end > brought.visit.end + 3.0
@@ -76,7 +79,9 @@ def test_may_begin_later():
         np.testing.assert_allclose(
             later.visit.ends_at(time + 10), plan.visit.ends_at(time), atol=1e-12
         )
-        np.testing.assert_allclose(later.thing_at(time + 10), plan.thing_at(time), atol=1e-12)
+        np.testing.assert_allclose(
+            later.object_position(time + 10), plan.object_position(time), atol=1e-12
+        )
     assert later.reaches[-1].end == later.visit.end
 
 
@@ -114,7 +119,7 @@ def test_handovers_vary_as_much_as_they_may():
     assert (aside >= -0.22).all()
     assert (aside[place[:, 0] > 0.081] <= 0.04).all()
     assert ((place[:, 0] >= 0.08) & (place[:, 0] <= 0.42)).all()
-    laid = np.array([plan.thing_at(plan.carried[0][1]) for plan in plans])
+    laid = np.array([plan.object_position(plan.carried[0][1]) for plan in plans])
     assert fills(laid[:, 0] - stand[:, 0], -0.25, 0.0)
     assert fills(EDGE - laid[:, 1], 0.10, 0.16)
     np.testing.assert_allclose(laid[:, 2], TOP + THICKNESS)

@@ -198,9 +198,9 @@ def state(q=READY, width=0.08, torque=None):
 def test_a_force_at_the_end_effector_is_felt_as_it_is():
     force = np.array([5.0, -20.0, 12.0])
     torque = panda.jacobian(Q).mT.numpy() @ np.concatenate([force, [0.4, -0.2, 0.1]])
-    felt = PersonFeedback(panda).told(state(torque=torque), pushed=False).contact_force
+    felt = PersonFeedback(panda).end_step(state(torque=torque), pushed=False).contact_force
     np.testing.assert_allclose(felt, force, atol=1e-9)
-    assert PersonFeedback(panda).told(state(), pushed=False).contact_force is None
+    assert PersonFeedback(panda).end_step(state(), pushed=False).contact_force is None
 
 
 def test_contacts_are_looked_at_ten_times_a_second_and_anew_when_the_clock_is_set_back():
@@ -208,7 +208,9 @@ def test_contacts_are_looked_at_ten_times_a_second_and_anew_when_the_clock_is_se
     seen = []
     for time in (*np.arange(0.0, 0.5, 0.01), 0.2):
         torque = J.mT.numpy() @ np.array([time, 0, 0, 0, 0, 0])
-        told = feedback.told(replace(state(torque=torque), time=float(time)), J, pushed=False)
+        told = feedback.end_step(
+            replace(state(torque=torque), time=float(time)), J, pushed=False
+        )
         seen.append(float(told.contact_force[0]))
     assert len(set(np.round(seen[:-1], 6))) in (5, 6)  # times are no exact decimals
     assert np.max(np.abs(np.array(seen[:-1]) - np.arange(0.0, 0.5, 0.01))) < 0.1 + 1e-9
@@ -218,9 +220,9 @@ def test_contacts_are_looked_at_ten_times_a_second_and_anew_when_the_clock_is_se
 def test_joints_near_their_limits_are_named():
     q = Q.numpy().copy()
     q[1], q[5] = panda.limits.lower[1] + 0.1, panda.limits.upper[5] - 0.14
-    told = PersonFeedback(panda).told(state(q), pushed=False)
+    told = PersonFeedback(panda).end_step(state(q), pushed=False)
     assert told.near_limits == (panda.joint_names[1], panda.joint_names[5])
-    assert PersonFeedback(panda).told(state(), pushed=False).near_limits == ()
+    assert PersonFeedback(panda).end_step(state(), pushed=False).near_limits == ()
 
 
 def test_an_object_slips_by_as_much_as_the_gripper_closes_while_it_holds_it():
@@ -228,7 +230,7 @@ def test_an_object_slips_by_as_much_as_the_gripper_closes_while_it_holds_it():
     load = GraspedBox(half_size=(0.02, 0.02, 0.05))
 
     def slip(width, load=None):
-        return feedback.told(state(width=width), pushed=False, load=load).slip
+        return feedback.end_step(state(width=width), pushed=False, load=load).slip
 
     assert slip(0.08) == slip(0.05) == 0.0  # it closes on nothing yet
     assert slip(0.040, load) == 0.0
@@ -243,12 +245,12 @@ def test_shares_multiply_and_the_worst_comes_first():
     feedback.note("obstacle", 0.2, distance=3.2)
     feedback.note("singularity", 0.99)  # nothing worth a word
     feedback.note("task_waits", mention=True)
-    told = feedback.told(state(), pushed=True)
+    told = feedback.end_step(state(), pushed=True)
     assert told.followed == pytest.approx(0.5 * 0.2 * 0.99)
     reasons = [(reason.hindrance, reason.kept) for reason in told.reasons]
     assert reasons == [("obstacle", 0.2), ("speed", 0.5), ("task_waits", 1.0)]
     assert told.reasons[0].text == "an obstacle is 3 cm away"
-    told = feedback.told(state(), pushed=True)
+    told = feedback.end_step(state(), pushed=True)
     assert told.followed == 1.0
     assert told.reasons == ()
 
@@ -257,7 +259,7 @@ def test_every_hindrance_has_words():
     for hindrance in HINDRANCES:
         feedback = PersonFeedback(panda)
         feedback.note(hindrance, 0.0, distance=2.0)
-        (reason,) = feedback.told(state(), pushed=True).reasons
+        (reason,) = feedback.end_step(state(), pushed=True).reasons
         assert len(reason.text) > 10
         assert "{" not in reason.text
 

@@ -440,3 +440,8 @@ def test_contact_limits_need_an_arm_with_masses():
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         PersonWatchConfig(**wrong)
+
+
+def test_a_contact_distance_of_nan_would_never_stop_the_arm_and_is_refused():
+    with pytest.raises(ValueError, match=r"contact is NaN: give a distance \[m\]"):
+        PersonWatchConfig(contact=float("nan"))

@@ -19,7 +19,7 @@ def run(**changes):
         "summary": "",
         "table": [
             Measurement(name="separation violations", value=0, target=0),
-            Measurement(name="force of contacts, of the limit", value=0.41, target=1.0),
+            Measurement(name="contact force relative to its limit", value=0.41, target=1.0),
             Measurement(name="trials, cycle time (median)", value=38.2, unit="s"),
         ],
         "configuration": {"cell": {"safety": {"separation": {"mode": "ssm+pfl"}}}},
@@ -43,7 +43,7 @@ def test_the_page_shows_values_settings_and_what_is_outside():
     page = evidence_page([run(), run(title="Second", table=run().table[:1])])
     assert "This is no certificate" in page
     assert "<code>safety.separation.mode</code> = ssm+pfl" in page
-    assert "force of contacts, of the limit 0.41" in page
+    assert "contact force relative to its limit 0.41" in page
     assert "Run 2" in page
     assert "A worker &amp; an arm" in page
     assert "emergency stop" in page
