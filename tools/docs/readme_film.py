@@ -40,10 +40,12 @@ SIZE = 640, 400
 RATE, SECONDS, FIRST, LAST = 15.0, 15.0, 1.0, 2.0
 """Pictures per second [1/s]; durations of the film, and of its titles at both ends [s]."""
 TITLE = "A robot arm works with people"
+BAR = 44
+"""Height of a title [px]."""
 AFTER_RELEASE = 7.0
 """Time after the release at which the film ends [s]."""
-EYE, TOWARDS = (1.62, 1.42, 1.02), (0.10, 0.06, 0.27)
-"""View of cabinet, arm, expert and worker [m]."""
+EYE, TOWARDS, FOCAL = (1.62, 1.42, 1.02), (0.10, 0.06, 0.36), 1.07
+"""View of cabinet, arm, expert and worker [m], and its focal length by the picture's height."""
 CLOSE_UP = np.array([0.22, 0.50, 0.20])
 """From the place of the release to the eye of the close-up, through the open front [m]."""
 INSET = 0.27
@@ -93,7 +95,7 @@ def frames(run: RunRecording, ending: str) -> Iterator[Picture]:
     width, height = SIZE
     begun = {event.text: event.time for event in run.phases}
     shelf = run.position[np.searchsorted(run.time, begun["release"])]
-    view = _camera(np.array(EYE), np.array(TOWARDS), focal=1.15)
+    view = _camera(np.array(EYE), np.array(TOWARDS), FOCAL)
     close = _camera(shelf + CLOSE_UP, shelf - [0.0, 0.0, 0.05], focal=1.5)
     assert run.camera is not None, "the run servoed"
     inset, expert = camera_inset(run.camera, width), expert_in(run)
@@ -217,13 +219,13 @@ def expert_in(run: RunRecording) -> Callable[[float], tuple[list[Line], bool]]:
 
 
 def titled(picture: Picture, text: str) -> Picture:
-    """A picture with a title across its middle."""
+    """A picture with a title below, where it hides nobody."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
     width, height = image.size
-    middle = height // 5
-    draw.rectangle((0, middle - 36, width, middle + 36), fill=(24, 26, 30, 215))
-    draw.text((width // 2, middle), text, font_size=34, fill="white", anchor="mm")
+    draw.rectangle((0, height - BAR, width, height), fill=(24, 26, 30))
+    middle = width // 2, height - BAR // 2
+    draw.text(middle, text, font_size=30, fill="white", anchor="mm")
     return np.asarray(image)
 
 
