@@ -1,4 +1,4 @@
-.PHONY: demo test test-long test-slow test-wheel docs format check bench xr clean
+.PHONY: demo test test-long test-slow test-wheel docs gallery check-site format check bench xr clean
 .DEFAULT_GOAL := help
 
 PYTHON := .venv/bin/python
@@ -17,6 +17,8 @@ help:
 	@echo "make xr      build the client for headsets and phones"
 	@echo "make bench   measure the speed against floors and peers"
 	@echo "make docs    build the documentation site; writes outputs/docs"
+	@echo "make gallery make the pictures of the site; ONLY=\"film dmp_pose\": only these"
+	@echo "make check-site  check every page of the built site in a browser"
 	@echo "make format  format the code        make check  lint, type-check, build the site"
 
 demo: .venv/.installed
@@ -45,6 +47,12 @@ test-wheel: .venv/.installed
 
 docs: .venv/.installed
 	$(PYTHON) tools/build_docs.py
+
+gallery: .venv/.installed
+	$(PYTHON) tools/build_gallery.py $(if $(ONLY),--only $(ONLY))
+
+check-site: .venv/.installed
+	$(PYTHON) tools/check_site.py
 
 format: .venv/.installed
 	$(PYTHON) -m ruff check --fix-only --quiet .

@@ -107,7 +107,7 @@ def _pictures(
 
 
 def _picture(tab) -> bytes:
-    shown = Image.open(BytesIO(tab.screenshot(type="png"))).convert("RGB")
+    shown = Image.open(BytesIO(tab.screenshot(type="png", timeout=300e3))).convert("RGB")
     buffer = BytesIO()
     smaller = shown.resize((WIDTH, WIDTH * SIZE[1] // SIZE[0]), Image.Resampling.LANCZOS)
     smaller.save(buffer, "JPEG", quality=80)
