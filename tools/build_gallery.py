@@ -27,6 +27,11 @@ RUNS = {
         "--config robot.images.kind=egl"
     ),
     "outputs/so101_set.rrd": "hrc show outputs/so101_set --out outputs/so101_set.rrd",
+    "outputs/so101_fit": "hrc fit outputs/so101_set --out outputs/so101_fit",
+    "outputs/so101_played": (
+        "hrc play --model outputs/so101_fit --goal 0.7 0.2 0.3 -0.4 1.6 --robot so101 "
+        "--out outputs/so101_played"
+    ),
     "outputs/fit": "hrc fit outputs/demo/placing_demos --out outputs/fit",
     "outputs/placing": "hrc run placing --out outputs/placing",
     "outputs/grasping": "hrc run grasping --out outputs/grasping",
@@ -76,6 +81,14 @@ PROGRAMS = (
         command="python tools/docs/readme_film.py",
         pictures=("film.webp",),
         needs=("outputs/demo",),
+    ),
+    Program(
+        heading="An SO-101",
+        command="python tools/docs/moving_picture.py outputs/so101_played/film.mp4 "
+        "docs/images/so101.webp",
+        pictures=("so101.webp",),
+        needs=("outputs/so101_set", "outputs/so101_fit", "outputs/so101_played"),
+        captions={"so101.webp": "A primitive of three demonstrations, sent to a new goal"},
     ),
     Program(
         heading="Page and headset",

@@ -12,6 +12,7 @@ from commands import done
 from PIL import Image
 from sample_runs import sample_run
 
+from hrc_learn.viz.film import film_mp4
 from hrc_learn.viz.report import (
     Measurement,
     Picture,
@@ -196,6 +197,23 @@ def test_the_film_is_a_picture_that_moves():
     for number, level in enumerate(levels):
         shown.seek(number)
         assert np.asarray(shown.convert("RGB")).mean() == pytest.approx(level, abs=8)
+
+
+def test_a_film_becomes_a_smaller_picture_that_moves(tmp_path):
+    program = load(ROOT / "tools" / "docs" / "moving_picture.py")
+    film = tmp_path / "film.mp4"
+    levels = [20, 20, 120, 120, 220, 220]
+    film.write_bytes(film_mp4((np.full((60, 120, 3), x, np.uint8) for x in levels), 30.0))
+    out = tmp_path / "film.webp"
+    program.main(program.Args(film=film, out=out, width=60, rate=15.0))
+    shown = Image.open(out)
+    assert (shown.size, shown.n_frames) == ((60, 30), 3)
+    for number, level in enumerate(levels[::2]):
+        shown.seek(number)
+        assert shown.convert("L").getpixel((30, 15)) == pytest.approx(level, abs=10)
+        assert shown.info["duration"] == 67
+    with pytest.raises(ValueError, match=r"film\.gif: name a file \.webp"):
+        program.main(program.Args(film=film, out=tmp_path / "film.gif"))
 
 
 @pytest.mark.parametrize(

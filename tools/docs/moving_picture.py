@@ -1,7 +1,8 @@
 """Make a film of a run a moving picture, which Markdown shows anywhere.
 
-hrc demo --robot so101 --out outputs/so101
-python tools/docs/moving_picture.py outputs/so101/run/film.mp4 docs/images/so101.webp
+python tools/docs/moving_picture.py outputs/so101_played/film.mp4 docs/images/so101.webp
+
+`tools/build_gallery.py` lists the commands of all pictures.
 """
 
 from dataclasses import dataclass
