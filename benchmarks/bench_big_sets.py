@@ -72,9 +72,9 @@ class Used:
     """CPU time and memory of a process."""
 
     seconds: float
-    """Of CPU."""
+    """CPU time [s]."""
     memory: float
-    """Largest [MiB]."""
+    """Largest resident memory [MiB]."""
     status: int
 
 

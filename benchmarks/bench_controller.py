@@ -59,14 +59,14 @@ TARGETS = {
     "eager_us": 300.0,
     "kinematics_us": 40.0,
 }
-"""At most."""
+"""Upper bounds of the measured values."""
 LEAST = {
     "kinematics_compiled_1024_per_s": 1e7,
     "kinematics_compiled_8192_per_s": 1e7,
     "steps_exported_25_neurons_1024_per_s": 1.5e6,
     "steps_exported_64_neurons_1024_per_s": 0.7e6,
 }
-"""At least."""
+"""Lower bounds of the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)

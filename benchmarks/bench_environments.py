@@ -56,7 +56,7 @@ SEPARATOR = "/"
 @dataclass(frozen=True, kw_only=True)
 class Args:
     tasks: tuple[str, ...] = PUBLIC
-    """Of public_tasks/known.py."""
+    """Names of tasks of public_tasks/known.py."""
     policies: tuple[str, ...] = (
         "act",
         "diffusion",

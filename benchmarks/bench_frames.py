@@ -28,7 +28,7 @@ SAMPLES, PLACES = 100, 50
 @dataclass(frozen=True, kw_only=True)
 class Args:
     counts: tuple[int, ...] = (3, 4, 6, 8, 12)
-    """Of demonstrations."""
+    """Numbers of demonstrations."""
     seeds: int = 10
     """Number of sets of demonstrations for each count."""
     n_basis: int = 30

@@ -30,7 +30,7 @@ _SAMPLES = 57  # number of positions of joint 7, or of starts
 @dataclass(frozen=True, kw_only=True)
 class Args:
     arms: tuple[str, ...] = ("panda", "fr3", "xarm7", "ur5", "iiwa7")
-    """Registered names."""
+    """Names of registered arms."""
     repeats: int = 10
     """Number of timed calls of each kind."""
     json: Path | None = None

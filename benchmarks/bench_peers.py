@@ -79,7 +79,7 @@ class Measured:
     """CPU time of one prediction [s]."""
     chosen: list[Setting] = field(default_factory=list)
     settings: list[Setting] = field(default_factory=list)
-    """Those compared."""
+    """Settings that were compared."""
 
 
 @dataclass(kw_only=True)

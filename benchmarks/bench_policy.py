@@ -74,7 +74,7 @@ class Figures:
     """Results of a policy from new starts."""
 
     success: float
-    """Share."""
+    """Fraction of successes."""
     path_mm: float
     """Distance of the end effector from the expert's path at the same time, root mean square
     [mm]."""
@@ -96,7 +96,7 @@ class Done:
     joints: Float[Tensor, "T 7"]
     """Joint positions measured before each command [rad]."""
     commands: Float[Tensor, "T 7"]
-    """[rad]"""
+    """Commanded joint positions [rad]."""
 
 
 def main(args: Args) -> None:

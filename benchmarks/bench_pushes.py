@@ -54,7 +54,7 @@ class Args:
     first_seed: int = 0
     """First seed of path, push and imperfections."""
     force: float = 20.0
-    """[N]"""
+    """Force of a push [N]."""
     config: TouchConfig = field(default_factory=TouchConfig)
     """Thresholds of a touch."""
     json: Path | None = None
@@ -79,7 +79,7 @@ class Listener(Human):
         return asked
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell it."""
+        """Pass the feedback to the touch."""
         self._touch.tell(feedback)
 
 

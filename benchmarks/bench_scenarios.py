@@ -76,7 +76,7 @@ def main(args: Args) -> None:
 
 
 def waves(end: float, n: int, fast: float = 2.5, slow: float = 1.5) -> tuple[Tensor, Tensor]:
-    """Two cosines."""
+    """Two cosines of different frequencies."""
     t = torch.linspace(0, end, n, dtype=F64)
     return t, torch.stack([(fast * torch.pi * t).cos(), 0.5 + (slow * torch.pi * t).cos()], -1)
 

@@ -72,7 +72,7 @@ class Listener(Human):
         return self._person.read(state)
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell both."""
+        """Pass the feedback to both."""
         self._touch.tell(feedback)
         self._person.tell(feedback)
 

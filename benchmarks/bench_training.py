@@ -27,12 +27,12 @@ JOINTS = tuple(f"joint{i + 1}" for i in range(7))
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """How much."""
+    """Size of the dataset and settings of the fit."""
 
     episodes: int = 1000
-    """Demonstrations."""
+    """Number of demonstrations."""
     frames: int = 1000
-    """Of each."""
+    """Number of frames in each demonstration."""
     n_basis: int = 50
     """Number of basis functions."""
     dataset: Path | None = None

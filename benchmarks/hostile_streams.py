@@ -41,7 +41,7 @@ class StreamConfig:
     count: int = 120
     """Number of streams; each kind has the same number."""
     ticks: int = 1000
-    """Of each."""
+    """Number of ticks of each stream."""
     seed: int = 0
     dt: float = 1e-3
     """Control step [s]."""

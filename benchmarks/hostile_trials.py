@@ -61,7 +61,7 @@ class HostileResult:
     """Results, one entry for each trial."""
 
     ticks: Int[Tensor, "trials"]
-    """Hostile ticks."""
+    """Number of ticks of the hostile phase."""
     poisoned: Int[Tensor, "trials"]
     """Number of ticks with NaN, infinity or 1e300 in an input of this arm or in the step."""
     beyond: Int[Tensor, "trials kinds"]

@@ -42,7 +42,7 @@ class Args:
     model: Path
     """Folder of the visual-servoing skill."""
     dataset: Path
-    """Its demonstrations."""
+    """Dataset of the demonstrations that the skill was fitted to."""
     json: Path | None = None
     """File for the measured values."""
 

@@ -42,7 +42,7 @@ class Peer:
 
 
 def grid(**choices: Sequence[Any]) -> list[Setting]:
-    """All combinations."""
+    """All combinations of the choices."""
     return [dict(zip(choices, values, strict=True)) for values in product(*choices.values())]
 
 

@@ -1,13 +1,13 @@
-"""gym-aloha's transfer of a cube from arm to arm, and an expert of our own.
+"""gym-aloha's transfer of a cube from arm to arm, with our own expert.
 
-The right arm takes a cube from the table and hands it to the left arm. What is seen are numbers
-that the package's own task keeps; it renders pictures at each step, this only when asked. It is
-done when the package says so: a finger of the left gripper touches the cube and the table does
-not.
+The right arm takes a cube from the table and hands it to the left arm. Observations are numbers
+from the package's own task; the package renders images at each step, this module only on
+request. The package decides on success: a finger of the left gripper touches the cube and the
+table does not.
 
-The expert looks at joints and cube before each action. It leads both hands past a few places by
-movements of minimum jerk, which go on from where they are if the cube turns up elsewhere, and
-it begins anew if it has lost the cube.
+The expert reads joints and cube before each action. It guides both hands through a sequence of
+poses by minimum-jerk motions. If the cube appears at another place, the motions continue from
+the present poses; if the cube is lost, the sequence starts again.
 """
 
 import math
@@ -20,73 +20,80 @@ from jaxtyping import Float, UInt8
 from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
 FPS = 50.0
-"""Of gym-aloha."""
+"""Actions per second, from gym-aloha."""
 LONGEST = 440
-"""Actions after which an episode has failed: half as many again as the expert takes."""
+"""Number of actions after which an episode has failed: 1.5 times the expert's number."""
 MOVED_AT = 20
-"""Actions after which the cube is moved: the right hand is above it after 70."""
+"""Number of actions after which the cube is moved: the right hand is above it after 70."""
 DONE = 4
-"""Reward of gym-aloha for a cube that the left gripper has."""
+"""Reward of gym-aloha for a cube in the left gripper."""
 LOW, HIGH = np.array([0.0, 0.4]), np.array([0.2, 0.6])
-"""Where the cube may be at the beginning, x and y [m]: gym-aloha has it inside a function."""
+"""Lowest and highest initial x and y of the cube [m]; gym-aloha defines them inside a function.
+"""
 DROPPED_FROM = 0.05
-"""Height of the cube at the beginning [m], likewise."""
+"""Initial height of the cube [m]; gym-aloha defines it inside a function."""
 TRIES = 1000
-"""Of a direction to move the cube in, until it may begin there."""
+"""Largest number of directions tried for a move of the cube to an allowed initial place."""
 HEIGHT, WIDTH = 480, 640
-"""Of a picture [px]."""
+"""Size of an image [px]."""
 
 JOINTS = 6
-"""Of an arm, without its gripper."""
+"""Number of joints of an arm, without its gripper."""
 FOREARM_ROLL = 3
-"""Joint that stays at 0: otherwise forearm and wrist may end up doing the same."""
+"""Index of the joint that stays at 0: otherwise forearm and wrist may rotate about the same
+axis."""
 GRIP = 0.142
-"""From a gripper's link to what it holds [m]: a little over a centimetre short of its tips."""
+"""Distance from the gripper's link to the held object [m]: about 1 cm before the finger tips.
+"""
 MEETING = np.array([0.0, 0.5, 0.25])
-"""Where the cube is handed over [m]: in the middle, well above the table."""
+"""Place of the hand-over [m]: in the middle, well above the table."""
 CLEARANCE = np.array([0.0, 0.0, 0.09])
-"""From the cube to where the right hand comes down from and is lifted to [m]."""
+"""Offset from the cube to the place above it, for the right hand [m]."""
 STANDOFF = np.array([-0.13, 0.0, 0.0])
-"""From the meeting to where the left hand waits [m]: clear of the right one."""
+"""Offset from the hand-over to the waiting place of the left hand [m], clear of the right hand.
+"""
 SHORT = np.array([-0.006, 0.0, 0.0])
-"""From the cube to where the left hand takes it [m]: clear of the right fingers."""
+"""Offset from the cube to the grasp of the left hand [m], clear of the right fingers."""
 DOWN = math.pi / 2
-"""How far the right hand looks down on the cube [rad]: when level, it has turned the cube by a
-quarter, so that the left hand finds faces."""
+"""Pitch at which the right hand grasps the cube [rad]. Back at level, it has turned the cube by
+a quarter turn, so the left hand finds faces."""
 ACROSS = math.pi / 2
-"""Roll of the left hand [rad]: its fingers take faces that the right ones leave free."""
+"""Roll of the left hand [rad]: its fingers grasp the faces that the right fingers leave free.
+"""
 
 NEAR = np.array([0.01, 0.01, 0.01, 0.1, 0.1])
-"""Of its goal, what a hand must come to [m and rad]: within its opening."""
+"""Distance from its goal at which a hand has arrived [m and rad]: within its opening."""
 PATIENCE = 1.0
-"""How long that may take [s]; on it goes anyway."""
+"""Longest wait for a hand to arrive [s]; then the next stage begins."""
 JUMP = 0.02
-"""Farther than this from one action to the next [m], the cube is not carried but elsewhere."""
+"""Displacement of the cube between two actions above which the cube was moved and not carried
+[m]."""
 AGAIN = 0.6
-"""Part of the time of the first stage that there is at least when the cube is elsewhere."""
+"""Smallest fraction of the first stage's duration that remains after the cube was moved."""
 LOST = 0.03
-"""How far from the hand a cube is no longer held [m]."""
+"""Distance from the hand above which the cube is no longer held [m]."""
 SPEED = math.pi
-"""Of a joint, at most [rad/s]: as the motors of these arms."""
+"""Largest joint speed [rad/s], that of the motors of these arms."""
 DAMPING = 1e-5
-"""Of inverse kinematics [m²]: far below squares of the arms' levers."""
+"""Damping of inverse kinematics [m²]: far below the squares of the arms' levers."""
 ITERATIONS = 5
-"""Of inverse kinematics for an action: the joints of the one before are near."""
+"""Number of iterations of inverse kinematics per action: the previous joints are near."""
 QUINTIC = np.array(
     [[1, 0, 0], [0, 1, 0], [0, 0, 0.5], [-10, -6, -1.5], [15, 8, 1.5], [-6, -3, -0.5]]
 )
-"""Polynomial of minimum jerk, by powers of time, that comes to rest at 0 after a unit of time,
-from place, speed and acceleration at first."""
+"""Minimum-jerk polynomial that rests at 0 after a unit of time: coefficients by powers of time,
+for an initial position, velocity and acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Stage:
-    """Where both hands are led for a while, and how far they are open in the end."""
+    """Poses of both hands at the end of a stage, with the openings of both grippers."""
 
     seconds: float
     right: Literal["above cube", "cube", "meeting"]
     right_open: float = 0.0
-    """When open, it goes to where the cube is now; closed, to where it was then."""
+    """Opening of the right gripper, 0 to 1. Open, the hand moves to the cube's present place;
+    closed, to its place at the time of closing."""
     left: Literal["waiting", "cube"] = "waiting"
     left_open: float = 1.0
 
@@ -101,15 +108,15 @@ STAGES = (
     _Stage(seconds=0.6, right="meeting", left="cube", left_open=0.0),
 )
 HELD = 3
-"""Stage from which on the right hand has the cube."""
+"""First stage in which the right hand holds the cube."""
 
 
 class AlohaTransfer:
-    """gym_aloha/AlohaTransferCube-v0, seen as numbers.
+    """gym_aloha/AlohaTransferCube-v0 with numbers as observations.
 
-    Seen of the left arm and then of the right are six joints [rad] and how far its gripper is
-    open, from 0 to 1; of the cube its position [m] and orientation (quaternion, scalar first).
-    An action is where to send the joints and grippers.
+    Observations are, for the left arm and then for the right arm, six joints [rad] and the
+    opening of the gripper, 0 to 1; for the cube, its position [m] and orientation (quaternion,
+    scalar first). An action holds the commanded joints and gripper openings.
     """
 
     fps: float = FPS
@@ -117,7 +124,8 @@ class AlohaTransfer:
     longest: int = LONGEST
     moved_at: int | None = MOVED_AT
     moved: float = 0.05
-    """How far `move_object` moves the cube [m]: farther than an open gripper is off."""
+    """Distance by which `move_object` moves the cube [m]: larger than the tolerance of an open
+    gripper."""
 
     def __init__(self) -> None:
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -127,7 +135,7 @@ class AlohaTransfer:
         from gym_aloha.tasks import sim  # pyright: ignore[reportMissingImports]
 
         class Task(sim.TransferCubeTask):
-            """Without pictures."""
+            """The package's task without images."""
 
             def get_observation(self, physics: Any) -> Observation:
                 return {
@@ -146,16 +154,18 @@ class AlohaTransfer:
         self.expert: Expert = _Expert(self._physics.model.ptr)
 
     def begin(self, seed: int) -> Observation:
-        """Put the arms in their places and the cube somewhere from `LOW` to `HIGH`."""
+        """Set the arms to their initial joints and the cube to a random place between `LOW` and
+        `HIGH`.
+        """
         where = np.random.default_rng(seed).uniform(LOW, HIGH)
         self._cube_pose[0] = np.array([*where, DROPPED_FROM, 1.0, 0.0, 0.0, 0.0])
         self._seen = None
         return self._env.reset().observation
 
     def step(self, action: Float[np.ndarray, "14"]) -> tuple[Observation, bool]:
-        """What is seen after an action, and whether the left gripper has the cube.
+        """Observation after an action, and True if the left gripper has the cube.
 
-        Where an action makes the simulation unstable the episode is lost: nothing moves any
+        If an action makes the simulation unstable, the episode is lost, and nothing moves any
         more.
         """
         if self._seen is not None:
@@ -169,7 +179,7 @@ class AlohaTransfer:
         return after.observation, after.reward == DONE
 
     def move_object(self, rng: np.random.Generator) -> Observation:
-        """Move the cube in a direction that leaves it where episodes may begin with it.
+        """Move the cube in a random direction to an allowed initial place.
 
         Raises:
             RuntimeError: There is no such place.
@@ -184,15 +194,15 @@ class AlohaTransfer:
         raise RuntimeError(f"no episode begins with the cube {self.moved} m from {where}")
 
     def render(self) -> UInt8[np.ndarray, "H W 3"]:
-        """Picture of both arms from the side of the table."""
+        """Image of both arms from the side of the table."""
         return self._physics.render(height=HEIGHT, width=WIDTH, camera_id="angle")
 
 
 class _Arm:
-    """Kinematics of one arm, in a `MjData` of its own.
+    """Kinematics of one arm, in its own `MjData`.
 
-    A hand is where it grips, x, y, z [m], how far it looks down and how far it is rolled [rad].
-    Seen from above, it looks where the arm looks.
+    The pose of a hand is its grasp point x, y, z [m], its pitch and its roll [rad]. Its
+    heading, seen from above, is that of the arm.
     """
 
     def __init__(self, model: Any, side: str):
@@ -208,7 +218,7 @@ class _Arm:
         self.heading = 0.0 if side == "left" else math.pi
 
     def hand(self, joints: Float[np.ndarray, "6"]) -> Float[np.ndarray, "5"]:
-        """Where the hand is with these joints [rad]."""
+        """Pose of the hand at these joints [rad]."""
         place, axes = self._link_at(joints)
         axes = _axes(-self.heading - joints[0], 0, 0) @ axes
         down, roll = math.atan2(-axes[2, 0], axes[0, 0]), math.atan2(-axes[1, 2], axes[1, 1])
@@ -217,7 +227,9 @@ class _Arm:
     def joints(
         self, hand: Float[np.ndarray, "5"], near: Float[np.ndarray, "6"]
     ) -> Float[np.ndarray, "6"]:
-        """Joints [rad] close to others that have the hand there, by damped least squares."""
+        """Joints [rad] near the given ones at which the hand has the pose, by damped least
+        squares.
+        """
         joints = near.copy()
         moved, turned = np.zeros((2, 3, self._model.nv))
         for _ in range(ITERATIONS):
@@ -226,7 +238,7 @@ class _Arm:
             turn = 0.5 * np.cross(axes, wanted, axis=0).sum(axis=1)
             self._mj.mj_jac(self._model, self._data, moved, turned, place, self._link)
             jac = np.vstack([moved, turned])[:, self._own]
-            jac[3:, 0] = 0  # What is wanted turns with the waist.
+            jac[3:, 0] = 0  # The wanted pose rotates with the waist.
             jac[:, FOREARM_ROLL] = 0
             error = np.concatenate([hand[:3] - place, turn])
             joints += jac.T @ np.linalg.solve(jac @ jac.T + DAMPING * np.eye(6), error)
@@ -236,7 +248,7 @@ class _Arm:
     def _link_at(
         self, joints: Float[np.ndarray, "6"]
     ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-        """Where it grips [m], and the axes of the gripper in columns; x is where it looks."""
+        """Grasp point [m], and the axes of the gripper in columns; x points forwards."""
         self._data.qpos[self._own] = joints
         self._mj.mj_kinematics(self._model, self._data)
         self._mj.mj_comPos(self._model, self._data)
@@ -252,11 +264,11 @@ class _Expert:
         self.begin()
 
     def begin(self) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self._stage = -1
 
     def act(self, seen: Observation) -> Float[np.ndarray, "14"]:
-        """What to do when that is seen; to be called once for each action."""
+        """Action for an observation; called once for each action."""
         arms = seen[AGENT_POS].astype(float).reshape(2, JOINTS + 1)
         cube = seen[ENVIRONMENT_STATE].astype(float)
         pairs = zip(self._arms, arms[:, :JOINTS], strict=True)
@@ -280,7 +292,7 @@ class _Expert:
     def _choose_stage(
         self, hands: Float[np.ndarray, "2 5"], cube: Float[np.ndarray, "7"]
     ) -> None:
-        """On, back or neither, with hands and cube there."""
+        """Choose the next, the first or the present stage, for these hands and this cube."""
         holds = self._stage >= HELD
         if holds and np.linalg.norm(hands[1, :3] - cube[:3]) > LOST:
             self._enter(0)
@@ -294,7 +306,7 @@ class _Expert:
                 self._enter(self._stage + 1)
 
     def _goal(self, cube: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2 6"]:
-        """Hands and their openings at the end of this stage, with the cube there."""
+        """Poses of the hands and openings at the end of this stage, for this cube."""
         stage = STAGES[self._stage]
         if stage.right_open:
             self._down = [*cube[:3], DOWN, self._roll(cube)]
@@ -307,7 +319,7 @@ class _Expert:
         )
 
     def _roll(self, cube: Float[np.ndarray, "7"]) -> float:
-        """Roll of the right hand that puts its fingers along faces of the cube [rad]."""
+        """Roll of the right hand that aligns its fingers with faces of the cube [rad]."""
         w, x, y, z = cube[3:]
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         away = cube[:2] - self._arms[1].base
@@ -317,7 +329,7 @@ class _Expert:
 
 
 def _axes(heading: float, down: float, roll: float) -> Float[np.ndarray, "3 3"]:
-    """Axes in columns of a gripper that looks there [rad]."""
+    """Axes, in columns, of a gripper with this heading, pitch and roll [rad]."""
     z, y, x = np.eye(3), np.eye(3), np.eye(3)
     for axes, rows, angle in ((z, [0, 1], heading), (y, [2, 0], down), (x, [1, 2], roll)):
         c, s = math.cos(angle), math.sin(angle)
@@ -328,7 +340,9 @@ def _axes(heading: float, down: float, roll: float) -> Float[np.ndarray, "3 3"]:
 def _go_on(
     motion: Float[np.ndarray, "3 2 6"], goal: Float[np.ndarray, "2 6"], seconds: float
 ) -> Float[np.ndarray, "3 2 6"]:
-    """Place, speed and acceleration an action later, to be at rest at the goal in time."""
+    """Position, velocity and acceleration one action later, on a motion that rests at the goal
+    in time.
+    """
     still = np.stack([goal, np.zeros_like(goal), np.zeros_like(goal)])
     if seconds <= 1 / FPS:
         return still

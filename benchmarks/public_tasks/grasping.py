@@ -1,6 +1,6 @@
-"""Our own: grasping in the simulated work cell, as `mujoco_arm` has it for LeRobot.
+"""Our own task: grasping in the simulated work cell, as in `mujoco_arm` for LeRobot.
 
-What is seen of the object is where its pixel was at the beginning, so it cannot be moved.
+The object is observed by its initial pixel only, so it cannot be moved during an episode.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot
 
 OBJECT = 2
-"""Last numbers of what a `mujoco_arm` observes: the object's pixel."""
+"""Number of the last components of a `mujoco_arm` observation: the object's pixel."""
 
 
 class Grasping:
@@ -33,35 +33,37 @@ class Grasping:
         self.n_actions = config.features[ACTION].shape[0]
 
     def begin(self, seed: int) -> Observation:
-        """The box where the seed has it."""
+        """Begin an episode with the box at the place drawn from the seed."""
         return _parted(self._env.reset(seed=seed)[0])
 
     def step(self, action: Float[np.ndarray, "A"]) -> tuple[Observation, bool]:
-        """One action; done once MuJoCo's contacts have said so for a while."""
+        """Observation after an action, and True once MuJoCo's contacts have shown success for
+        some time.
+        """
         seen, _, done, _, _ = self._env.step(action)
         return _parted(seen), done
 
     def move_object(self, rng: np.random.Generator) -> Observation:
-        """Not here."""
+        """Not available: the object is observed at the beginning only."""
         raise RuntimeError("where the object is is told at the beginning only")
 
     def render(self) -> Any:
-        """The work cell."""
+        """Image of the work cell."""
         return self._env.render()
 
 
 class _Expert:
-    """The scripted expert with its trembling hand, which knows where the box is."""
+    """The scripted expert with tremor, which knows the place of the box."""
 
     def __init__(self, robot: MujocoArmRobot):
         self._robot = robot
 
     def begin(self) -> None:
-        """From where the arm is."""
+        """Begin at the arm's present pose."""
         self._guided = GuidedRobot(self._robot, self._robot.run.expert)
 
     def act(self, seen: Observation) -> Float[np.ndarray, "A"]:
-        """What it shows next."""
+        """Next demonstrated action."""
         return np.array(list(self._guided.next()[0].values()))
 
 

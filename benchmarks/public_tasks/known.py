@@ -1,4 +1,4 @@
-"""The tasks by name, and how long their chunks are."""
+"""Tasks by name, and the lengths of their chunks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,13 +8,14 @@ from public_tasks.protocol import PublicTask
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """How a task is learned: alike for all policies."""
+    """Settings of learning a task, the same for all policies."""
 
     make: Callable[[], PublicTask]
     chunk: int
-    """Actions predicted at once: one to two seconds, a third of one in MetaWorld."""
+    """Number of actions predicted at once: one to two seconds, a third of a second in
+    MetaWorld."""
     executed: int
-    """Of these, how many are carried out before the next prediction."""
+    """Number of these actions that are executed before the next prediction."""
 
 
 def _pusht() -> PublicTask:

@@ -19,12 +19,12 @@ from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Observation, Pub
 @EnvConfig.register_subclass("public_task")
 @dataclass
 class PublicTaskConfig(EnvConfig):
-    """One of `TASKS`, seen as numbers."""
+    """One of `TASKS`, with numbers as observations."""
 
     task: str | None = "pusht"
-    """As `TASKS` name it."""
+    """Name of the task in `TASKS`."""
     move_object: bool = False
-    """Whether the object is moved aside while the agent is on its way to it."""
+    """True if the object is moved while the agent approaches it."""
     fps: int = field(init=False)
     features: dict[str, PolicyFeature] = field(init=False)
     features_map: dict[str, str] = field(
@@ -55,7 +55,7 @@ class PublicTaskConfig(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector of environments that differ by their seeds."""
+        """A vector of environments that differ in their seeds."""
         makers = [partial(PublicTaskEnv, **self.gym_kwargs)] * n_envs
         mode = AutoresetMode.SAME_STEP
         if use_async_envs and n_envs > 1:
@@ -68,7 +68,7 @@ class PublicTaskConfig(EnvConfig):
 
 
 class PublicTaskEnv(gym.Env):
-    """A task as gymnasium has it; the reward is one for a task that is done."""
+    """A task as a gymnasium environment; the reward is 1 for success."""
 
     render_mode = "rgb_array"
 
@@ -76,8 +76,8 @@ class PublicTaskEnv(gym.Env):
         """Set up.
 
         Args:
-            task: As `TASKS` name it.
-            move_object: Whether the object is moved under way.
+            task: Name of the task in `TASKS`.
+            move_object: True if the object is moved during the episode.
         """
         self._task: PublicTask = make_task(task)
         self._move_object = move_object
@@ -94,7 +94,7 @@ class PublicTaskEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin as a seed has it, or as the next random number."""
+        """Begin with a seed, or with the next random number."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
@@ -104,7 +104,7 @@ class PublicTaskEnv(gym.Env):
     def step(
         self, action: Float[np.ndarray, "A"]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One action. Where the object is to be moved, it moves before that action is done."""
+        """Execute one action. If the object is to be moved, it is moved before the action."""
         seen, success = self._task.step(np.asarray(action, float))
         self._steps += 1
         if self._move_object and self._steps == self._task.moved_at and not success:
@@ -114,7 +114,7 @@ class PublicTaskEnv(gym.Env):
         return _single(seen), float(success), success, late, {"is_success": success}
 
     def render(self) -> Any:
-        """A picture of what is there."""
+        """Image of the scene."""
         return self._task.render()
 
 

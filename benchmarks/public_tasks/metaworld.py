@@ -1,7 +1,8 @@
-"""MetaWorld, by its scripted experts and from beginnings of its own.
+"""MetaWorld with its scripted experts and its own initial scenes.
 
-Actions are where the hand is sent, as on most robots; MetaWorld takes the change to it, up to a
-centimetre at a time. An episode succeeds as soon as MetaWorld says so, as in LeRobot.
+Actions are commanded positions of the hand, as on most robots; MetaWorld accepts changes of at
+most a centimetre per action. An episode succeeds as soon as MetaWorld reports success, as in
+LeRobot.
 """
 
 import atexit
@@ -20,36 +21,38 @@ from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observat
 # MuJoCo ships no type stubs, and MetaWorld is taken for this file.
 
 FPS = 80.0
-"""Of MetaWorld: five steps of simulation of 2.5 ms an action."""
+"""Actions per second of MetaWorld: an action lasts five simulation steps of 2.5 ms."""
 LONGEST = 200
-"""Actions after which an episode has failed: some three times what the experts take."""
+"""Number of actions after which an episode has failed: about three times the experts' number.
+"""
 MOVED_AT = 12
-"""Actions after which the object is moved: experts close the gripper on it after 12 to 32."""
+"""Number of actions after which the object is moved: experts close the gripper after 12 to 32.
+"""
 MOVED = 0.07
-"""How far [m]: whoever goes to where it was misses it."""
+"""Distance of this move [m]: an agent that moves to the old place misses the object."""
 PER_METRE = 100.0
-"""MetaWorld's own action of a change of position; at most 1."""
+"""MetaWorld's action for a position change of one metre; an action is at most 1."""
 AGENT = 4
-"""Numbers of the hand, which come first: its position and how far it is open."""
+"""Number of the hand's components, which come first: its position and its opening."""
 FRAME = 18
-"""Numbers of a frame: those of the hand, and 14 for two objects, 0 where there is none."""
+"""Number of components of a frame: those of the hand, and 14 for two objects, 0 if missing."""
 TRIES = 1000
-"""Of a direction to move the object in, until it may begin there."""
+"""Largest number of directions tried for a move of the object to an allowed initial place."""
 SUITE_SEED = 42
-"""Of MetaWorld's list of tasks, as in LeRobot; beginnings have seeds of their own."""
+"""Seed of MetaWorld's list of tasks, as in LeRobot; initial scenes have their own seeds."""
 CAMERA = "corner3"
-"""Sees hand, object and goal from the side, upside down."""
+"""Camera that sees hand, object and goal from the side, upside down."""
 SIDE = 480
-"""Of a picture [px]."""
+"""Width and height of an image [px]."""
 
 
 class MetaWorld:
-    """A task of MetaWorld with one object that can be moved, begun as LeRobot begins it.
+    """A task of MetaWorld with one movable object, with initial scenes as in LeRobot.
 
-    Seen are the position of the hand [m] and how far it is open, from 0 to 1; and of the
-    object the position [m] and orientation (quaternion, scalar last), seven zeros, and where
-    the goal is [m]. An action is where to send the hand [m], and how hard to close it, from
-    -1 (open) to 1.
+    Observations are the position of the hand [m] and its opening, 0 to 1; the position [m] and
+    orientation of the object (quaternion, scalar last); seven zeros; and the position of the
+    goal [m]. An action is the commanded position of the hand [m], and the gripper's command,
+    from -1 (open) to 1 (closed).
     """
 
     fps: float = FPS
@@ -61,8 +64,8 @@ class MetaWorld:
         """Make the task.
 
         Args:
-            name: As in MetaWorld: pick-place-v3, push-v3.
-            moved: How far `move_object` moves it [m].
+            name: Name in MetaWorld, such as pick-place-v3 or push-v3.
+            moved: Distance by which `move_object` moves the object [m].
         """
         from metaworld import MT1, policies  # pyright: ignore[reportMissingImports]
 
@@ -76,19 +79,19 @@ class MetaWorld:
         self.expert: Expert = _Expert(getattr(policies, f"Sawyer{words}Policy")(), self._sent)
 
     def begin(self, seed: int) -> Observation:
-        """Put everything in its place; the same seed begins alike."""
+        """Begin an episode; the same seed gives the same initial scene."""
         self._env.seed(seed)
         return _observation(self._env.reset(seed=seed)[0])
 
     def step(self, action: Float[np.ndarray, "4"]) -> tuple[Observation, bool]:
-        """What is seen after an action, and whether the task is done as MetaWorld says."""
+        """Observation after an action, and True if MetaWorld reports success."""
         own = action.astype(float)
         own[:3] = PER_METRE * (own[:3] - self._sent())
         seen, _, _, _, info = self._env.step(own.clip(-1, 1))
         return _observation(seen), bool(info["success"])
 
     def move_object(self, rng: np.random.Generator) -> Observation:
-        """Move the object in a direction that leaves it where episodes may begin with it.
+        """Move the object in a random direction to an allowed initial place.
 
         Raises:
             RuntimeError: There is no such place.
@@ -105,7 +108,7 @@ class MetaWorld:
         raise RuntimeError(f"MetaWorld begins with no object {self._moved} m from {where}")
 
     def render(self) -> UInt8[np.ndarray, "H W 3"]:
-        """Picture of what is there."""
+        """Image of the scene."""
         if self._renderer is None:
             self._renderer = mujoco.Renderer(self._env.model, SIDE, SIDE)
             atexit.register(self._renderer.close)
@@ -113,26 +116,26 @@ class MetaWorld:
         return self._renderer.render()[::-1, ::-1]
 
     def _sent(self) -> Float[np.ndarray, "3"]:
-        """Where the hand has been sent [m]."""
+        """Commanded position of the hand [m]."""
         return self._env.data.mocap_pos[0].copy()
 
 
 @dataclass(frozen=True)
 class _Expert:
-    """What MetaWorld does itself: `begin` an episode, then `act` on what is seen."""
+    """MetaWorld's own expert: `begin` an episode, then `act` on observations."""
 
     policy: Any
     sent: Callable[[], Float[np.ndarray, "3"]]
 
     def begin(self) -> None:
-        """It sees anew for every action."""
+        """Begin an episode; the expert has no state."""
 
     def act(self, seen: Observation) -> Float[np.ndarray, "4"]:
-        """What to do when that is seen; to be called once for each action."""
+        """Action for an observation; called once for each action."""
         frame = np.concatenate([seen[AGENT_POS], seen[ENVIRONMENT_STATE]])
         own = np.concatenate([frame[:FRAME], np.zeros(FRAME), frame[FRAME:]])
         with warnings.catch_warnings():
-            # It asks for more than the arm does, and says so at each action.
+            # The expert requests larger actions than allowed, and warns at each one.
             warnings.filterwarnings("ignore", message="Constant.s. may be too high")
             action = self.policy.get_action(own).astype(float).clip(-1, 1)
         action[:3] = self.sent() + action[:3] / PER_METRE
@@ -140,7 +143,7 @@ class _Expert:
 
 
 def _observation(seen: Float[np.ndarray, "39"]) -> Observation:
-    """Without the frame before, which MetaWorld repeats in the middle."""
+    """Observation without the previous frame, which MetaWorld inserts in the middle."""
     seen = seen.astype(np.float32)
     things = np.concatenate([seen[AGENT:FRAME], seen[2 * FRAME :]])
     return {AGENT_POS: seen[:AGENT], ENVIRONMENT_STATE: things}

@@ -1,8 +1,8 @@
-"""Public environments with experts, and an object that may be moved under way.
+"""Public environments with experts, and an object that can be moved during an episode.
 
-Each is what its package makes it, seen as numbers: where the agent is and where things are. Add
-one by a module with a class that has all of `PublicTask`, and name it in known.py. They need
-packages of their own: tools/make_environments.sh.
+Each environment comes from its package, with numbers as observations: positions of the agent
+and of objects. To add one, write a module with a class that has all members of `PublicTask`,
+and name it in known.py. The environments need their own packages: tools/make_environments.sh.
 """
 
 from typing import Any, Protocol
@@ -14,7 +14,7 @@ from torch import Tensor
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 AGENT_POS, ENVIRONMENT_STATE = "agent_pos", "environment_state"
-"""What gymnasium environments call the first two for LeRobot."""
+"""Names of the two observations in LeRobot's gymnasium environments."""
 type Observation = dict[str, Float[np.ndarray, "_"]]
 """`AGENT_POS` and `ENVIRONMENT_STATE`."""
 type Episode = dict[str, Tensor]
@@ -22,44 +22,44 @@ type Episode = dict[str, Tensor]
 
 
 class Expert(Protocol):
-    """Who knows how a task is done."""
+    """An expert that demonstrates a task."""
 
     def begin(self) -> None:
-        """An episode begins; to be called after the task's own `begin`."""
+        """Begin an episode; called after the task's own `begin`."""
         ...
 
     def act(self, seen: Observation) -> Float[np.ndarray, "A"]:
-        """What to do when that is seen; to be called once for each action."""
+        """Action for an observation; called once for each action."""
         ...
 
 
 class PublicTask(Protocol):
     """One environment with one task.
 
-    The same seed begins alike.
+    The same seed gives the same initial scene.
     """
 
     fps: float
-    """Actions a second."""
+    """Actions per second."""
     n_actions: int
-    """A, components of an action."""
+    """Number A of components of an action."""
     longest: int
-    """Actions after which an episode has failed."""
+    """Number of actions after which an episode has failed."""
     moved_at: int | None
-    """Actions after which the object is moved, the agent being on its way to it; None: it is
-    not."""
+    """Number of actions after which the object is moved, while the agent approaches it; None:
+    it is not moved."""
     expert: Expert
 
     def begin(self, seed: int) -> Observation:
-        """Put everything in its place."""
+        """Begin an episode."""
         ...
 
     def step(self, action: Float[np.ndarray, "A"]) -> tuple[Observation, bool]:
-        """What is seen after an action, and whether the task is done as its package says."""
+        """Observation after an action, and True if the package reports success."""
         ...
 
     def move_object(self, rng: np.random.Generator) -> Observation:
-        """Move the object aside, to where episodes may begin with it.
+        """Move the object to an allowed initial place.
 
         Raises:
             RuntimeError: There is no such place.
@@ -67,12 +67,12 @@ class PublicTask(Protocol):
         ...
 
     def render(self) -> Any:
-        """Picture of what is there, (H, W, 3), 8 bits."""
+        """Image of the scene, (H, W, 3), 8 bits."""
         ...
 
 
 def demonstrate(task: PublicTask, seed: int) -> Episode | None:
-    """What the expert sees and does until it succeeds; None: it does not."""
+    """Observations and actions of the expert until its success; None: it fails."""
     columns: dict[str, list[np.ndarray]] = {STATE: [], ENVIRONMENT: [], ACTION: []}
     seen, done = task.begin(seed), False
     task.expert.begin()
@@ -88,7 +88,7 @@ def demonstrate(task: PublicTask, seed: int) -> Episode | None:
 
 
 def succeeds(task: PublicTask, seed: int, *, moved: bool) -> bool:
-    """Whether the expert does it, with the object moved under way or not."""
+    """True if the expert succeeds, with or without the object moved during the episode."""
     seen, rng = task.begin(seed), np.random.default_rng(seed)
     task.expert.begin()
     for steps in range(1, task.longest + 1):

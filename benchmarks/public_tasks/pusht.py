@@ -1,11 +1,11 @@
-"""Push-T of gym-pusht: a disc pushes a T on a table onto a drawn one.
+"""Push-T of gym-pusht: a disc pushes a T on a table onto a drawn T.
 
-The package has no demonstrations, and those of people must be downloaded, so the expert here is
-our own. It knows how the T answers to a push: without friction at the disc and without inertia
-on the table, each contact shifts and turns the T along one known direction. So it can try
-thousands of sequences of straight pushes at once, takes the one that should be done soonest,
-carries out its first push, looks, and thinks again. Between pushes it walks round the T. The
-same observation after a push always gives the same next one.
+The package has no demonstrations, and those of people must be downloaded, so the expert is our
+own. It predicts the effect of a push: without friction at the disc and without inertia on the
+table, each contact shifts and rotates the T along one known direction. It evaluates thousands
+of sequences of straight pushes at once, chooses the sequence with the shortest predicted time,
+executes its first push, observes, and plans again. Between pushes, the disc moves round the T.
+The same observation after a push always gives the same next push.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observat
 type Point = Float[np.ndarray, "2"]
 type Points = Float[np.ndarray, "*N 2"]
 type Pose = Float[np.ndarray, "3"]
-"""Where the T is: x and y of its origin, the middle of its top (pixels), and angle (rad)."""
+"""Pose of the T: x and y of its origin, the middle of its top (pixels), and angle (rad)."""
 type Poses = Float[np.ndarray, "*N 3"]
 
 GOAL = np.array([256.0, 256.0, np.pi / 4])
-"""Pose wanted, the package's."""
+"""Goal pose of the T, from the package."""
 CENTRES = np.array([[0.0, 15.0], [0.0, 75.0]])
-"""Of bar and stem, in the frame of the T, pixels."""
+"""Centres of bar and stem, in the frame of the T, pixels."""
 HALVES = np.array([[60.0, 15.0], [15.0, 45.0]])
 """Half the sides of bar and stem, pixels."""
 CORNERS = np.array(
@@ -33,59 +33,66 @@ CORNERS = np.array(
 )
 """Outline of the T, in its frame, pixels."""
 KEYPOINTS = CORNERS[[0, 1, 2, 7, 6, 3, 4, 5]]
-"""In the order of the package: corners of the bar, then of the stem."""
+"""Corners in the order of the package: first those of the bar, then those of the stem."""
 PASSED = CORNERS[[0, 1, 2, 4, 5, 7]]
-"""Corners that a way round the T goes by: all but those between bar and stem."""
+"""Corners that a path round the T passes: all except those between bar and stem."""
 ASIDE = np.array([[-1, -1], [1, -1], [1, 1], [1, 1], [-1, 1], [-1, 1]])
-"""Direction of the way from each of these."""
+"""Direction of the path's distance from each of these corners."""
 MASS_CENTRE = np.array([0.0, 45.0])
-"""About which the T turns: the package takes bar and stem as equally heavy."""
+"""Point about which the T rotates: in the package, bar and stem have the same mass."""
 GYRATION = 3000.0
-"""Inertia of the T over its mass, pixels²: that of the bar twice, as the package has it."""
+"""Moment of inertia of the T over its mass, pixels²; the package uses that of the bar twice."""
 RADIUS = 15.0
-"""Of the disc, pixels."""
+"""Radius of the disc, pixels."""
 TABLE = (20.0, 492.0)
-"""Where corners of the T should be: from there on, the disc has no room beside a wall."""
+"""Allowed range of the corners of the T: outside, the disc does not fit between T and wall."""
 REACH = (5.0, 507.0)
-"""Where the disc may be sent: the package takes 0 to 512."""
+"""Allowed range of commands to the disc; the package accepts 0 to 512."""
 BEGINS = (100.0, 400.0)
-"""Where the package puts the T, before it turns it about `MASS_CENTRE`."""
+"""Range of the T's initial position, before its rotation about `MASS_CENTRE`."""
 
 SPACING, EDGE = 9.0, 5.0
-"""Pixels between places to push at, and between the outermost and the corner of the T."""
+"""Distance between neighbouring contact points, and between the outermost and the corner of the
+T, pixels."""
 STRIDES = np.r_[np.full(12, 1.0), np.full(12, 2.0), np.full(52, 3.0)]
-"""Pixels between poses at which a push may end: fine near its begin, for the last pushes."""
+"""Distances between poses at which a push may end, pixels: small near its start, for the last
+pushes."""
 GAP = 10.0
-"""Pixels between disc and T where a push begins, so that the disc is steady when it touches."""
+"""Distance between disc and T at which a push begins, pixels, so that the disc is steady at
+contact."""
 CLEARANCE = 12.0
-"""Pixels between disc and T on the way round: the disc cuts corners by less."""
+"""Distance between disc and T on the path round it, pixels: the disc cuts corners by less."""
 WIDENING = 0.5
-"""Pixels by which that gap grows at least, for each that the disc goes away from a push."""
+"""Smallest growth of that distance per pixel by which the disc departs from a push, pixels."""
 ROUNDING = 0.5
-"""Pixels by which a gap may be too narrow: the disc presses itself a little into the T."""
+"""Tolerance of a distance, pixels: the disc penetrates the T slightly."""
 BEND = 90.0
-"""Pixels from the middle of the T at which the disc goes round it, about."""
+"""Approximate distance from the middle of the T at which the disc moves round it, pixels."""
 WALK, PUSH = 20.0, 10.0
-"""Pixels an action on the way and in a push. People move by 8 as a rule, one in ten by > 21."""
+"""Pixels per action on the path and during a push. People usually move by 8, one in ten by more
+than 21."""
 STEADY, SETTLED = 4.0, 1.0
-"""Pixels between the disc and where it was sent when a push begins, and when it is over."""
+"""Distance between the disc and its command below which a push begins, and below which it has
+ended, pixels."""
 PAUSE = 9.0
-"""Actions in which the disc comes to rest before and after a push."""
+"""Number of actions in which the disc comes to rest before and after a push."""
 DEPTH, BEAM = 3, 48
-"""Pushes thought ahead, one for each degree of freedom of the T, and of how many beginnings."""
+"""Number of pushes planned ahead, one for each degree of freedom of the T, and number of
+sequences kept."""
 KINDS = 4
-"""Ranges of lengths of which each may have a beginning of its own: divides `STRIDES`."""
+"""Number of ranges of lengths, each of which may keep its own sequence: divides `STRIDES`."""
 NEAR = 1.2
-"""Mean distance of corners from where they belong that is surely a success, pixels."""
+"""Mean distance of corners from their goals that is certainly a success, pixels."""
 PER_PIXEL, PER_HALVING = 2.0, 30.0
-"""Actions thought to be left for each pixel of that distance, and for each halving of it. More
-than there are: with fewer it would think any real push a waste, and put it off."""
+"""Predicted number of remaining actions for each pixel of that distance, and for each halving
+of it. The values are too large on purpose: with smaller ones, no real push would seem worth its
+time."""
 MOVED = 2.0
-"""Pixels by which corners of the T may shift before a push, until it thinks again."""
+"""Displacement of corners of the T before a push above which the expert plans again, pixels."""
 
 
 def turned(points: Points, angles: Float[np.ndarray, "*N"]) -> Points:
-    """Points (..., 2) turned about the origin by angles (...), rad."""
+    """Points (..., 2) rotated about the origin by angles (...), rad."""
     cos, sin = np.cos(angles), np.sin(angles)
     x, y = points[..., 0], points[..., 1]
     return np.stack([cos * x - sin * y, sin * x + cos * y], -1)
@@ -114,13 +121,13 @@ def outward(local: Points, part: int) -> tuple[Float[np.ndarray, "*N"], Points]:
 
 
 def clearance(points: Points, pose: Pose) -> Float[np.ndarray, "*N"]:
-    """Distance between the T and points (..., 2), negative in it, pixels."""
+    """Distance between the T and points (..., 2), pixels; negative inside."""
     local = turned(points - pose[:2], np.asarray(-pose[2]))
     return np.minimum(outward(local, 0)[0], outward(local, 1)[0])
 
 
 def yielded(poses: Poses, disc: Points) -> Poses:
-    """Where the T is when a disc at (..., 2) has pressed it aside from poses (..., 3)."""
+    """Poses of the T after a disc at (..., 2) has displaced it from poses (..., 3)."""
     for part in (0, 1):
         local = turned(disc - poses[..., :2], -poses[..., 2])
         distance, normal = outward(local, part)
@@ -135,7 +142,9 @@ def yielded(poses: Poses, disc: Points) -> Poses:
 
 
 def _contacts() -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K 2"]]:
-    """Where a disc may touch the T, its centre, and the normals there, in the T's frame."""
+    """Possible centres of a disc in contact with the T, and the normals there, in the T's
+    frame.
+    """
     discs, normals = [], []
     for a, b in pairwise([*CORNERS, CORNERS[0]]):
         length = float(np.linalg.norm(b - a))
@@ -154,11 +163,11 @@ PLACES, NORMALS = _contacts()
 
 
 def pushed(poses: Float[np.ndarray, "B 3"]) -> tuple[Poses, Points, Points]:
-    """What comes of every push at each of B poses of the T.
+    """Effects of all pushes at each of B poses of the T.
 
     Returns:
         Poses (B, K, L, 3) after each of L lengths of a push at each of K places, and the disc's
-        centre at first (B, K, 2) and its direction (B, K, 2).
+        initial centre (B, K, 2) and its direction (B, K, 2).
     """
     angles = poses[:, None, 2]
     first = turned(PLACES, angles) + poses[:, None, :2]
@@ -172,7 +181,7 @@ def pushed(poses: Float[np.ndarray, "B 3"]) -> tuple[Poses, Points, Points]:
 
 
 def way(start: Points, to: Points, pose: Poses) -> Float[np.ndarray, "*N"]:
-    """About how far it is from point to point round the T, pixels."""
+    """Approximate length of the path between two points round the T, pixels."""
     middle = pose[..., :2] + turned(MASS_CENTRE, pose[..., 2])
     a, b = start - middle, to - middle
     far_a, far_b = (np.maximum(np.linalg.norm(x, axis=-1), 1.0) for x in (a, b))
@@ -182,7 +191,7 @@ def way(start: Points, to: Points, pose: Poses) -> Float[np.ndarray, "*N"]:
 
 
 def to_go(poses: Poses) -> Float[np.ndarray, "*N"]:
-    """About how many actions are left when the T is at poses (..., 3)."""
+    """Approximate number of remaining actions for poses (..., 3) of the T."""
     at = corners(poses)
     far = np.linalg.norm(at - WANTED, axis=-1).mean(-1)
     outside = np.maximum(np.maximum(TABLE[0] - at, at - TABLE[1]), 0).sum((-1, -2))
@@ -192,19 +201,19 @@ def to_go(poses: Poses) -> Float[np.ndarray, "*N"]:
 
 @dataclass(frozen=True)
 class Push:
-    """A straight push: where the disc's centre is when it touches and when it stops, pixels."""
+    """A straight push: centres of the disc at first contact and at the end, pixels."""
 
     first: Point
     last: Point
 
 
 def _allowed(points: Points) -> Bool[np.ndarray, "*N"]:
-    """Whether the disc may be sent to points (..., 2)."""
+    """True where the disc may be commanded to points (..., 2)."""
     return np.all((points >= REACH[0]) & (points <= REACH[1]), axis=-1, keepdims=True)[..., 0]
 
 
 def _various(total: Float[np.ndarray, "B K L"]) -> Int[np.ndarray, "W"]:
-    """Indices of the cheapest pushes, best first, with no two that differ by length alone."""
+    """Indices of the cheapest pushes, best first; no two differ in length alone."""
     blocks = total.reshape(*total.shape[:2], KINDS, -1)
     length = blocks.argmin(-1)
     cheapest = np.take_along_axis(blocks, length[..., None], -1)[..., 0]
@@ -213,7 +222,9 @@ def _various(total: Float[np.ndarray, "B K L"]) -> Int[np.ndarray, "W"]:
 
 
 def best_push(pose: Pose, disc: Point) -> Push:
-    """First push of the sequence that should be done soonest, the disc being at a point."""
+    """First push of the sequence with the shortest predicted time, for this position of the
+    disc.
+    """
     poses, discs, spent = pose[None], disc[None], np.zeros(1)
     lengths = STRIDES.cumsum()
     begun: list[Push] = []
@@ -239,7 +250,7 @@ def best_push(pose: Pose, disc: Point) -> Push:
 
 
 def _free(a: Point, b: Point, pose: Pose) -> bool:
-    """Whether the disc can go straight from a to b: near either end it may be near the T."""
+    """True if the disc can move straight from a to b; at both ends it may be close to the T."""
     length = float(np.linalg.norm(b - a))
     along = np.linspace(0.0, 1.0, int(length / 3.0) + 2)
     gaps = clearance(a + along[:, None] * (b - a), pose) - RADIUS
@@ -250,7 +261,7 @@ def _free(a: Point, b: Point, pose: Pose) -> bool:
 
 
 def _aside(point: Point, pose: Pose) -> Point:
-    """Nearest place from a point at which the disc is clear of the T, about."""
+    """Approximately nearest place to a point at which the disc is clear of the T."""
     local = turned(point - pose[:2], -pose[2])
     for part in (0, 1):
         distance, gradient = outward(local, part)
@@ -259,9 +270,9 @@ def _aside(point: Point, pose: Pose) -> Point:
 
 
 def route(a: Point, b: Point, pose: Pose) -> Float[np.ndarray, "N 2"]:
-    """Where the disc turns on its shortest way from a round the T to b, which is the last.
+    """Turning points of the disc on its shortest path from a round the T to b, the last one.
 
-    Straight to b where there is no way.
+    If there is no path, the result is b alone.
     """
     round_it = turned(PASSED + (RADIUS + CLEARANCE + 1.0) * ASIDE, pose[2]) + pose[:2]
     asides = [_aside(a, pose), _aside(b, pose)]
@@ -282,7 +293,9 @@ def route(a: Point, b: Point, pose: Pose) -> Float[np.ndarray, "N 2"]:
 
 
 def _stepped(start: Point, turns: Float[np.ndarray, "N 2"], stride: float) -> list[Point]:
-    """Points from start, without it, along turns to the last, equally far by at most stride."""
+    """Points from start (excluded) along the turning points to the last, at equal distances of
+    at most `stride`.
+    """
     line = np.vstack([start, turns])
     gone = np.r_[0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()]
     count = max(int(np.ceil(gone[-1] / stride - 1e-9)), 1)
@@ -291,7 +304,7 @@ def _stepped(start: Point, turns: Float[np.ndarray, "N 2"], stride: float) -> li
 
 
 def pose_of(keypoints: Float[np.ndarray, "16"]) -> Pose:
-    """Pose of the T with such corners."""
+    """Pose of the T with these corners."""
     seen, own = keypoints.reshape(8, 2) @ [1, 1j], KEYPOINTS @ [1, 1j]
     angle = np.angle(((seen - seen.mean()) * (own - own.mean()).conj()).sum())
     origin = seen.mean() - own.mean() * np.exp(1j * angle)
@@ -299,20 +312,20 @@ def pose_of(keypoints: Float[np.ndarray, "16"]) -> Pose:
 
 
 class _Expert:
-    """Says where to send the disc, one action after another."""
+    """Commands the disc, one action after another."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self._ahead: list[Point] = []
-        self._push = 0  # The last so many of them.
+        self._push = 0  # The last observations, in this number.
         self._expected = np.full((8, 2), np.inf)
         self._sent = np.full(2, np.inf)
 
     def act(self, seen: Observation) -> Point:
-        """Target of the disc, pixels, given all that was seen since the last call."""
+        """Target of the disc, pixels, given all observations since the last call."""
         pose, disc = pose_of(seen[ENVIRONMENT_STATE]), seen[AGENT_POS]
         behind = np.linalg.norm(disc - self._sent)
         if len(self._ahead) >= self._push:
@@ -336,17 +349,19 @@ class _Expert:
 
 
 class PushT:
-    """The package's task. Seen are the disc and, as the environment, corners of the T."""
+    """The package's task, observed as the disc and, as the environment, corners of the T."""
 
     fps: float = 10.0
     n_actions: int = 2
     longest: int = 300
-    """After which the package ends an episode, and LeRobot; demonstrations take about 100."""
+    """Number of actions after which the package and LeRobot end an episode; demonstrations take
+    about 100."""
     moved_at: int | None = 10
     moved: float = 40.0
-    """How far the T is moved, pixels."""
+    """Distance by which the T is moved, pixels."""
     reward: float = 0.0
-    """Of the package for the last action: covered share of the goal over 95 %, at most 1."""
+    """Reward of the package for the last action: covered fraction of the goal relative to 95 %,
+    at most 1."""
 
     def __init__(self) -> None:
         import gym_pusht  # noqa: F401  # pyright: ignore[reportMissingImports]
@@ -357,17 +372,17 @@ class PushT:
         self.expert: Expert = _Expert()
 
     def begin(self, seed: int) -> Observation:
-        """Disc and T where the package puts them for this seed."""
+        """Begin with disc and T at the package's places for this seed."""
         return self._environment.reset(seed=seed)[0]
 
     def step(self, action: Point) -> tuple[Observation, bool]:
-        """What is seen after an action, and whether 95 % of the goal are covered."""
+        """Observation after an action, and True if 95 % of the goal is covered."""
         act = np.asarray(action, dtype=float)
         seen, self.reward, _, _, info = self._environment.step(act)
         return seen, bool(info["is_success"])
 
     def move_object(self, rng: np.random.Generator) -> Observation:
-        """Move the T to where episodes may begin with it, clear of the disc.
+        """Move the T to an allowed initial place, clear of the disc.
 
         Raises:
             RuntimeError: There is no such place.
@@ -386,5 +401,5 @@ class PushT:
         raise RuntimeError(f"No place for the T {self.moved:g} pixels away.")
 
     def render(self) -> Any:
-        """Picture of disc, T and goal, (H, W, 3), 8 bits."""
+        """Image of disc, T and goal, (H, W, 3), 8 bits."""
         return self._environment.render()

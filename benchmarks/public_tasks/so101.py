@@ -1,7 +1,7 @@
-"""SO-101 picks up a block and puts it down at a goal, by the controller of its package.
+"""SO-101 picks up a block and puts it down at a goal; its package's controller is the expert.
 
-Actions are where the point between the jaws is sent, as on most robots; the package takes the
-change from where that point is, up to a few centimetres at a time.
+Actions are commanded positions of the point between the jaws, as on most robots; the package
+accepts changes of this position by up to a few centimetres.
 """
 
 import atexit
@@ -17,28 +17,31 @@ from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observat
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 FPS = 10.0
-"""Of the package."""
+"""Actions per second, from the package."""
 LONGEST = 150
-"""Actions after which an episode has failed: some three times what the expert takes."""
+"""Number of actions after which an episode has failed: about three times the expert's number.
+"""
 MOVED_AT = 4
-"""Actions after which the block is moved: the expert is above it after 6 to 11."""
+"""Number of actions after which the block is moved: the expert is above it after 6 to 11."""
 MOVED = 0.04
-"""How far [m]: as wide as it is; whoever goes to where it was misses it."""
+"""Distance of this move [m]: the width of the block; an agent that moves to the old place
+misses it."""
 STILL = 1e-6
-"""Changes that are less [m] are due to rounding; the package tells 0 from all others."""
+"""Changes below this value [m] are rounding errors; the package distinguishes 0 from all
+others."""
 TRIES = 1000
-"""Of a direction to move the block in, until it may begin there."""
+"""Largest number of directions tried for a move of the block to an allowed initial place."""
 HEIGHT, WIDTH = 240, 320
-"""Of a picture [px]."""
+"""Size of an image [px]."""
 
 
 class SO101PickPlace:
-    """Pick-and-place of `lerobot_env_so101`, with block and goal anywhere it may put them.
+    """Pick-and-place of `lerobot_env_so101`, with block and goal at random places.
 
-    Seen are of the arm five joint angles [rad] and their speeds [rad/s], how far the jaws have
-    been told to open, from -1 to 1, and the positions of the gripper and of the point between
-    its jaws; and the positions of block and goal, all [m]. An action is where to send the
-    point between the jaws [m], and how far to open them, from 0 to 1.
+    Observations are five joint angles [rad] and their velocities [rad/s], the commanded opening
+    of the jaws, from -1 to 1, and the positions of the gripper, of the point between its jaws,
+    of the block and of the goal [m]. An action is the commanded position of the point between
+    the jaws [m], and the opening of the jaws, from 0 to 1.
     """
 
     fps: float = FPS
@@ -50,7 +53,7 @@ class SO101PickPlace:
         """Make the task.
 
         Args:
-            moved: How far `move_object` moves the block [m].
+            moved: Distance by which `move_object` moves the block [m].
         """
         from lerobot_env_so101 import (  # pyright: ignore[reportMissingImports]
             GymRenderingSpec,
@@ -72,11 +75,11 @@ class SO101PickPlace:
         self.expert: Expert = _Expert(self._scale)
 
     def begin(self, seed: int) -> Observation:
-        """Put everything in its place; the same seed begins alike."""
+        """Begin an episode; the same seed gives the same initial scene."""
         return self._observation(self._env.reset(seed=seed)[0])
 
     def step(self, action: Float[np.ndarray, "4"]) -> tuple[Observation, bool]:
-        """What is seen after an action, and whether the task is done as the package says."""
+        """Observation after an action, and True if the package reports success."""
         own = action.astype(float)
         change = own[:3] - self._env.ik_point_pos
         own[:3] = change / self._scale if np.linalg.norm(change) > STILL else 0.0
@@ -85,7 +88,7 @@ class SO101PickPlace:
         return self._observation(seen), bool(info["succeed"])
 
     def move_object(self, rng: np.random.Generator) -> Observation:
-        """Move the block in a direction that leaves it where episodes may begin with it.
+        """Move the block in a random direction to an allowed initial place.
 
         Raises:
             RuntimeError: There is no such place.
@@ -105,7 +108,7 @@ class SO101PickPlace:
         raise RuntimeError(f"no episode begins with the block {self._moved} m from {where}")
 
     def render(self) -> UInt8[np.ndarray, "H W 3"]:
-        """Picture of what is there."""
+        """Image of the scene."""
         picture = self._env.render()
         if not self._drawn:
             atexit.register(self._env.close)  # before EGL ends, which only now is to do so
@@ -119,7 +122,7 @@ class SO101PickPlace:
         return self._observation(self._env._compute_observation())
 
     def _observation(self, seen: Observation) -> Observation:
-        """With the point that actions move, which the package keeps to itself."""
+        """Observation with the point that actions move, which the package does not observe."""
         arm = np.concatenate([seen[AGENT_POS], self._env.ik_point_pos])
         return {
             AGENT_POS: arm.astype(np.float32),
@@ -128,7 +131,7 @@ class SO101PickPlace:
 
 
 class _Expert:
-    """The controller of the package: `begin` an episode, then `act` on what is seen."""
+    """The controller of the package: `begin` an episode, then `act` on observations."""
 
     def __init__(self, scale: float):
         from lerobot_env_so101.scripted.pick_place import (  # pyright: ignore[reportMissingImports]
@@ -139,11 +142,11 @@ class _Expert:
         self._scale = scale
 
     def begin(self) -> None:
-        """Forget how far it has come in the episode before."""
+        """Begin an episode, and forget the progress of the last one."""
         self._controller.reset()
 
     def act(self, seen: Observation) -> Float[np.ndarray, "4"]:
-        """What to do when that is seen; to be called once for each action."""
+        """Action for an observation; called once for each action."""
         point, things = seen[AGENT_POS][-3:].astype(float), seen[ENVIRONMENT_STATE]
         action = self._controller.act(point, things[:3], things[3:]).astype(float)
         action[:3] = point + self._scale * action[:3]
