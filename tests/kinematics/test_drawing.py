@@ -6,9 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import arm, panda
+from hrc_learn.kinematics.described_arm import _finger
+from hrc_learn.kinematics.description import Joint
 from hrc_learn.kinematics.drawing import arm_bodies, panda_meshes
 from hrc_learn.kinematics.registry import arm_of_robot
 
@@ -140,3 +143,42 @@ def test_an_mjcf_without_its_meshes_is_an_arm_of_capsules(tmp_path):
         "link1",
         "link2",
     }
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "closed", "opened"),
+    [
+        (0.0, 0.04, 0.0, 0.04),
+        (-0.04, 0.0, 0.0, -0.04),
+        (-0.5, 0.3, 0.3, -0.5),
+        (-0.3, 0.5, -0.3, 0.5),
+        (-0.3, 0.3, -0.3, 0.3),
+        (0.1, 0.2, 0.1, 0.2),
+        (None, 0.7, 0.0, 0.7),
+        (-0.7, None, 0.0, -0.7),
+        (None, None, 0.0, 0.0),
+    ],
+)
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+def test_a_finger_is_open_at_the_end_of_its_range_further_from_zero(
+    lower, upper, closed, opened, kind
+):
+    axis, parent, origin = np.array([0.6, 0.0, 0.8]), np.eye(4), np.eye(4)
+    parent[:3, 3], origin[:3, 3] = (0.1, 0.2, 0.3), (0.0, 0.0, 0.05)
+    parent[:3, :3] = Rotation.from_euler("xyz", [0.2, -0.4, 0.7]).as_matrix()
+    joint = Joint(
+        name="jaw", kind=kind, parent="hand", child="jaw", origin=origin, axis=axis,
+        lower=lower, upper=upper, follows=("other", -1.0, 0.01),
+    )  # fmt: skip
+    finger, poses = _finger(joint, parent)
+    assert (finger.closed, finger.opened) == (closed, opened)
+    assert finger.kind == ("prismatic" if kind == "prismatic" else "revolute")
+    assert (finger.name, finger.follows, finger.axis) == ("jaw", joint.follows, (0.6, 0.0, 0.8))
+    for pose, value in zip(poses, np.linspace(closed, opened, len(poses)), strict=True):
+        moved = np.eye(4)
+        if kind == "prismatic":
+            moved[:3, 3] = value * axis
+        else:
+            moved[:3, :3] = Rotation.from_rotvec(value * axis).as_matrix()
+        np.testing.assert_allclose(pose, parent @ origin @ moved, atol=1e-12)
+    assert len(poses) > 2
