@@ -177,3 +177,55 @@ def test_nothing_under_way_has_no_rest():
     assert motion.after(1) is None
     assert motion.nearest(torch.zeros(1, 2)) is None
     assert motion.left_over(torch.ones(1, 2)) is None
+
+
+def planned(seed, batch=2):
+    """Coefficients of two smooth columns, and a column that jumps."""
+    rng = torch.Generator().manual_seed(seed)
+    motion = ContinuedMotion(
+        ChunkDecoder(9, 0.05, 4), compose=lambda smooth, levels: torch.cat([smooth, levels], -1)
+    )
+    shape = (batch, 2, motion.decoder.size)
+    coefficients = 0.1 * torch.randn(shape, generator=rng, dtype=torch.float64)
+    levels = (torch.rand(batch, 10, 1, generator=rng) > 0.5).double()
+    return motion, coefficients, levels
+
+
+@pytest.mark.parametrize("delay", [0, 4])
+def test_a_motion_begins_where_its_plan_does_or_where_the_arm_is(delay):
+    """Nothing is carried out yet, so there is nothing to wait for."""
+    motion, coefficients, levels = planned(0)
+    own = motion.decoder.states(coefficients)[:, 0]
+    moving = own + torch.tensor([[0.02, -0.01], [0.1, 0.2], [-0.3, 0.5]]).double()
+    for beginning in (None, moving):
+        actions = motion.go_on(coefficients, levels, None, beginning=beginning, delay=delay)
+        chunk, start = motion.chunk, own if beginning is None else beginning
+        torch.testing.assert_close(chunk.states[:, 0], start, atol=1e-9, rtol=0)
+        assert torch.equal(chunk.stepped, levels)
+        assert torch.equal(chunk.actions, actions)
+        assert torch.equal(actions, torch.cat([chunk.states[:, :, 0], levels], -1))
+    plan = motion.decoder.positions(coefficients)
+    motion.go_on(coefficients, levels, None, delay=delay)
+    torch.testing.assert_close(motion.chunk.states[:, :, 0], plan, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 4, 9, 30])
+def test_actions_that_are_carried_out_meanwhile_stay_and_the_motion_goes_on(delay):
+    motion, coefficients, levels = planned(1)
+    _, others, switched = planned(2)
+    motion.go_on(others, switched, None)
+    before, given = motion.chunk, levels.clone()
+    motion.go_on(
+        coefficients, levels, before, beginning=torch.ones(2, 3, 2).double(), delay=delay
+    )
+    assert torch.equal(levels, given)
+    after, kept = motion.chunk, min(delay, 9)
+    assert torch.equal(after.states[:, :kept], before.states[:, :kept])
+    assert torch.equal(after.stepped[:, :kept], switched[:, :kept])
+    assert torch.equal(after.stepped[:, kept:], levels[:, kept:])
+    # Position, velocity and acceleration are continuous where the plan takes over.
+    torch.testing.assert_close(
+        after.states[:, kept], before.states[:, kept], atol=1e-7, rtol=1e-7
+    )
+    if kept < 9:
+        assert (after.states[:, -1, 0] - before.states[:, -1, 0]).abs().max() > 0.01
