@@ -190,3 +190,35 @@ def test_a_goal_that_is_no_orientation_is_refused(kinds, wrong):
     dmp = kinds["orientation"]
     with torch.no_grad(), shapes_unchecked(), pytest.raises(ValueError, match="unit quat"):
         dmp.step(dmp.initial_state(), 0.01, goal=wrong)
+
+
+@pytest.mark.parametrize(
+    ("place", "length", "message"),
+    [
+        ([np.nan, 0.0, 0.0], 1.0, "position of goal"),
+        ([0.0, np.inf, -np.inf], 1.0, "position of goal"),
+        ([0.0, 0.0], 1.0, "position of goal"),
+        ([0.0, 0.0, 0.0], 0.5, "unit quat"),
+        ([0.0, 0.0, 0.0], 1e100, ""),
+        ([1e308, 1e308, 1e308], 0.51, ""),
+    ],
+)
+def test_a_pose_is_refused_or_taken_for_one_motion_as_for_several(
+    kinds, place, length, message
+):
+    """One motion is computed in Python's numbers, several by PyTorch."""
+    dmp, found = kinds["pose"], []
+    q = length * torch.tensor([0.5, 0.5, -0.5, 0.5]).double()
+    with torch.no_grad(), shapes_unchecked():
+        for batch in ((), (1,)):
+            state = dmp.initial_state(duration=torch.full(batch, 2.0).double())
+            position = torch.tensor(place, dtype=torch.float64)
+            goal = Pose(position.expand(*batch, -1), q.expand(*batch, 4))
+            if message:
+                with pytest.raises(ValueError, match=message):
+                    dmp.retarget(state, goal, filtered=False)
+            else:
+                new = dmp.retarget(state, goal, filtered=False)
+                found.append((new.motion.position, new.motion.target[..., :3], new.reference))
+    for one, several in zip(*found, strict=True) if found else ():
+        torch.testing.assert_close(one, several[0], rtol=1e-9, atol=1e-9)
