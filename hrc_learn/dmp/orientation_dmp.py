@@ -282,8 +282,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             columns, frame = self._to_reference(columns, frame, new, filtered), new
             if position is not None:
                 position = checked_vector("position of goal", position, frame[..., :3])
-                target = _with_columns(columns.target, P, position)
-                columns = replace(columns, target=target)
+                columns = replace(columns, target=_with_columns(columns.target, P, position))
         if goal_body is None:
             return columns, frame, columns.target
         goal_body = checked_vector("goal_body", goal_body, columns.target[..., B])
@@ -310,8 +309,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             return None
         numbers = [number for x in parts for number in x.tolist()]
         q, place = numbers[:4], numbers[4:]
-        norm = math.hypot(*q)
-        if not (0.5 < norm < math.inf and math.isfinite(sum(place))):
+        if not (0.5 < (norm := math.hypot(*q)) < math.inf and math.isfinite(sum(place))):
             return None
         offset = motion._buffers["goal"].tolist()[E]
         q = quaternion.product_of_components(exp_numbers(offset), [x / norm for x in q])

@@ -25,7 +25,6 @@ from hrc_learn.dmp.response import (
     chebyshev_points,
     empty_in_large_pages,
     powers_of,
-    product,
     without_subnormals,
 )
 
@@ -112,8 +111,8 @@ class CoefficientTable:
         if periodic or not (torch.compiler.is_compiling() or piece.max() == pieces):
             return piece, powers
         back = spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
-        goal = torch.full_like(s, float(self.order == 0))[..., None]
-        back = torch.cat([back, goal], dim=-1).to(dtype)
+        # The third value multiplies the goal.
+        back = torch.nn.functional.pad(back, (0, 1), value=float(self.order == 0)).to(dtype)
         back = torch.nn.functional.pad(back, (0, degree - back.shape[-1]))
         back = torch.cat([back, powers[..., degree:]], dim=-1)
         return piece, torch.where((piece == pieces)[..., None], back, powers)
@@ -146,17 +145,27 @@ def _tabulate(
 ) -> CoefficientTable:
     forced, N = response.forced, response.basis.count
     row = forced.coefficients[:, :, min(order, 1)]
+    knots = torch.arange(len(row), dtype=row.dtype)[:, None]
+    points = forced.interval * (knots + chebyshev_points())
+    # An approach that ends where a piece ends is a polynomial on each piece.
+    pieces = response.approach / forced.interval
+    on_pieces = 0 < pieces < len(row) + 1e-9 and abs(pieces - round(pieces)) < 1e-9
+    if on_pieces:
+        curve = approach_curve(points, response.approach, min(order, 1))[..., None, None]
+        curve = forced.interpolate(curve, forced.interval).coefficients[..., 0, :]
+        row = torch.cat([row, curve], dim=-1)
     for _ in range(order - 1):
         # The table of y' is as exact as the table of y, so differentiate y' for higher orders.
         exponents = torch.arange(row.shape[1], dtype=row.dtype, device=row.device)
         row = row * (2 / forced.interval * exponents)[:, None]
         row = torch.nn.functional.pad(row[:, 1:], (0, 0, 0, 1))
-    knots = torch.arange(len(row), dtype=row.dtype)[:, None]
-    free = spring_rows(response, forced.interval * (knots + chebyshev_points()), order)
+    free = spring_rows(response, points, order)
     free = forced.interpolate(free[..., None, :], forced.interval).coefficients[..., 0, :]
     goal = torch.zeros_like(row[..., :1])
     goal[:, 0] = float(order == 0)
     rate, start = free[..., 1:], free[..., :1]
+    if on_pieces:
+        row, start = row[..., :N], -row[..., N:]
     others = row.new_zeros(N + 3, 2)
     if forced.periodic:
         # The motion is the limit cycle plus the initial distance to it, which decays.
@@ -165,8 +174,8 @@ def _tabulate(
         others[N + 2, 0] = -1.0
         coefficients = torch.cat([row, 0 * free, goal], dim=-1)
     else:
-        others = others[:, : int(response.approach > 0)]
-        if response.approach:
+        others = others[:, : int(pieces > 0 and not on_pieces)]
+        if others.numel():
             start = torch.zeros_like(start)
             others[N + 1], others[N + 2] = -1.0, 1.0
         coefficients = torch.cat([row, rate, start, goal - start], dim=-1)
@@ -206,8 +215,9 @@ def _rows(
     """Coefficients of each motion, on the first pieces or on all."""
     B, D, _ = coordinates.shape
     matrix = table.matrix if pieces is None else table.matrix[:, : pieces * table.size]
-    rows = product(coordinates, matrix)
-    return rows.view(B, D, rows.shape[-1] // table.size, table.size).permute(0, 2, 3, 1)
+    # In this order of products, the coefficients of a piece are neighbours in memory.
+    rows = torch.bmm(matrix.mT.expand(B, -1, -1), coordinates.mT)
+    return rows.view(B, -1, table.size, D)
 
 
 def _flat_pieces(piece: Int[Tensor, "B T"]) -> tuple[Int[Tensor, "BT"], int]:
@@ -276,7 +286,7 @@ def _motion(s: Tensor, coordinates: Tensor, response: Response, order: int) -> T
             # the gathered rows to memory first.
             values = torch.nn.functional.embedding_bag(
                 bags.index_select(0, flat),
-                rows.contiguous().view(-1, D),
+                rows.view(-1, D),
                 mode="sum",
                 per_sample_weights=powers.view(-1, table.size),
             ).view(len(x), -1, D)

@@ -295,6 +295,8 @@ class Response:
         interval = min(self.basis.smooth_interval, self.spring.smooth_interval)
         if self.basis.knot_spacing is not None:
             interval = self.basis.knot_spacing / math.ceil(self.basis.knot_spacing / interval)
+        elif self.approach:
+            interval = self.approach / math.ceil(self.approach / interval)
         # The tolerance keeps rounding from adding a piece past the last knot.
         n_pieces = math.ceil(self.basis.horizon / interval - 1e-9)
         knots = interval * torch.arange(n_pieces + 1, dtype=torch.float64)

@@ -29,3 +29,13 @@ def test_a_new_goal_adds_few_operations_to_a_step(kind):
         without = count_operations(lambda: dmp.step(state, 1e-3))
         new = count_operations(lambda: dmp.step(state, 1e-3, goal=goal))
     assert new <= 1.4 * without
+
+
+def test_own_durations_take_few_operations():
+    """A batch on ragged times moves no coefficients in memory and evaluates no approach."""
+    position = COLUMNS.float() * torch.linspace(1, 2, 5)[:, None, None]
+    dmp = JointDMP.fit(2 * S, position, 20)
+    duration = torch.linspace(2, 4, 5)
+    with torch.no_grad(), shapes_unchecked():
+        count = count_operations(lambda: dmp.rollout(2 * S, duration=duration).position)
+    assert count <= 90
