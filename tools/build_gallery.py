@@ -33,6 +33,9 @@ RUNS = {
         "--out outputs/so101_played"
     ),
     "outputs/fit": "hrc fit outputs/demo/placing_demos --out outputs/fit",
+    "outputs/near_worker": (
+        "hrc run collaboration --pulls random --worker --out outputs/near_worker"
+    ),
     "outputs/placing": "hrc run placing --out outputs/placing",
     "outputs/grasping": "hrc run grasping --out outputs/grasping",
     "outputs/collaboration": (
@@ -97,9 +100,9 @@ PROGRAMS = (
     ),
     Program(
         heading="A run in Rerun",
-        command="python tools/docs/dashboards.py --run outputs/demo/run/run.rrd",
+        command="python tools/docs/dashboards.py --run outputs/near_worker/run.rrd",
         pictures=_files("dashboard_{}.jpg", "story", "person", "servoing", "safety"),
-        needs=("outputs/demo",),
+        needs=("outputs/demo", "outputs/near_worker"),
         only="--tabs",
         prefix="dashboard_",
     ),

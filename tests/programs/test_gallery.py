@@ -29,7 +29,8 @@ def test_single_pictures_and_the_runs_they_need(tmp_path):
     made = build_gallery.commands(["dmp_pose", "dmp_bases", "dashboard_story"], tmp_path)
     assert made == [
         "hrc demo",
-        "python tools/docs/dashboards.py --run outputs/demo/run/run.rrd --tabs story",
+        "hrc run collaboration --pulls random --worker --out outputs/near_worker",
+        "python tools/docs/dashboards.py --run outputs/near_worker/run.rrd --tabs story",
         "python tools/docs/dmp_gallery.py --out docs/images --only pose bases",
     ]
     (tmp_path / "outputs/demo").mkdir(parents=True)

@@ -244,3 +244,28 @@ def test_the_pictures_of_the_page_are_there_and_small():
     shown = {part.split(")")[0] for part in text.split("(../images/")[1:]}
     for name in shown:
         assert 5_000 < (IMAGES / name).stat().st_size < 200_000, name
+
+
+class Viewer:
+    """A page that draws these pictures, one a screenshot, the last one for ever."""
+
+    def __init__(self, *pictures: bytes):
+        self.pictures, self.mouse = list(pictures), self
+
+    def wait_for_timeout(self, milliseconds: float) -> None:
+        pass
+
+    def move(self, x: float, y: float) -> None:
+        pass
+
+    def screenshot(self, **_: object) -> bytes:
+        return self.pictures.pop(0) if len(self.pictures) > 1 else self.pictures[0]
+
+
+def test_a_dashboard_is_photographed_once_it_stays_the_same():
+    dashboards = load(ROOT / "tools" / "docs" / "dashboards.py")
+    viewer = Viewer(b"arm", b"arm and plot", b"all", b"all", b"later")
+    assert dashboards._settled(viewer, 1.0) == b"all"
+    restless = Viewer(*(bytes([k]) for k in range(100)))
+    with pytest.raises(ValueError, match=r"draws for longer than 20 s: raise --pause"):
+        dashboards._settled(restless, 1.0)

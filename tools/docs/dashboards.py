@@ -3,15 +3,14 @@
 Every recording is served as `hrc show --web` does, opened in a headless Chromium and
 photographed; of a run, each of its tabs.
 
-hrc demo
-python tools/docs/dashboards.py --run outputs/demo/run/run.rrd --tabs story person
+hrc run collaboration --pulls random --worker --out outputs/near_worker
+python tools/docs/dashboards.py --run outputs/near_worker/run.rrd --tabs story person
 
 `tools/build_gallery.py` lists the commands of all pictures.
 """
 
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -36,8 +35,8 @@ TABS = ("Story", "Servoing", "Person and worker", "Primitive", "Safety", "Lyapun
 LEFT, DOWN, LETTER, MARGIN = 800, 40, 6.5, 33
 """Where the viewer draws the row of a run's tabs, and how wide they are: a letter, and what is
 around a title [px]. Read off its picture: the viewer draws them itself, without elements."""
-REDRAWN = 30.0
-"""Until another tab is shown where nothing draws but the CPU [s]."""
+PAUSES = 20
+"""Most pauses of a viewer that still draws."""
 
 
 type Tab = Literal["story", "servoing", "person", "primitive", "safety", "lyapunov"]
@@ -55,8 +54,8 @@ class Args:
     """Of `hrc show DATASET --out FILE`."""
     fit: Path | None = None
     """Of `hrc fit`."""
-    load: float = 90.0
-    """Until the viewer has drawn all of a recording [s]."""
+    pause: float = 30.0
+    """A picture that stays the same for so long is complete [s]."""
     out: Path = Path(__file__).parents[2] / "docs" / "images"
     """Folder of the pictures."""
 
@@ -71,7 +70,7 @@ def main(args: Args) -> None:
         if recording is None:
             continue
         for suffix, content in _pictures(
-            recording, args.load, args.tabs if name == "dashboard" else ()
+            recording, args.pause, args.tabs if name == "dashboard" else ()
         ):
             file = args.out / f"{name}{suffix}.jpg"
             file.write_bytes(content)
@@ -79,7 +78,7 @@ def main(args: Args) -> None:
 
 
 def _pictures(
-    recording: Path, load: float, tabs: tuple[Tab, ...]
+    recording: Path, pause: float, tabs: tuple[Tab, ...]
 ) -> Iterator[tuple[str, bytes]]:
     with (
         tempfile.TemporaryDirectory() as profile,
@@ -87,9 +86,9 @@ def _pictures(
         chromium(Path(profile), SIZE) as tab,
     ):
         tab.goto(address, timeout=120e3)
-        time.sleep(load)
+        shown = _settled(tab, pause)
         if not tabs:
-            yield "", _picture(tab)
+            yield "", _picture(shown)
         left = float(LEFT)
         for title in TABS if tabs else ():
             width, name = MARGIN + LETTER * len(title), title.split()[0].lower()
@@ -97,19 +96,29 @@ def _pictures(
                 left += width
                 continue
             tab.mouse.click(left + width / 2, DOWN)
-            # The viewer draws while something moves over it; else a scale stays half drawn.
-            for place in ((LEFT + 200, 300), (LEFT + 400, 500), (LEFT / 2, SIZE[1] - 5)):
-                time.sleep(REDRAWN / 3)
-                tab.mouse.move(*place)
-            time.sleep(REDRAWN / 3)
-            yield f"_{name}", _picture(tab)
+            yield f"_{name}", _picture(_settled(tab, pause))
             left += width
 
 
-def _picture(tab) -> bytes:
-    shown = Image.open(BytesIO(tab.screenshot(type="png", timeout=300e3))).convert("RGB")
+def _settled(tab, pause: float) -> bytes:
+    """What the viewer shows as soon as it is the same after a pause [s]."""
+    last = b""
+    for _ in range(PAUSES):
+        # The viewer draws while something moves over it; else a scale stays half drawn.
+        for place in ((LEFT + 200, 300), (LEFT + 400, 500), (LEFT / 2, SIZE[1] - 5)):
+            tab.wait_for_timeout(1e3 * pause / 3)
+            tab.mouse.move(*place)
+        shown = tab.screenshot(type="png", timeout=300e3)
+        if shown == last:
+            return shown
+        last = shown
+    raise ValueError(f"the viewer draws for longer than {PAUSES * pause:.0f} s: raise --pause")
+
+
+def _picture(shown: bytes) -> bytes:
+    image = Image.open(BytesIO(shown)).convert("RGB")
     buffer = BytesIO()
-    smaller = shown.resize((WIDTH, WIDTH * SIZE[1] // SIZE[0]), Image.Resampling.LANCZOS)
+    smaller = image.resize((WIDTH, WIDTH * SIZE[1] // SIZE[0]), Image.Resampling.LANCZOS)
     smaller.save(buffer, "JPEG", quality=80)
     return buffer.getvalue()
 
