@@ -84,9 +84,8 @@ class TrialArm:
         down: Orientation of the tool there: the paper's orientation for Franka's arms, straight
             down for others.
         postures: Joint positions with that pose, the best first [rad]. For arms without a
-        closed
-            inverse, the postures from which the arm reaches all targets, if there are any,
-            ordered by their distance from the ready posture.
+            closed inverse, the postures from which the arm reaches all targets, if there are
+            any, ordered by their distance from the ready posture.
     """
 
     def __init__(self, arm: Arm):
