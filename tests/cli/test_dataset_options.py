@@ -227,8 +227,8 @@ def test_without_decisions_nothing_is_stored_and_a_copy_has_all(curated, capsys)
         ({"reject": (5,)}, "there is no episode 5; the dataset has 0 to 4"),
         ({"cut": {2: "30"}}, "--cut 2 30: give the first frame to keep"),
         ({"cut": {2: "a:b"}}, "the episode has 100"),
-        ({"cut": {2: "30:31"}}, "no part of two frames"),
-        ({"cut": {2: "30:101"}}, "no part of two frames"),
+        ({"cut": {2: "30:31"}}, "must keep two frames"),
+        ({"cut": {2: "30:101"}}, "must keep two frames"),
     ],
 )
 def test_decisions_that_cannot_be_are_refused(curated, given, message):
