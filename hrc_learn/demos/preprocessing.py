@@ -39,7 +39,7 @@ def local_polynomial(
     Raises:
         ValueError: There are too few samples for the degree, or the window is not positive.
     """
-    if not window > 0 or degree < 1:
+    if not 0 < window < np.inf or degree < 1:
         raise ValueError(f"window and degree must be positive, got {window} s and {degree}")
     if len(time) <= degree:
         text = f"{len(time)} samples do not determine a polynomial of degree {degree}"
@@ -396,7 +396,7 @@ def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
     Raises:
         ValueError: The duration is not positive, or there is only one frame.
     """
-    if not duration > 0 or len(demo) < 2:
+    if not 0 < duration < np.inf or len(demo) < 2:
         text = f"a demonstration of {len(demo)} frames cannot be made to last {duration} s"
         raise ValueError(text)
     scale = duration / demo.duration

@@ -68,7 +68,7 @@ class CameraWatchStep(ProcessorStep):
     it unless pixels are corrected."""
 
     def __post_init__(self) -> None:
-        if not self.fps > 0:
+        if not 0 < self.fps < torch.inf:
             raise ValueError(f"fps must be positive, got {self.fps}.")
         text = json_text(self.reference)
         reference = parse_json(text, CameraReference, "reference of the camera watch")

@@ -254,13 +254,16 @@ def test_changes_and_positions_are_not_merged(recorded, tmp_path):
         ("deg/step", np.pi / 180),
         ("0.05 rad/step", 0.05),
         ("2e-3 rad/step", 0.002),
+        ("1.5e+02 rad/step", 150.0),
     ],
 )
 def test_units_of_changes(unit, factor):
     assert unit_factor("command_position", unit) == pytest.approx(factor)
 
 
-@pytest.mark.parametrize("unit", ["m/s/step", "x rad/step", "rad/steps", "/step"])
+@pytest.mark.parametrize(
+    "unit", ["m/s/step", "x rad/step", "rad/steps", "/step", "0 rad", "1e999 rad"]
+)
 def test_units_of_changes_that_do_not_exist(unit):
     with pytest.raises(DatasetError, match="does not come in"):
         unit_factor("command_position", unit)
@@ -333,6 +336,7 @@ def followed(slope, *, names=None, unit="rad", fps=50.0, fit=0.95, position=0.1)
         (1.49, "rad/step"),
         (1.51, "1.5 rad/step"),
         (0.02, "0.02 rad/step"),
+        (150.0, "1.5e+02 rad/step"),
     ],
 )
 def test_changes_have_the_scale_of_the_motion_they_make(scale, unit):
@@ -343,6 +347,7 @@ def test_changes_have_the_scale_of_the_motion_they_make(scale, unit):
     text = f"the joints follow the sum of the commands ({scale:.2g} rad per unit, R2 0.95), so"
     assert command.evidence.startswith(text)
     assert command.steps.all()
+    assert command.factor == pytest.approx(1.0 if unit == "rad/step" else scale, rel=0.01)
 
 
 @pytest.mark.parametrize(

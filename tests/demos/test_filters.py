@@ -60,6 +60,8 @@ def test_too_few_samples_are_refused():
         local_polynomial(np.arange(3.0), np.zeros((3, 1)), window=1, degree=3)
     with pytest.raises(ValueError, match="must be positive"):
         local_polynomial(np.arange(9.0), np.zeros((9, 1)), window=0)
+    with pytest.raises(ValueError, match="must be positive, got inf s"):
+        local_polynomial(np.arange(9.0), np.zeros((9, 1)), window=np.inf)
 
 
 def cheapest(cost: np.ndarray) -> float:

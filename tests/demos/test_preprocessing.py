@@ -621,7 +621,7 @@ def test_a_change_of_duration_scales_rates():
     np.testing.assert_allclose(slow.joint_velocity, demo.joint_velocity * 0.4)
     np.testing.assert_allclose(slow.command_velocity, 0.4)
     np.testing.assert_array_equal(slow.joint_effort, demo.joint_effort)
-    for bad in (0, -1, float("nan")):
+    for bad in (0, -1, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="101 frames cannot be made to last"):
             set_duration(demo, bad)
     with pytest.raises(ValueError, match="of 1 frames cannot be made to last 2 s"):

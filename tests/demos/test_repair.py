@@ -183,6 +183,12 @@ def test_only_a_rate_above_zero_can_be_resampled_to():
             regular_grid(1.0, fps)
 
 
+def test_offsets_that_are_not_finite_are_refused():
+    for angle in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="offsets must be finite angles"):
+            RepairOptions(offsets={"joint1": 1.0, "joint2": angle})
+
+
 def test_stamps_of_lerobot_that_stall_are_counted_anew(tmp_path):
     root = write(tmp_path / "old", [joint_path(60)] * 2, version="v2.1")
     set_rows("timestamp", lambda v: np.concatenate([v[:20], v[19:-1]]))(root)

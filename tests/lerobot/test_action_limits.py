@@ -231,6 +231,11 @@ def test_the_calibration_of_another_robot_is_refused(tmp_path):
         (calibrated_ranges, "{}", "it has no motors"),
         (calibrated_ranges, '{"a": {"range_min": 5, "range_max": 5}}', "a has no range_min"),
         (calibrated_ranges, '{"a": 3}', "a has no range_min"),
+        (
+            calibrated_ranges,
+            '{"a": {"range_min": 0, "range_max": "nan"}}',
+            "a has no range_min",
+        ),
         (calibrated_ranges, "nonsense", "not valid JSON"),
     ],
 )
@@ -282,5 +287,6 @@ def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
     for arguments in ({"dataset": dataset}, {"limits": file, "remove": True}):
         with pytest.raises(ValueError, match="give --checkpoint"):
             smooth(Smooth(**arguments))
-    with pytest.raises(ValueError, match="scale must be positive"):
-        smooth(Smooth(dataset=dataset, limits=file, scale=0.0))
+    for scale in (0.0, float("inf")):
+        with pytest.raises(ValueError, match="scale must be positive"):
+            smooth(Smooth(dataset=dataset, limits=file, scale=scale))

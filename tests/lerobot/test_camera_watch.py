@@ -199,8 +199,9 @@ def test_several_environments_at_once_are_refused(step):
 
 
 def test_settings_that_make_no_sense_are_refused(step):
-    with pytest.raises(ValueError, match="fps must be positive"):
-        CameraWatchStep(**step.get_config() | {"fps": 0.0})
+    for fps in (0.0, float("inf")):
+        with pytest.raises(ValueError, match="fps must be positive"):
+            CameraWatchStep(**step.get_config() | {"fps": fps})
 
 
 def test_what_is_missing_is_named(dataset, tmp_path):

@@ -595,6 +595,7 @@ def test_the_learning_rate_rises_and_then_falls_to_nothing(steps, warm_up):
         ({"history": -1}, "history must be at least 0, got -1"),
         ({"state_noise": float("nan")}, "state_noise must be at least 0, got nan"),
         ({"blend_time": 0.0}, "blend_time must be positive seconds, got 0.0"),
+        ({"blend_time": float("nan")}, "blend_time must be positive seconds, got nan"),
     ],
 )
 def test_settings_have_their_least_values(settings, complaint):

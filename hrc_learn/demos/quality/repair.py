@@ -78,6 +78,8 @@ class RepairOptions:
     def __post_init__(self) -> None:
         if self.fps is not None and not 0 < self.fps < np.inf:
             raise ValueError(f"fps must be positive, got {self.fps}")
+        if not np.isfinite([*self.offsets.values()]).all():
+            raise ValueError(f"offsets must be finite angles, got {dict(self.offsets)}")
 
 
 @dataclass(kw_only=True)

@@ -145,7 +145,7 @@ def read_calibration(file: Path) -> dict[str, tuple[float, bool]]:
             span = float(motor["range_max"]) - float(motor["range_min"])
         except (TypeError, KeyError, ValueError):
             span = 0.0
-        if span <= 0:
+        if not 0 < span < math.inf:
             text = f"is no calibration of LeRobot: {name} has no range_min below a range_max"
             raise DatasetError(text, file=file)
         found[name] = span, bool(motor.get("drive_mode"))

@@ -22,7 +22,7 @@ from hrc_learn.demos.read.naming import is_hand, role_of_key
 from hrc_learn.demos.read.quantities import DIMENSIONS, ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.unit_evidence import CONFIDENT, Guess, Sizes
 
-_SCALED = re.compile(r"(?:(-?\d+\.?\d*(?:e-?\d+)?) )?(.+?)(/step)?")
+_SCALED = re.compile(r"(?:(-?\d+\.?\d*(?:e[-+]?\d+)?) )?(.+?)(/step)?")
 """Unit with an optional factor: 1.1 deg for -100..100 of a calibrated motor, 0.05 rad/step for
 scaled commands that are added to the joint positions."""
 
@@ -134,8 +134,9 @@ def unit_factor(role: str, unit: str) -> float:
         )
     scaled = _SCALED.fullmatch(unit)
     known = ("command_position",) if scaled and scaled[3] else (*_JOINTS, *_RATES)
-    if role in known and scaled and scaled[2] != unit:
-        return float(scaled[1] or 1) * unit_factor(role, scaled[2])
+    size = float(scaled[1] or 1) if scaled else 0.0
+    if role in known and scaled and scaled[2] != unit and 0 < abs(size) < math.inf:
+        return size * unit_factor(role, scaled[2])
     options = units_of(role)
     if unit not in options:
         raise DatasetError(

@@ -115,7 +115,7 @@ class MotionChunkConfig(MotionPolicyConfig):
             value = getattr(self, name)
             if value is not None and not value >= bound:
                 raise ValueError(f"{name} must be at least {bound}, got {value}")
-        if self.blend_time is not None and self.blend_time <= 0:
+        if self.blend_time is not None and not 0 < self.blend_time < torch.inf:
             raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
 
     @property

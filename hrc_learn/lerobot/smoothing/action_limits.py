@@ -142,7 +142,7 @@ def gathered_limits(
         FileNotFoundError: A file is missing.
         ValueError: A file cannot be read, or has no name in common with the dataset.
     """
-    if not scale > 0:
+    if not 0 < scale < math.inf:
         raise ValueError(f"scale must be positive, but is {scale}")
     limits = demonstrated_limits(dataset, scale)
     if urdf is not None:
