@@ -268,7 +268,7 @@ def feature_profiles(
         known = [p for p in profiles if key in p.columns and key not in INDEX_KEYS]
         widths = {p.columns[key].start.shape for p in known}
         if widths != {(declared.width,)}:
-            continue  # reported with the columns
+            continue  # the check of the columns reports this
         discrete = np.mean([is_discrete(p.columns[key], p.entry.length) for p in known], axis=0)
         yield FeatureProfiles(
             key=key,
@@ -418,9 +418,9 @@ def commanded_rates(
         fps: Frame rate [1/s].
 
     Returns:
-        Joint rate per unit of the command [1/s], NaN for components that do not follow, and the
-        typical fraction of the variance of rates that the commands explain (R squared); None if
-        most joints do not follow in this way.
+        Joint rate per unit of the command [1/s], NaN for components that do not follow. Typical
+        R squared: the fraction of the variance of the rates that the commands explain. None
+        instead of both if most joints do not follow.
     """
     positions, rates = (
         [known[name] for known in trackings if name in known]
