@@ -88,9 +88,7 @@ def _segments_v3(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment
                     continue
                 for name, value in values.items():
                     if not isinstance(value, int | float):
-                        text = (
-                            f"must be a number, got {value!r}: copy the list of episodes again"
-                        )
+                        text = f"must be a number, got {value!r}: copy the file again"
                         place = {"episode": row["episode_index"], "key": f"videos/{key}/{name}"}
                         raise DatasetError(text, file=file, **place)
                 chunk, number, *times = values.values()

@@ -367,9 +367,7 @@ def select_episodes(
         known = {task for entry in folder.episodes for task in entry.tasks}
         if unknown := sorted(wanted - known):
             listed = ", ".join(map(repr, sorted(known))) or "none"
-            text = (
-                f"no episode shows the task {unknown[0]!r}; the list of episodes has {listed}"
-            )
+            text = f"no episode shows the task {unknown[0]!r}; tasks shown: {listed}"
             raise DatasetError(text, file=root)
         chosen = [entry for entry in chosen if wanted & {*entry.tasks}]
     chosen = [entry for entry in chosen if where is None or where(entry)]
