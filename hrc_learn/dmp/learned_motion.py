@@ -41,7 +41,8 @@ from hrc_learn.model_files import SavedModel, write_model
 BASIS_COUNTS = (10, 20, 30, 50, 100)
 """Numbers of basis functions compared."""
 APPROACHES = (1.0, 0.6)
-"""Approaches compared: the smoothest, and one that keeps the end of the path."""
+"""Approaches compared: the smoothest, and one for which the last 40 % of the path only shifts
+with the goal."""
 WIDTHS = (2.0, 1.0, 0.5, 0.25)
 """Widths of kernels, relative to the spread of the contexts."""
 PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
