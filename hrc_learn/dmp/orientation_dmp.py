@@ -299,9 +299,8 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """
         E, motion, posed = self.error_columns, self.motion, isinstance(goal, Pose)
         given = columns.position, columns.rate, columns.target
-        if goal is None or frame.ndim != 1 or posed != (E.start > 0):
-            return None
-        if type(motion) is not JointDMP or not fits_numpy(frame, *given):
+        one = goal is not None and frame.ndim == 1 and posed == (E.start > 0)
+        if not one or type(motion) is not JointDMP or not fits_numpy(frame, *given):
             return None
         parts = (goal.orientation, goal.position) if posed else (goal,)
         parts = [to_tensor(x, frame.dtype, frame.device) for x in parts]
@@ -316,10 +315,9 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         y, rate, target = moved = [x.tolist() for x in given]
         y[E], rate[E] = retarget_numbers(y[E], rate[E], frame.tolist(), q)
         target[: E.start] = place
-        dtype = frame.numpy().dtype
-        y, rate, target = map(torch.from_numpy, np.array(moved, dtype))
+        y, rate, target = map(torch.from_numpy, np.array(moved, frame.numpy().dtype))
         columns = replace(columns, position=y, rate=rate, target=target)
-        return columns, torch.from_numpy(np.array(q, dtype))
+        return columns, frame.new_tensor(q)
 
     def _to_reference(
         self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool
