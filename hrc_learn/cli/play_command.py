@@ -148,10 +148,8 @@ def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -
     ) as writer:
         writer.start_episode(f"played {args.model.name}")
         columns = motion.joints, motion.position, motion.orientation, following
-        for q, p, R, command in zip(*columns, strict=True):
-            writer.add_frame(
-                joint_position=q, position=p, orientation=R, command_position=command
-            )
+        for q, p, R, sent in zip(*columns, strict=True):
+            writer.add_frame(joint_position=q, position=p, orientation=R, command_position=sent)
         writer.save_episode()
 
 

@@ -52,9 +52,8 @@ def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
                 if stream is None:
                     height, width = picture.shape[:2]
                     assert height % 2 == width % 2 == 0, "chroma is halved"
-                    stream: Any = container.add_stream(
-                        "libx264", rate=Fraction(rate).limit_denominator(1001), options=_CODEC
-                    )
+                    exact = Fraction(rate).limit_denominator(1001)
+                    stream: Any = container.add_stream("libx264", rate=exact, options=_CODEC)
                     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
                 content = np.ascontiguousarray(picture)
                 frame = av.VideoFrame.from_ndarray(content, format="rgb24")
@@ -97,9 +96,8 @@ def annotated(
         small = Image.fromarray(inset)
         left = width - small.width - _MARGIN
         top = height - _BAR - small.height - _MARGIN
-        draw.rectangle(
-            (left - 2, top - 2, left + small.width + 1, top + small.height + 1), fill=_SHADE
-        )
+        frame = left - 2, top - 2, left + small.width + 1, top + small.height + 1
+        draw.rectangle(frame, fill=_SHADE)
         image.paste(small, (left, top))
     return np.asarray(image)
 
@@ -119,10 +117,8 @@ def camera_inset(camera: CameraRecording, width: int) -> Callable[[int, float], 
         last = int(np.searchsorted(camera.image_time, time, side="right")) - 1
         image = images[max(last, 0)].copy()
         draw = ImageDraw.Draw(image, "RGBA")
-        for pixel, colour in (
-            (camera.target[step], palette.GREEN),
-            (camera.feature[step], palette.VERMILION),
-        ):
+        marks = {palette.GREEN: camera.target, palette.VERMILION: camera.feature}
+        for colour, pixel in ((colour, path[step]) for colour, path in marks.items()):
             if np.isfinite(pixel).all():
                 u, v = (scale * pixel).tolist()
                 draw.ellipse((u - 5, v - 5, u + 5, v + 5), outline=colour, width=3)
@@ -138,9 +134,8 @@ def camera_inset(camera: CameraRecording, width: int) -> Callable[[int, float], 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
     # Matplotlib ships this font, so that it is always available.
-    return ImageFont.truetype(
-        Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size
-    )
+    fonts = Path(matplotlib.get_data_path()) / "fonts/ttf"
+    return ImageFont.truetype(fonts / "DejaVuSans.ttf", size)
 
 
 def draw_run(
