@@ -104,7 +104,7 @@ def test_without_an_arm_the_path_is_the_models_own(models, tmp_path):
         (["--goal", 0.5, 0.1], "--goal 0.5 0.1: ", 2),
         (["--goal", *range(7)], "7 numbers may be joints or pose", 2),
         (["--goal", "pose", 0.4, 0, 0.4, 1, 1, 0, 0], "the norm of w x y z is 1.414", 2),
-        (["--goal", "there"], "takes 7 numbers (joints), 3 numbers (position)", 2),
+        (["--goal", "there"], "accepts 7 numbers (joints), 3 numbers (position)", 2),
         (["--goal", "nan", 0.1, 0.2], "all finite", 2),
         (["--goal", "episode", "last"], "needs one number", 2),
         (["--goal", 0.4, 0, 0.4, "--robot", "so101"], "moves the joints panda_joint1", 2),
