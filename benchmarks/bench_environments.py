@@ -47,7 +47,13 @@ from hrc_learn import cli
 
 FIRST_SEED = 10_000
 """First seed of starts that were not demonstrated: demonstrations use seeds from 0 on."""
-PUBLIC = tuple(name for name in TASKS if name != "grasping")
+PUBLIC = (
+    "pusht",
+    "aloha-transfer",
+    "metaworld-pick-place",
+    "metaworld-push",
+    "so101-pick-place",
+)
 COLUMNS = ("unmoved", "moved", "few")
 SEPARATOR = "/"
 """Separator between the number of an episode and the key of its column, in a file."""
@@ -100,18 +106,18 @@ def main(args: Args) -> None:
         table.title = (
             f"{name}: {len(shown)} demonstrations, {frames} frames; {args.rollouts} of each"
         )
-        with _environments(name, args.rollouts, moved=False) as still:
+        with environments(name, args.rollouts, moved=False) as still:
             moves = task.moved_at is not None
             counts = [_by_expert(task, args, moved) for moved in (False, True)[: 1 + moves]]
             table.add_row("expert", "", "", *map(str, counts))
             for policy in args.policies:
                 learned = _learn(name, policy, shown, args)
-                row = {"unmoved": _successes(still, learned)}
+                row = {"unmoved": successes(still, learned)}
                 if moves:
-                    with _environments(name, args.rollouts, moved=True) as moving:
-                        row["moved"] = _successes(moving, learned)
+                    with environments(name, args.rollouts, moved=True) as moving:
+                        row["moved"] = successes(moving, learned)
                 few = _learn(name, policy, shown[: args.few], args)
-                row["few"] = _successes(still, few)
+                row["few"] = successes(still, few)
                 cells = [str(row.get(key, "-")) for key in COLUMNS]
                 table.add_row(policy, str(learned.steps), f"{learned.seconds:.0f}", *cells)
                 console.print(f"[dim]{name} {policy}: {' '.join(cells)}[/]", highlight=False)
@@ -165,7 +171,8 @@ def demonstrations(name: str, count: int, folder: Path, console: Console) -> lis
 
 
 @contextmanager
-def _environments(name: str, count: int, *, moved: bool) -> Iterator[gym.vector.VectorEnv]:
+def environments(name: str, count: int, *, moved: bool) -> Iterator[gym.vector.VectorEnv]:
+    """Vector of environments of a task, as LeRobot makes them."""
     from public_tasks.lerobot_env import PublicTaskConfig
 
     config = PublicTaskConfig(task=name, move_object=moved)
@@ -195,8 +202,16 @@ def _by_expert(task: Any, args: Args, moved: bool) -> int:
     return sum(succeeds(task, seed, moved=moved) for seed in seeds)
 
 
-def _successes(environments: gym.vector.VectorEnv, learned: Learned) -> int:
-    """Number of successes, by the code of `lerobot-eval`."""
+def successes(
+    vector: gym.vector.VectorEnv, learned: Learned, episodes: int | None = None
+) -> int:
+    """Number of successes, by the code of `lerobot-eval`.
+
+    Args:
+        vector: Environments that run side by side.
+        learned: Policy.
+        episodes: Number of episodes; None: one in each environment.
+    """
     from lerobot.processor import PolicyProcessorPipeline
     from lerobot.scripts.lerobot_eval import eval_policy
 
@@ -204,13 +219,13 @@ def _successes(environments: gym.vector.VectorEnv, learned: Learned) -> int:
     nothing: Any = PolicyProcessorPipeline(steps=[])
     with redirect_stderr(StringIO()):  # a progress bar for every episode
         result = eval_policy(
-            environments,
+            vector,
             learned.policy,
             nothing,
             nothing,
             learned.before,
             learned.after,
-            n_episodes=environments.num_envs,
+            n_episodes=episodes or vector.num_envs,
             start_seed=FIRST_SEED,
         )
     return sum(episode["success"] for episode in result["per_episode"])

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from public_tasks.metaworld import FPS, MetaWorld
+from public_tasks.metaworld import FPS, MetaWorld, _observation
 from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Observation
 from scipy.stats import binomtest
 
@@ -197,12 +197,17 @@ def rigid(
 
 def succeeds(task: MetaWorld, scene: np.ndarray, actions: np.ndarray) -> bool:
     """True if MetaWorld reports success while the actions are executed."""
+    placed(task, scene)
+    return any(task.step(action)[1] for action in actions)
+
+
+def placed(task: MetaWorld, scene: np.ndarray) -> Observation:
+    """First observation of an episode with object and goal at given positions [m]."""
     env = task._env
     # An object that lies on the table has the height that MetaWorld gives it.
     env._last_rand_vec = np.array([*scene[:2], 0.02, *scene[3:]])
     env._freeze_rand_vec = True
-    env.reset()
-    return any(task.step(action)[1] for action in actions)
+    return _observation(env.reset()[0])
 
 
 if __name__ == "__main__":

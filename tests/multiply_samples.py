@@ -72,11 +72,16 @@ def write_dataset(folder, robot_type: str = "panda") -> None:
     with DatasetWriter(folder, FPS, robot_type, panda.joint_names, features) as writer:
         for demo, at in zip(demonstrations(), BLOCKS, strict=True):
             writer.start_episode(demo.task)
+            tool = panda.forward(torch.from_numpy(demo.joint_position))
+            held = tool @ tool[GRASP + 2].inverse() @ at
             for k in range(END):
                 writer.add_frame(
                     joint_position=demo.joint_position[k],
                     gripper=demo.gripper[k],
                     command_position=demo.command_position[k],
-                    **{"observation.block": at.vector(), "observation.mood": [k / END]},
+                    **{
+                        "observation.block": (at if k < GRASP + 2 else held[k]).vector(),
+                        "observation.mood": [k / END],
+                    },
                 )
             writer.save_episode()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from public_tasks.protocol import PublicTask
 
@@ -30,16 +31,10 @@ def _aloha() -> PublicTask:
     return AlohaTransfer()
 
 
-def _pick_place() -> PublicTask:
+def _metaworld(name: str) -> PublicTask:
     from public_tasks.metaworld import MetaWorld
 
-    return MetaWorld("pick-place-v3")
-
-
-def _push() -> PublicTask:
-    from public_tasks.metaworld import MetaWorld
-
-    return MetaWorld("push-v3")
+    return MetaWorld(name)
 
 
 def _so101() -> PublicTask:
@@ -57,8 +52,16 @@ def _grasping() -> PublicTask:
 TASKS = {
     "pusht": Setting(make=_pusht, chunk=16, executed=8),
     "aloha-transfer": Setting(make=_aloha, chunk=48, executed=12),
-    "metaworld-pick-place": Setting(make=_pick_place, chunk=24, executed=3),
-    "metaworld-push": Setting(make=_push, chunk=24, executed=3),
+    "metaworld-pick-place": Setting(
+        make=partial(_metaworld, "pick-place-v3"), chunk=24, executed=3
+    ),
+    "metaworld-push": Setting(make=partial(_metaworld, "push-v3"), chunk=24, executed=3),
+    "metaworld-shelf-place": Setting(
+        make=partial(_metaworld, "shelf-place-v3"), chunk=24, executed=3
+    ),
+    "metaworld-coffee-push": Setting(
+        make=partial(_metaworld, "coffee-push-v3"), chunk=24, executed=3
+    ),
     "so101-pick-place": Setting(make=_so101, chunk=16, executed=4),
     "grasping": Setting(make=_grasping, chunk=24, executed=12),
 }

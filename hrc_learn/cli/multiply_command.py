@@ -221,8 +221,8 @@ class Multiplication:
         draws = self.draw(attempts)
         made = self.motions.motions(draws)
         trials = [self.trial(draws, motion, k) for k, motion in enumerate(made)]
-        good = [t for t, motion in zip(trials, made, strict=True) if not motion.reason]
-        replays = map(self._planned, good) if judge is None else judge(good)
+        good = [(m, t) for m, t in zip(made, trials, strict=True) if not m.reason]
+        replays = judge([t for _, t in good]) if judge else (self._planned(*x) for x in good)
         for k, attempt in enumerate(attempts):
             replay = None if made[k].reason else next(replays)
             if replay is None or replay.failure:
@@ -284,23 +284,10 @@ class Multiplication:
             },
         )
 
-    def _planned(self, trial: Trial) -> Replay:
-        """Motion as planned: an object moves with the tool while the gripper is closed."""
-        tool = self.robot.forward(torch.from_numpy(trial.joints))
-        closed = trial.gripper < (trial.gripper.min() + trial.gripper.max()) / 2
-        objects = {n: np.tile(at, (len(closed), 1)) for n, at in trial.objects.items()}
-        held, grip = "", Pose(tool.position[0], tool.orientation[0])
-        for k in range(1, len(closed)):
-            if closed[k] and not closed[k - 1] and objects:
-                here = tool.position[k].numpy()
-                held = min(objects, key=lambda n: np.linalg.norm(objects[n][k, :3] - here))
-                grip = tool[k].inverse() @ pose_of(torch.from_numpy(objects[held][k]))
-            if held and closed[k]:
-                moved = tool[k] @ grip
-                objects[held][k:] = torch.cat([moved.position, moved.orientation]).numpy()
-        q = trial.joints
-        sent = np.concatenate([q[1:], q[-1:]])
-        return Replay(joints=q, sent=sent, gripper=None, objects=objects)
+    def _planned(self, made: motions.NewMotion, trial: Trial) -> Replay:
+        """Motion as planned; objects move with the tool where they did in the demonstration."""
+        q, objects = trial.joints, self.columns.object_paths(made, trial.objects)
+        return Replay(joints=q, sent=q[[*range(1, len(q)), -1]], gripper=None, objects=objects)
 
 
 def _judge(config: JudgeConfig, task: str) -> JudgeConfig:

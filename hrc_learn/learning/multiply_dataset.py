@@ -22,11 +22,12 @@ from hrc_learn.demos.dataset_views import DatasetArm
 from hrc_learn.demos.read.columns import column_places
 from hrc_learn.demos.read.contract import Sidecar, read_sidecar
 from hrc_learn.demos.read.dataset_folder import staging_folder
-from hrc_learn.demos.read.frames import RawFrames, read_frames
+from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.demos.read.metadata import INDEX_FEATURES
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm
+from hrc_learn.learning.multiply_motions import NewMotion
 from hrc_learn.store import Claim, json_text, parse_json
 
 # Names of the components of an object's pose: NAME.x, NAME.y and NAME.z, and likewise wx to wz
@@ -41,6 +42,9 @@ _LEFT_OUT = ("feature", "feature_visible", "human_effort", "joint_effort", "time
 _LEVELS = 5
 # Largest distance of recorded tool positions from forward kinematics that counts as noise [m].
 _APART = 5e-3
+# `_MOVED`: distance from its first position at which an object has moved [m]. `_STILL`:
+# distance up to which it has not begun to move [m].
+_MOVED, _STILL = 1e-2, 1e-3
 
 type Place = tuple[str, int]
 """Place of one number in a frame: name of a feature, and index within this feature."""
@@ -84,8 +88,9 @@ class MultipliedColumns:
         lost = {key for r in _LEFT_OUT if r in self._places for key, _ in self._places[r]}
         known = {key: f for key, f in source.folder.features.items() if f.numeric}
         self._old = {key: f for key, f in known.items() if key not in (*INDEX_KEYS, *lost)}
-        read = read_frames(source.folder, source.entries, [*self._old])
-        self._frames: list[RawFrames] = [frames for _, frames in read]
+        names = {k: f.names or () for k, f in self._old.items()}
+        self._named = [(k, i, name) for k in names for i, name in enumerate(names[k])]
+        self._frames = [f for _, f in read_frames(source.folder, source.entries, [*self._old])]
         self.objects: dict[str, Pose] = {}
         for name, places in self._object_columns(objects).items():
             self._places[f"object {name}"] = places
@@ -98,12 +103,8 @@ class MultipliedColumns:
             for r in _TOOL
             for n, (k, i) in enumerate(self._places.get(r, ()))
         }
-        self._next = [
-            (key, i, *shown[name])
-            for key, feature in self._old.items()
-            for i, name in enumerate(feature.names or ())
-            if key.startswith("action") and name in shown
-        ]
+        self._actions = [named for named in self._named if named[0].startswith("action")]
+        self._next = [(key, i, *shown[name]) for key, i, name in self._actions if name in shown]
         self._refuse_changes()
         self._tool = self._recorded_tool()
         names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
@@ -111,10 +112,9 @@ class MultipliedColumns:
             self._rename(names)
         self.features = {}
         for key, feature in self._old.items():
-            width, named = names[key].shape[1], names[key][0].tolist()
+            width, named = names[key].shape[1], feature.names and names[key][0].tolist()
             shape = list(feature.shape) if width == feature.width else [width]
-            content = {"dtype": feature.dtype, "shape": shape, "names": feature.names and named}
-            self.features[key] = content
+            self.features[key] = {"dtype": feature.dtype, "shape": shape, "names": named}
 
     def _recorded_tool(self) -> Float[torch.Tensor, "3"]:
         """Origin of the recorded tool in the frame of the arm's tool [m]."""
@@ -148,11 +148,10 @@ class MultipliedColumns:
         """Places of the numbers of each object's pose, by name of the object."""
         taken = {place for places in self._places.values() for place in places}
         found: dict[str, dict[str, Place]] = {}
-        for key, feature in self._old.items():
-            for i, name in enumerate(feature.names or ()):
-                match = _AXES.match(name)
-                if match and (key, i) not in taken and not key.startswith("action"):
-                    found.setdefault(match["name"], {})[match["axis"]] = (key, i)
+        for key, i, name in self._named:
+            match = _AXES.match(name)
+            if match and (key, i) not in taken and not key.startswith("action"):
+                found.setdefault(match["name"], {})[match["axis"]] = (key, i)
         places = {
             name: [axes[axis] for axis in _POSE if axis in axes]
             for name, axes in found.items()
@@ -199,12 +198,7 @@ class MultipliedColumns:
             main: Index of the demonstration.
             phase: Fractional frames of the demonstration.
         """
-        commands = [
-            (key, i)
-            for key, feature in self._old.items()
-            for i, name in enumerate(feature.names or ())
-            if key.startswith("action") and "gripper" in name.lower()
-        ]
+        commands = [(key, i) for key, i, name in self._actions if "gripper" in name.lower()]
         for key, i in [*commands, *self._places.get("gripper", ())]:
             return self._along(main, key, phase)[:, i]
         return np.zeros(len(phase))
@@ -219,6 +213,31 @@ class MultipliedColumns:
             at = np.interp(phase, np.arange(len(column)), column)
             made.append(at if smooth else column[np.rint(phase).astype(int)])
         return np.stack(made, axis=1)
+
+    def object_paths(
+        self, made: NewMotion, scene: Mapping[str, Float[np.ndarray, "7"]]
+    ) -> dict[str, Float[np.ndarray, "T 7"]]:
+        """Pose of each object over time: it moves with the tool where the demonstrated one did.
+
+        Args:
+            made: Motion in a new scene.
+            scene: Pose of each object at the start.
+        """
+        main, phase, tool = made.source, made.phase.numpy(), self._robot.forward(made.joints)
+        paths = {name: np.tile(at, (len(phase), 1)) for name, at in scene.items()}
+        q = self._taught.positions(self._source[main].joint_position)
+        q = np.stack([np.interp(phase, np.arange(len(q)), angle) for angle in q.T], axis=1)
+        hand = self._taught.arm.forward(torch.from_numpy(q)).inverse()
+        for name in paths.keys() & self.objects:
+            x = [self._along(main, k, phase)[:, i] for k, i in self._places[f"object {name}"]]
+            shown = pose_of(torch.from_numpy(np.stack(x, axis=1)))
+            first, held = _departure(shown.position), hand @ shown
+            last = len(phase) - 1 - _departure(shown.position.flip(0))
+            grip = tool[first].inverse() @ pose_of(torch.from_numpy(paths[name][0]))
+            path = tool @ grip @ held[first].inverse() @ held
+            moved = torch.cat([path.position, path.orientation], -1).numpy()
+            paths[name][first:] = moved[np.arange(first, len(q)).clip(max=max(first, last))]
+        return paths
 
     def values(
         self,
@@ -246,15 +265,13 @@ class MultipliedColumns:
         new = {role: self._pose_columns(role, tool, main) for role in _TOOL}
         if gripper is not None:
             new["gripper"] = gripper[:, None]
-        units = self._source.units
-        new = {r: x / units[r].factor for r, x in new.items() if r in self._places}
-        for name, path in objects.items():
-            role, pose = f"object {name}", pose_of(torch.from_numpy(path))
-            width = len(self._places.get(role, ()))
+        new = {r: x / self._source.units[r].factor for r, x in new.items() if r in self._places}
+        for name in objects.keys() & self.objects:
+            role, pose = f"object {name}", pose_of(torch.from_numpy(objects[name]))
+            width = len(self._places[role])
             turned = "quaternion_wxyz" if width == 7 else "rotation_vector"
             columns = [self._pose_columns(x, pose, main, role) for x in ("position", turned)]
-            if width:
-                new[role] = np.concatenate(columns, axis=1)[:, :width]
+            new[role] = np.concatenate(columns, axis=1)[:, :width]
         for role, columns in new.items():
             for (key, i), column in zip(self._places[role], columns.T, strict=True):
                 made[key][:, i] = column
@@ -302,6 +319,13 @@ class MultipliedColumns:
         own = self._same and len(factor) > 1
         chosen = factor[list(self._made.columns)] if own else factor[0]
         return values / (one - zero) / chosen
+
+
+def _departure(position: Float[torch.Tensor, "T 3"]) -> int:
+    """Last frame before an object begins to move; the last of all if it does not move."""
+    away = (position - position[0]).norm(dim=-1)
+    moved = int((away > _MOVED).int().argmax())
+    return int((away[:moved] <= _STILL).nonzero().max()) if moved else len(away) - 1
 
 
 def pose_of(values: Float[torch.Tensor, "*batch numbers"]) -> Pose:

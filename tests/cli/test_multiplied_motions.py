@@ -131,60 +131,17 @@ def test_an_attempt_is_the_same_in_any_chunk_and_differs_by_the_seed():
     assert not np.array_equal(job(seed=1).draw(range(10)).speed, whole.speed)
 
 
-def planned(gripper, objects):
-    """A tool that turns and moves, with a gripper, and objects at their places."""
-    k = np.arange(len(gripper))[:, None]
-    q = panda.ready.numpy() + 0.05 * k * np.array([1.0, 0.5, -0.3, 0.2, 0.1, 0.4, 1.0])
-    tool = panda.forward(torch.from_numpy(q))
-    places = {
-        name: np.append(tool.position[at].numpy() + shift, [1.0, 0.0, 0.0, 0.0])
-        for name, (at, shift) in objects.items()
-    }
-    trial = Trial(joints=q, gripper=np.array(gripper), objects=places)
-    made: Any = SimpleNamespace(robot=arm("panda"))
-    return Multiplication._planned(made, trial), tool, places
-
-
-def frame(tool, k):
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(
-        tool.orientation[k].numpy(), scalar_first=True
-    ).as_matrix()
-    pose[:3, 3] = tool.position[k].numpy()
-    return pose
-
-
-def test_the_object_nearest_to_the_closing_gripper_moves_with_it():
-    gripper = [0.08, 0.08, 0.05, 0.0, 0.0, 0.0, 0.08, 0.08, 0.0, 0.0]
-    objects = {"far": (3, 0.2), "near": (3, 0.01), "later": (8, 0.02)}
-    replay, tool, places = planned(gripper, objects)
-    np.testing.assert_array_equal(replay.objects["far"], np.tile(places["far"], (10, 1)))
-    # Closed means less than half way open: from frame 3 to 5, and from 8 on.
-    for name, closes, opens in (("near", 3, 6), ("later", 8, 10)):
-        found = replay.objects[name]
-        np.testing.assert_allclose(
-            found[: closes + 1], np.tile(places[name], (closes + 1, 1)), atol=1e-12
-        )
-        start = np.eye(4)
-        start[:3, 3] = places[name][:3]
-        grip = np.linalg.inv(frame(tool, closes)) @ start
-        for k in range(closes, opens):
-            pose = frame(tool, k) @ grip
-            np.testing.assert_allclose(found[k, :3], pose[:3, 3], atol=1e-9)
-            turn = Rotation.from_quat(found[k, 3:], scalar_first=True)
-            np.testing.assert_allclose(turn.as_matrix(), pose[:3, :3], atol=1e-9)
-        np.testing.assert_array_equal(found[opens:], np.tile(found[opens - 1], (10 - opens, 1)))
-    np.testing.assert_array_equal(replay.sent[:-1], replay.joints[1:])
-    np.testing.assert_array_equal(replay.sent[-1], replay.joints[-1])
-    assert replay.gripper is None
-    assert replay.failure == ""
-
-
-def test_a_gripper_closes_on_nothing_and_may_be_closed_from_the_start():
-    replay, *_ = planned([0.08, 0.0, 0.0], {})
-    assert replay.objects == {}
-    replay, _, places = planned([0.0, 0.0, 0.08], {"box": (0, 0.0)})
-    np.testing.assert_array_equal(replay.objects["box"], np.tile(places["box"], (3, 1)))
+def test_a_plan_has_the_moving_objects_of_the_demonstration():
+    q = panda.ready + 0.1 * torch.arange(3).double()[:, None]
+    motion, objects = SimpleNamespace(joints=q), {"box": np.ones(7)}
+    columns = SimpleNamespace(object_paths=lambda *given: given)
+    made: Any = SimpleNamespace(columns=columns)
+    trial = Trial(joints=q.numpy(), gripper=np.zeros(3), objects=objects)
+    replay = Multiplication._planned(made, motion, trial)  # pyright: ignore[reportArgumentType]
+    np.testing.assert_array_equal(replay.joints, q)
+    np.testing.assert_array_equal(replay.sent, q[[1, 2, 2]])
+    assert replay.objects == (motion, objects)
+    assert (replay.gripper, replay.failure) == (None, "")
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetWriter, open_demos
 from hrc_learn.demos.dataset_views import arm_of_dataset
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import arm, panda
 from hrc_learn.learning.multiply_dataset import MultipliedColumns, pose_of
+from hrc_learn.learning.multiply_motions import NewMotion
 
 pytestmark = pytest.mark.simulation
 
@@ -261,3 +263,91 @@ def test_changes_of_the_tool_pose_are_no_commands_of_poses(tmp_path):
     source = open_demos(tmp_path / "set")
     with pytest.raises(ValueError, match=r"action.tool \(ee.x\) holds changes, not commanded"):
         MultipliedColumns(source, arm_of_dataset(source), panda, {})
+
+
+FIRST, LAST = 6, 18
+"""Frames between which the tool carries a box."""
+
+
+@pytest.fixture(scope="module")
+def carried(tmp_path_factory):
+    """Columns of a demonstration that carries a box.
+
+    The opening of its gripper counts the other way: 1 is closed.
+    """
+    folder = tmp_path_factory.mktemp("carried") / "demos"
+    boxes = {
+        f"observation.{name}": tuple(
+            f"{name}.{a}" for a in ("x", "y", "z", "qw", "qx", "qy", "qz")
+        )
+        for name in ("box", "other")
+    }
+    q = joints(0)
+    tool = panda.forward(torch.from_numpy(q))
+    path = box_path(tool)
+    with DatasetWriter(folder, FPS, "panda", panda.joint_names, boxes) as writer:
+        writer.start_episode("carry")
+        for k in range(FRAMES):
+            writer.add_frame(
+                joint_position=q[k],
+                command_position=q[k],
+                gripper=float(FIRST <= k < LAST),
+                **{
+                    "observation.box": path[k],
+                    "observation.other": BLOCK,
+                },
+            )
+        writer.save_episode()
+    source = open_demos(folder)
+    taught = arm_of_dataset(source)
+    return MultipliedColumns(source, taught, panda, {})
+
+
+def box_path(tool):
+    """Pose of a box that slides by 1 mm a frame in the hand that carries it."""
+    still = torch.tensor([0.0, 0.0, 1.0, 0.0]).double()
+    grip = Pose(torch.tensor([0.01, 0.0, 0.1]).double(), still)
+    path = []
+    for k in range(FRAMES):
+        n = min(max(k, FIRST), LAST)
+        slid = Pose(
+            torch.tensor([0.001 * (n - FIRST), 0, 0]).double(),
+            quaternion.exp(torch.zeros(3).double()),
+        )
+        pose = tool[n] @ grip @ slid
+        path.append(torch.cat([pose.position, pose.orientation]).numpy())
+    return np.stack(path)
+
+
+def test_an_object_moves_with_the_tool_where_the_demonstrated_one_did(carried):
+    shown = box_path(panda.forward(torch.from_numpy(joints(0))))
+    scene = {"box": shown[0], "other": BLOCK, "goal": BLOCK}
+    again = NewMotion(
+        joints=torch.from_numpy(joints(0)),
+        phase=torch.arange(FRAMES).double(),
+        source=0,
+        reason="",
+    )
+    made = carried.object_paths(again, scene)
+    np.testing.assert_allclose(made["box"], shown, atol=2e-3)
+    np.testing.assert_allclose(made["other"], still(BLOCK), atol=1e-6)
+    np.testing.assert_array_equal(made["goal"], still(BLOCK))
+
+
+def test_an_object_moves_with_the_tool_elsewhere_and_more_slowly(carried):
+    phase = np.arange(0, FRAMES - 0.6, 0.5)
+    q = np.stack([np.interp(phase, np.arange(FRAMES), x) for x in joints(0).T], axis=1)
+    q[:, 0] += 0.5  # all turns about the axis of the first joint
+    turn = Rotation.from_euler("z", 0.5)
+    shown = box_path(panda.forward(torch.from_numpy(joints(0))))
+    first = seven(
+        turn.apply(shown[0, :3]), turn * Rotation.from_quat(shown[0, 3:], scalar_first=True)
+    )
+    slow = NewMotion(
+        joints=torch.from_numpy(q), phase=torch.from_numpy(phase), source=0, reason=""
+    )
+    made = carried.object_paths(slow, {"box": first})["box"]
+    np.testing.assert_allclose(made[::2, :3], turn.apply(shown[:, :3]), atol=2e-3)
+    np.testing.assert_array_equal(made[: 2 * FIRST - 2], [first] * (2 * FIRST - 2))
+    assert np.ptp(made[2 * LAST + 2 :], axis=0).max() == 0
+    assert np.ptp(made[:, :3], axis=0).max() > 0.01

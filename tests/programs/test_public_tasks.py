@@ -147,11 +147,11 @@ def test_successes_are_counted_by_lerobots_evaluation():
     shown = [protocol.demonstrate(Walk(), seed) for seed in range(8)]
     learned = bench._learn("walk", "motion_chunk", shown, args)
     for moved in (False, True):
-        with bench._environments("walk", 4, moved=moved) as vector:
+        with bench.environments("walk", 4, moved=moved) as vector:
             assert vector.num_envs == 4
-            assert 0 <= bench._successes(vector, learned) <= 4
+            assert 0 <= bench.successes(vector, learned) <= 4
     learned.policy.select_action = lambda seen: torch.full((4, 1), 1e3)
     learned = bench.Learned(learned.policy, learned.before, lambda action: action, False)
     for moved in (False, True):
-        with bench._environments("walk", 4, moved=moved) as vector:
-            assert bench._successes(vector, learned) == 4
+        with bench.environments("walk", 4, moved=moved) as vector:
+            assert bench.successes(vector, learned) == 4

@@ -1,0 +1,239 @@
+"""Policies learned from demonstrations that `hrc multiply` made of five, in MetaWorld.
+
+A policy learns from five demonstrations of the scripted expert (few), from these five
+multiplied without physics (multiplied), from the actions of the multiplied ones as MetaWorld
+carries them out, without the failures (replayed), or from a hundred demonstrations (many), for
+the same CPU time. It starts where no demonstration does, and MetaWorld decides. The user of
+`hrc multiply` states where objects and goals may be: where MetaWorld puts them. Every finished
+run is a line of `--runs`; runs that are there already are not repeated. Needs
+tools/make_environments.sh.
+
+    .venv-environments/bin/python benchmarks/bench_multiplied_policies.py
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import torch
+from bench_environments import environments, successes
+from bench_multiply_public import APART, STILL, placed, record
+from bench_policies import ACTION, ENVIRONMENT, STATE, Episode, learn
+from public_tasks.known import TASKS
+from public_tasks.metaworld import MetaWorld
+from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE
+from rich.console import Console
+from rich.table import Table
+from scipy.stats import binomtest
+
+from hrc_learn import cli
+from hrc_learn.cli.arguments import Multiply
+from hrc_learn.cli.multiply_command import multiply
+
+SETS = ("few", "multiplied", "replayed", "many")
+SIZES = {"few": "few", "multiplied": "episodes", "replayed": "episodes", "many": "many"}
+TOGETHER = 10
+"""Environments that run side by side."""
+LONGEST = 500
+"""Actions after which an episode has failed, in MetaWorld and in LeRobot: multiplied motions
+keep the limits of the arm, which the expert does not, and take three times as long."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    tasks: tuple[str, ...] = ("metaworld-pick-place", "metaworld-push", "metaworld-coffee-push")
+    """Tasks of MetaWorld in public_tasks/known.py, with one object and a goal."""
+    policies: tuple[str, ...] = ("act", "motion_chunk")
+    """LeRobot's own and ours."""
+    sets: tuple[str, ...] = SETS
+    """Sets to learn from; see above."""
+    few: int = 5
+    """Demonstrations that are multiplied."""
+    many: int = 100
+    """Demonstrations of the last set; the few are the first of these."""
+    episodes: int = 300
+    """Multiplied demonstrations."""
+    config: tuple[str, ...] = ()
+    """Further settings of `hrc multiply`, as for its `--config`."""
+    minutes: float = 0.5
+    """CPU time of building and training each policy."""
+    rollouts: int = 50
+    """Rollouts of each policy."""
+    seeds: tuple[int, ...] = (0,)
+    """Of weights and batches."""
+    out: Path = Path("outputs/multiplied_policies")
+    """Folder of the datasets, which are made if missing."""
+    runs: Path = Path("outputs/multiplied_policies.jsonl")
+    """Receives a line for each run."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    console = Console()
+    known = {key(run) for run in finished(args.runs)}
+    for seed in args.seeds:
+        for name in args.tasks:
+            for policy in args.policies:
+                for chosen in args.sets:
+                    run = {
+                        "task": name,
+                        "policy": policy,
+                        "set": chosen,
+                        "episodes": getattr(args, SIZES[chosen]),
+                        "minutes": args.minutes,
+                        "rollouts": args.rollouts,
+                        "seed": seed,
+                        "config": [*args.config] if SIZES[chosen] == "episodes" else [],
+                    }
+                    if key(run) in known:
+                        continue
+                    run |= measured(run, args)
+                    args.runs.parent.mkdir(parents=True, exist_ok=True)
+                    with args.runs.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(run) + "\n")
+                    console.print(run, highlight=False)
+    show([*finished(args.runs)], args, console)
+
+
+def measured(run: dict[str, Any], args: Args) -> dict[str, Any]:
+    """Steps and time of the training, and the number of successful rollouts."""
+    name = run["task"]
+    shown = episodes(name, run["set"], args)
+    setting = TASKS[name]
+    learned = learn(
+        run["policy"],
+        shown,
+        MetaWorld.fps,
+        minutes=args.minutes,
+        chunk=setting.chunk,
+        executed=setting.executed,
+        seed=run["seed"],
+    )
+    begun = time.process_time()
+    with environments(name, TOGETHER, moved=False) as vector:
+        vector.set_attr("_max_episode_steps", LONGEST)
+        done = successes(vector, learned, args.rollouts)
+    return {
+        "frames": sum(len(e[ACTION]) for e in shown),
+        "steps": learned.steps,
+        "cpu_s": round(learned.seconds, 1),
+        "rollout_cpu_s": round(time.process_time() - begun, 1),
+        "successes": done,
+    }
+
+
+def episodes(name: str, chosen: str, args: Args) -> list[Episode]:
+    """Episodes of a set, in the columns that the policy sees in MetaWorld."""
+    folder = args.out / name
+    task = "".join(f"{word}-" for word in name.split("-")[1:]) + "v3"
+    shown = folder / f"demonstrations_{args.many}"
+    if not shown.exists():
+        record(MetaWorld(task), task, shown, args.many)
+    if SIZES[chosen] != "episodes":
+        return read(shown)[: args.few if chosen == "few" else args.many]
+    options = [f"multiply.demonstrations={[*range(args.few)]}", *ranges(task), *args.config]
+    label = "_".join(["multiplied", *args.config]).replace("/", "")
+    made = folder / f"{label}_{args.few}_{args.episodes}"
+    command = Multiply(dataset=shown, episodes=args.episodes, out=made, config=tuple(options))
+    if not made.exists() and multiply(command):
+        raise SystemExit(1)
+    return read(made) if chosen == "multiplied" else replayed(MetaWorld(task), read(made))
+
+
+def replayed(task: MetaWorld, made: list[Episode]) -> list[Episode]:
+    """What MetaWorld shows while it carries out actions, of the episodes that succeed."""
+    kept = []
+    for episode in made:
+        scene = episode[ENVIRONMENT][0].numpy()
+        # MetaWorld has no such scenes.
+        if np.linalg.norm(scene[:2] - scene[-3:-1]) < APART:
+            continue
+        seen, frames, left = placed(task, np.concatenate([scene[:3], scene[-3:]])), [], None
+        for action in episode[ACTION].numpy():
+            frames.append((seen[AGENT_POS], seen[ENVIRONMENT_STATE], action))
+            seen, done = task.step(action)
+            left = STILL if done and left is None else left if left is None else left - 1
+            if left == 0:
+                break
+        if left is not None:
+            columns = [torch.from_numpy(np.stack(x)).float() for x in zip(*frames, strict=True)]
+            kept.append(dict(zip((STATE, ENVIRONMENT, ACTION), columns, strict=True)))
+    return kept
+
+
+def ranges(task: str) -> Iterator[str]:
+    """Settings of where MetaWorld puts the object and the goal."""
+    space = MetaWorld(task)._env._random_reset_space
+    for k, name in enumerate(("object", "object", "goal", "goal", "goal")):
+        axis, number = ("x", "y", "x", "y", "z")[k], (0, 1, 3, 4, 5)[k]
+        yield f"objects.{name}.{axis}=[{space.low[number]},{space.high[number]}]"
+
+
+def read(folder: Path) -> list[Episode]:
+    """Episodes of a dataset of `bench_multiply_public`, as MetaWorld shows them."""
+    rows = pq.read_table(sorted(folder.glob("data/*/*.parquet")))
+    columns = {
+        k: torch.tensor(rows.column(k).to_pylist()) for k in (STATE, ENVIRONMENT, ACTION)
+    }
+    lengths = torch.unique_consecutive(
+        torch.tensor(rows.column("episode_index").to_pylist()), return_counts=True
+    )[1]
+    things = columns[ENVIRONMENT]
+    absent = torch.zeros(len(things), 7)
+    columns[STATE] = columns[STATE][:, -4:]
+    columns[ENVIRONMENT] = torch.cat(
+        [things[:, :3], things[:, 3:7].roll(-1, -1), absent, things[:, 7:]], -1
+    )
+    parts = {k: x.split(lengths.tolist()) for k, x in columns.items()}
+    return [{k: x[n] for k, x in parts.items()} for n in range(len(lengths))]
+
+
+def key(run: dict[str, Any]) -> str:
+    """What is asked of a run, as text."""
+    asked = ("task", "policy", "set", "episodes", "minutes", "rollouts", "seed", "config")
+    return json.dumps([run[name] for name in asked])
+
+
+def finished(path: Path) -> Iterator[dict[str, Any]]:
+    """Finished runs; a line that was cut off is left out."""
+    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:
+            continue
+
+
+def show(runs: list[dict[str, Any]], args: Args, console: Console) -> None:
+    """Successes of all seeds with 95 % intervals."""
+    table = Table("task", "policy", "set", "steps", "successes", "95 % interval")
+    figures: dict[str, float] = {}
+    groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for run in runs:
+        label = "+".join([run["set"], *run["config"]])
+        groups.setdefault((run["task"], run["policy"], label), []).append(run)
+    for group, each in groups.items():
+        done, n = (sum(run[name] for run in each) for name in ("successes", "rollouts"))
+        low, high = binomtest(done, n).proportion_ci(method="wilson")
+        steps = sum(run["steps"] for run in each) // len(each)
+        table.add_row(*group, str(steps), f"{done} of {n}", f"{low:.0%} to {high:.0%}")
+        figures["_".join(group)] = done / n
+    console.print(table)
+    cli.write_values(args.json, figures)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
