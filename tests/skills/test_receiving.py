@@ -346,6 +346,7 @@ def test_the_hand_comes_to_rest_at_its_goal():
 def test_fingers_close_once_a_hand_rests_about_its_place(model, away, sway, rests):
     """By images each eighth of a second: half a second of them has five."""
     cell = Cell([(-1.0, 0.5, REST)], brings=False)
+    cell.time = 4.0
     offset = np.array([0.1, 0.2, -0.1])
     middle = START.numpy() + offset + away * np.array([0.6, 0.0, 0.8])
     shown = []
@@ -353,17 +354,17 @@ def test_fingers_close_once_a_hand_rests_about_its_place(model, away, sway, rest
     def read():
         k = int(cell.time * 8 + 1e-9)
         # Every other image to one side and to the other, by the same distance.
-        side = (0.0 if k == 0 else 1.0) * sway * (1 if k % 2 else -1)
+        side = (0.0 if k == 32 else 1.0) * sway * (1 if k % 2 else -1)
         shown.append(k / 8)
         return seen(k / 8, middle + np.array([0.0, side, 0.0]))
 
     cell.read = read
     taker = receiving(cell, model, near=0.09, still=0.5)
     if rests:
-        taker._await_hand(offset, 3.0)
-        assert shown[-1] == 0.5
+        taker._await_hand(offset, 7.0)
+        assert shown[-1] == 4.5
         assert torch.equal(cell.pose.position, START)
     else:
         with pytest.raises(MissedGraspError, match="did not reach the gripper"):
-            taker._await_hand(offset, 3.0)
-        assert 3.0 <= cell.time < 3.05
+            taker._await_hand(offset, 7.0)
+        assert 7.0 <= cell.time < 7.05
