@@ -1,13 +1,11 @@
 """Stop an arm whose control loop no longer reports, and retry stops that fail."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import final
+from typing import Self, final
 
 _FIRST_PAUSE = 0.02
 _LONGEST_PAUSE = 1.0
@@ -154,7 +152,7 @@ class Watchdog:
         if self._thread.is_alive():
             self._thread.join(self._timeout + _LONGEST_PAUSE)
 
-    def __enter__(self) -> Watchdog:
+    def __enter__(self) -> Self:
         self.feed()
         self.start()
         return self

@@ -6,8 +6,6 @@ device has not been run on hardware: it needs `forcedimension-core` (the extra `
 maker's SDK; tests drive the same interface without a device.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select
@@ -16,7 +14,7 @@ import time
 from collections.abc import Callable
 from threading import Event, Thread
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -121,7 +119,7 @@ class Gamepad(Human):
         self._held: set[int] = set()
 
     @classmethod
-    def open(cls, chain: SerialChain) -> Gamepad:
+    def open(cls, chain: SerialChain) -> Self:
         """Open the first gamepad with pygame, which the extra `gamepad` installs.
 
         Args:
@@ -261,7 +259,7 @@ class TerminalKeyboard(Human):
         self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
 
     @classmethod
-    def open(cls, chain: SerialChain) -> TerminalKeyboard:
+    def open(cls, chain: SerialChain) -> Self:
         """Read the terminal this process runs in, key by key, until the process ends.
 
         Raises:
@@ -377,7 +375,7 @@ class HapticDevice(Human):
         self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
 
     @classmethod
-    def open(cls, chain: SerialChain) -> HapticDevice:
+    def open(cls, chain: SerialChain) -> Self:
         """Open the first device with forcedimension-core, which the extra `haptic` installs.
 
         Args:
@@ -398,7 +396,7 @@ class HapticDevice(Human):
             raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
         return cls(chain, dhd, number=number)
 
-    def __enter__(self) -> HapticDevice:
+    def __enter__(self) -> Self:
         self._device.enableForce(True, self._number)
         self._thread.start()
         return self
