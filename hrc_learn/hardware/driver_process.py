@@ -337,12 +337,12 @@ class ArmProcess:
                 answer [s].
 
         Raises:
-            ValueError: The timeout is not positive.
+            ValueError: The timeout is not positive or not finite.
             DriverError: The arm cannot be reached.
             WatchdogError: The process died or took too long.
         """
-        if not timeout > 0:
-            raise ValueError(f"timeout must be positive, but is {timeout}")
+        if not 0 < timeout < math.inf:
+            raise ValueError(f"timeout must be positive and finite, but is {timeout}")
         self._timeout = timeout
         self._driver = DriverProcess(_serve, open_arm, timeout, name="arm")
         self._call = partial(self._driver.call, timeout=timeout)

@@ -58,12 +58,12 @@ class CaptureCamera(Connected, TimedCamera):
         Raises:
             FileNotFoundError: There is no such file.
             CameraError: The source cannot be opened, or sends no usable image.
-            ValueError: The delay is negative, or the timeout is not positive.
+            ValueError: The delay is negative, or the timeout is not positive or infinite.
         """
         if not delay >= 0:
             raise ValueError(f"delay must not be negative, but is {delay} s.")
-        if not timeout > 0:
-            raise ValueError(f"timeout must be positive, but is {timeout} s.")
+        if not 0 < timeout < math.inf:
+            raise ValueError(f"timeout must be positive and finite, but is {timeout} s.")
         name = str(source)
         device = name.isdecimal() or name.startswith("/dev/")
         self._is_file = not device and "://" not in name

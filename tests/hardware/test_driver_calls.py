@@ -154,7 +154,7 @@ def test_an_arm_that_cannot_be_opened_or_stopped_says_so(monkeypatch):
 
     with pytest.raises(DriverError, match=r"^OSError: no route$"):
         ArmProcess(refuse, timeout=1.0)
-    for timeout in (0.0, -1.0, np.nan):
+    for timeout in (0.0, -1.0, np.inf, np.nan):
         with pytest.raises(ValueError, match="timeout must be positive"):
             ArmProcess(Arm, timeout=timeout)
     monkeypatch.setattr(driver_process, "bring_to_rest", lambda stop, patience: False)
