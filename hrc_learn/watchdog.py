@@ -1,11 +1,13 @@
 """Stop an arm whose control loop no longer reports, and retry stops that fail."""
 
+from __future__ import annotations
+
 import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Self, final
+from typing import final
 
 _FIRST_PAUSE = 0.02
 _LONGEST_PAUSE = 1.0
@@ -152,7 +154,7 @@ class Watchdog:
         if self._thread.is_alive():
             self._thread.join(self._timeout + _LONGEST_PAUSE)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Watchdog:
         self.feed()
         self.start()
         return self

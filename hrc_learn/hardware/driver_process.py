@@ -5,6 +5,8 @@ or dies. Each command shows the driver's process that the loop is alive, and eac
 the loop that the process is alive. Both notice within the timeout if the other is gone.
 """
 
+from __future__ import annotations
+
 import importlib
 import math
 import multiprocessing
@@ -18,7 +20,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from types import FrameType
-from typing import Any, Protocol, Self, final, runtime_checkable
+from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -389,7 +391,7 @@ class ArmProcess:
         finally:
             self._driver.end(self._timeout + 1.0)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> ArmProcess:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:

@@ -1,12 +1,14 @@
 """Serve a browser page on which a person accepts, trims and rejects episodes of a dataset."""
 
+from __future__ import annotations
+
 import asyncio
 import struct
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from threading import Lock
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +81,7 @@ class CurationPage:
         self._gate = Gate(config, folder_contents(_CLIENT), routes, self.answer)
         self.url = self._gate.address.link()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> CurationPage:
         self._gate.start()
         return self
 

@@ -6,6 +6,8 @@ device has not been run on hardware: it needs `forcedimension-core` (the extra `
 maker's SDK; tests drive the same interface without a device.
 """
 
+from __future__ import annotations
+
 import contextlib
 import os
 import select
@@ -14,7 +16,7 @@ import time
 from collections.abc import Callable
 from threading import Event, Thread
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -119,7 +121,7 @@ class Gamepad(Human):
         self._held: set[int] = set()
 
     @classmethod
-    def open(cls, chain: SerialChain) -> Self:
+    def open(cls, chain: SerialChain) -> Gamepad:
         """Open the first gamepad with pygame, which the extra `gamepad` installs.
 
         Args:
@@ -259,7 +261,7 @@ class TerminalKeyboard(Human):
         self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
 
     @classmethod
-    def open(cls, chain: SerialChain) -> Self:
+    def open(cls, chain: SerialChain) -> TerminalKeyboard:
         """Read the terminal this process runs in, key by key, until the process ends.
 
         Raises:
@@ -375,7 +377,7 @@ class HapticDevice(Human):
         self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
 
     @classmethod
-    def open(cls, chain: SerialChain) -> Self:
+    def open(cls, chain: SerialChain) -> HapticDevice:
         """Open the first device with forcedimension-core, which the extra `haptic` installs.
 
         Args:
@@ -396,7 +398,7 @@ class HapticDevice(Human):
             raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
         return cls(chain, dhd, number=number)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> HapticDevice:
         self._device.enableForce(True, self._number)
         self._thread.start()
         return self
