@@ -6,7 +6,12 @@ from matplotlib.colors import to_rgb
 
 from hrc_learn.viz import palette
 
-COLOURS = [*{*palette.SERIES, *palette.SERIES_ON_DARK}, palette.BLACK, "#010203", "#fefdfc"]
+COLOURS = [
+    *sorted({*palette.SERIES, *palette.SERIES_ON_DARK}),
+    palette.BLACK,
+    "#010203",
+    "#fefdfc",
+]
 
 
 @pytest.mark.parametrize("colour", COLOURS)
