@@ -62,9 +62,9 @@ class ControllerConfig:
     """c_d [N m s/rad]: a null-space input d requests the null-space velocity d/c_d."""
     yields_to_limits: bool = True
     """True: near joint limits, free joints take over the motion that limited joints cannot make
-    (saturation in the null space); the task slows down where a limit would make the tool faster
-    than requested; the null-space motion is scaled as a whole. False: only the safety filter
-    keeps the limits."""
+    (saturation in the null space). The task slows down where a joint at its limit no longer
+    cancels the motion of another, so that the tool would move faster than requested. The
+    null-space motion is scaled as a whole. False: only the safety filter keeps the limits."""
     drift_compensation_rate: float = 2.0
     """Decay rate of the tool's pose drift under a null-space input [1/s]; 0: no
     compensation."""
@@ -160,8 +160,9 @@ class AdaptiveController(nn.Module):
 
     Goals for a part of the tool pose (`Goals.task`) leave more null space. With a basis B of
     that part, J_t = B J and s = J_s_hat^T xi_x + xi_r, the law is
-    u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q). The potential still falls. An arm with the
-    task "nearest pose" (`Arm.task`) also follows this law for goals of the whole pose.
+    u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q). The potential of the regions, whose
+    gradients are s and xi_q, still falls. An arm with the task "nearest pose" (`Arm.task`) also
+    follows this law for goals of the whole pose.
 
     A step is a pure function `(state, observation) -> (command, state)`; the module stores no
     state. Run real-time loops under `torch.inference_mode()`.
@@ -233,14 +234,14 @@ class AdaptiveController(nn.Module):
         if wanted != seen:
             raise ValueError(
                 f"the goals' target has {wanted} coordinates, the estimator's feature {seen}: "
-                "pass u and v of each point as target (with_vision(False) then ignores them)"
+                "pass u and v of each point as target (with_vision(False) ignores them)"
             )
         if task == "pose" and n < 6 and not self._nearest:
             left = self.null_space_dimension("position+axis")
             raise ValueError(
                 f"the goals control the whole tool pose, which needs six joints, but the "
-                f"arm has {n}: control its position and axis, Goals.at(..., "
-                f"task='position+axis'), which leaves a null space of {left}, or its position"
+                f"arm has {n}: control the tool's position and axis by Goals.at(..., "
+                f"task='position+axis') (null space: {left}), or its position alone"
             )
 
     def initial_state(

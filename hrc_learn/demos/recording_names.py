@@ -139,7 +139,7 @@ class FieldSearch:
         for name, one in fields.items():
             parts = name.lower().split("/")
             if _IGNORED.fullmatch(parts[-1]) or any(part.startswith("next_") for part in parts):
-                self.left_out[name] = "a counter, or data of a learner or the next frame"
+                self.left_out[name] = "a counter, a reward, or the next frame"
             elif one.width == 1 and len(parts) == 1:
                 table.append(name)
             else:

@@ -17,9 +17,9 @@ from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
 
 SEARCH_RANGE = 0.1
-"""Relative range around the estimate by autocorrelation in which a period is searched."""
+"""Half width of the search for a period, relative to the estimate by autocorrelation."""
 HIGH_PEAK = 0.9
-"""Height of a peak of the autocorrelation, relative to the highest, that counts as high."""
+"""Smallest height of a high peak of the autocorrelation, relative to the highest peak."""
 GOLDEN = (5**0.5 - 1) / 2
 """Fraction of an interval that a golden-section search keeps."""
 SEARCH_RIDGE = 1e-6

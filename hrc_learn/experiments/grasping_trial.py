@@ -49,7 +49,7 @@ _LIMIT_MARGIN, _START_HEIGHT = 0.02, 0.15
 _MOST_STARTS = 200
 """Largest number of random joint positions that are tried as a start."""
 START_DISTANCE = 0.35
-"""Smallest distance of the end effector at the start from its goal [m]."""
+"""Smallest distance of the end effector at the start from its goal [m], at `hand_size` 1."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ class PlacingOutcome:
     """Measured outcome of one placing."""
 
     deviation: float
-    """Deviation of the approach path from the demonstrated one, shifted to this goal [m]."""
+    """Distance of the approach from the demonstrated path, shifted to end at this goal [m]."""
     place_error: float
     """Horizontal distance of the object on its board from its intended place [m]."""
     place_tilt: float

@@ -158,7 +158,7 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
     """Paths of the gripper's marker in the image, and its distance from the target."""
     camera = run.camera
     if camera is None:
-        raise ValueError("this figure needs camera, which the recording does not have.")
+        raise ValueError("this figure needs the camera, which the recording does not have.")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 6.0))
         grid = figure.add_gridspec(2, 1, height_ratios=[2.1, 1])

@@ -18,7 +18,7 @@ GRIPPER = "gripper.pos"
 """Name of a gripper's value in LeRobot: 0 to 100 % of its calibrated range."""
 _ATTEMPTS = 3
 _LONG = {"robot": "robot", "teleop": "teleoperator"}
-"""LeRobot's names of packages, classes and functions for the two kinds of options."""
+"""Prefix of an option -> word in the names of LeRobot's packages, classes and functions."""
 _STATUS_REGISTERS = ("Status", "Hardware_Error_Status")
 """Registers of Feetech and Dynamixel servos, 0 without a fault."""
 
@@ -162,7 +162,7 @@ class JointUnits:
         zeros = dict(zeros or {})
         if unknown := {*zeros, *reversed_joints} - {*joint_names}:
             raise ValueError(
-                f"zeros and reversed name {', '.join(sorted(unknown))}, but the joints are "
+                f"zeros or reversed: no joint named {', '.join(sorted(unknown))}; joints are "
                 f"{', '.join(joint_names)}."
             )
         scales, spans = zip(*(_rad_per_unit(device, key, unit) for key in keys), strict=True)

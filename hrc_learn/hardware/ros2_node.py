@@ -38,13 +38,14 @@ _RECENT = 500
 _HISTORY = 500
 """Number of joint states kept, to find the one at the time of an image."""
 _PUSH = 0.25
-"""Time for which a push counts [s], as at the page: the message that ends it may be lost."""
+"""Time after which a push ends without a new message [s], because the message that ends it may
+be lost. Pushes from the browser page end after the same time."""
 _PATH = 200
 """Number of points of the tool path in the markers, 20 s at their period."""
 
 
 class ControllerNode:
-    """A node that keeps the arm's tool in regions of space and image.
+    """A node that keeps the tool in a goal region, and its feature at a target in the image.
 
     `configure` builds the controller, `activate` holds the tool where it is and then follows
     goals, and `deactivate` brings the arm to rest. Old joint states, a missing heartbeat and
@@ -282,7 +283,7 @@ class ControllerNode:
         centre, orientation = self._pose(message, "region")
         size = 0.5 * np.array([message.scale.x, message.scale.y, message.scale.z])
         if not (size > 0).all() or abs(orientation[0]) < 1 - 1e-6:
-            text = "a region is refused: give edges above 0, along the axes of the base"
+            text = "a region is refused: give edges longer than 0, parallel to the base's axes"
             raise ValueError(text)
         self._runner.observation["goals.position.centre"][:] = centre
         self._runner.observation["goals.position.half_size"][:] = size

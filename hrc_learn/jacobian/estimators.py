@@ -197,7 +197,8 @@ class MotionSample:
     dr: Float[Tensor, "*batch 6"]
     """Motion of the tool with rotation scaled to metres [m]."""
     dx: Float[Tensor, "*batch rows"]
-    """Motion of the feature minus the motion predicted by the network's camera, if any [px]."""
+    """Motion of the feature [px]. If the network has a camera model, the motion that this model
+    predicts is subtracted."""
     theta: Float[Tensor, "*batch K"]
     """Mean of the neurons' activations at both frames."""
     valid: Bool[Tensor, "*batch"]

@@ -30,9 +30,9 @@ FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
 # Largest number of samples drawn from the clearest matches, and then from all matches. With
 # these numbers, an image without the tool takes a fifth of a second.
 _TRIALS = 300, 1000
-# Once a pose is found, it predicts the pixels of the tool's points. Features within these
-# multiples of `_REACH` from a predicted pixel match the point if their descriptors differ by
-# less than `_SIMILAR`.
+# Once a pose is found, it is refined in rounds. In each, a feature matches a point of the tool
+# if it lies within this multiple of `_REACH` from the pixel that the pose predicts, and if
+# their descriptors differ by less than `_SIMILAR`.
 _GUIDED, _SIMILAR = (2.0, 1.0, 1.0), 270.0
 # Least standard deviation of a feature's position in the image [px].
 _LEAST_NOISE = 0.15
@@ -201,7 +201,8 @@ class Object:
     """Views of an object, each with its features around the object's middle."""
 
     views: tuple[Features, ...]
-    """Features relative to the object's middle and direction, at the first view's size [px]."""
+    """Features in a frame at the object's middle, along its direction, at the object's size in
+    the first view [px]."""
 
     def find(self, seen: Features, width: int) -> Finding | None:
         """Find the object among an image's features; None: not found."""
@@ -210,7 +211,10 @@ class Object:
 
 
 def match_view(view: Features, seen: Features, width: int) -> Finding | None:
-    """Pixel of a view's origin and direction of its first axis in an image; None: not found.
+    """Find a view in an image: the pixel of its origin, and the direction of its first axis.
+
+    Return None if it is not found.
+
 
     Args:
         view: Features of the view.

@@ -195,7 +195,7 @@ def test_above_its_cap_the_tool_brakes_as_for_a_stop():
 
 def test_a_distance_without_a_jacobian_is_refused():
     safety = SafetyFilter(panda.limits)
-    with pytest.raises(ValueError, match="pass jacobian as well"):
+    with pytest.raises(ValueError, match="set jacobian"):
         safety.step(
             safety.initial_state(READY), READY, ACROSS, 0.01, human_distance=tensor(1.0)[0]
         )

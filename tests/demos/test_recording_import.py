@@ -228,7 +228,7 @@ def test_a_preview_has_a_row_for_each_field_and_a_line_for_each_reason():
     assert rows["time"] == ["time", "time", "s", "by", "its", "name"]
     assert rows["action"][:5] == ["action", "action,", "as", "recorded", "?"]
     left = [line for line in lines if line.startswith("left out: ")]
-    assert "left out: reward, done (a counter, or data of a learner or the next frame)" in left
+    assert "left out: reward, done (a counter, a reward, or the next frame)" in left
     assert len(left) == len({*plan.meaning.left_out.values()}) == 3
     assert not any("no commands" in line for line in lines)
     assert plan.has_actions

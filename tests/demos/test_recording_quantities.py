@@ -260,8 +260,8 @@ def test_fields_that_are_not_taken_are_listed_with_the_reason():
         "depth": "depth images are not written",
         "note": "text",
         "waves": "no frames",
-        "reward": "a counter, or data of a learner or the next frame",
-        "next_obs/qpos": "a counter, or data of a learner or the next frame",
+        "reward": "a counter, a reward, or the next frame",
+        "next_obs/qpos": "a counter, a reward, or the next frame",
         "camera_pose": "transforms of a frame other than the hand",
         "other": "not understood; to keep it: observation.NAME",
     }

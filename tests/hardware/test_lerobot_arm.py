@@ -136,7 +136,7 @@ def test_reversed_joints_and_zeros_belong_to_the_description(settings, bus, chai
     config = LeRobotConfig(zeros={"shoulder_lift": 0.5}, reversed=("shoulder_lift",))
     with LeRobotArm(settings, chain, config) as arm:
         assert arm.read().joint_position[1] == pytest.approx(0.5 - 200 * STEP, abs=STEP)
-    with pytest.raises(ValueError, match="zeros and reversed name elbow,"):
+    with pytest.raises(ValueError, match="zeros or reversed: no joint named elbow"):
         LeRobotArm(settings, chain, LeRobotConfig(zeros={"elbow": 0.5}))
 
 

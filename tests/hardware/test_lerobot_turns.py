@@ -523,7 +523,9 @@ class TestUnits:
         np.testing.assert_allclose(position, expected)
         assert share == 0.4
         assert units.action(position, share) == pytest.approx(values)
-        with pytest.raises(ValueError, match="zeros and reversed name elbow, hip, but the"):
+        with pytest.raises(
+            ValueError, match="zeros or reversed: no joint named elbow, hip; joints are"
+        ):
             JointUnits.of(Servos(), NAMES, zeros={"hip": 0.1}, reversed_joints=("elbow",))
 
     def test_joints_go_by_their_names_or_else_by_their_order(self):

@@ -18,7 +18,8 @@ JOINT_SUFFIXES: dict[str, list[str]] = WORDS["joint_suffixes"]
 
 _JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
 
-# `joint_1_vel`: only after a clear joint name, as `ee_pos` and `x_vel` are no joints.
+# An underscore separates the quantity, as in `joint_1_vel`, only after a name that is clearly a
+# joint: `ee_pos` and `x_vel` are no joints.
 _UNDERSCORED = re.compile(
     r"(.*(?:joint|motor|axis|shoulder|elbow|wrist|waist|gripper)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)",
     re.IGNORECASE,
@@ -57,7 +58,8 @@ _NAMES = [
     for table in ("components", "numbered")
     for role, rest in WORDS[table]
 ]
-"""Role, pattern of the whole name, and True if the name needs a word for the tool."""
+"""Role, pattern of the whole name, and True if the pattern applies only to names that contain a
+word for the tool."""
 _SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _QUATERNION_SLOTS = {"w": 0, "x": 1, "y": 2, "z": 3}
 
@@ -161,7 +163,7 @@ def is_hand(name: str) -> bool:
 
 
 def names_no_joint(name: str) -> bool:
-    """True if the name is that of an object, an image point, a base or another sensor."""
+    """True if the name is that of an object, an image point, a mobile base or a sensor."""
     return bool(_NO_JOINT.search(_CAMEL.sub("_", name.strip()).lower()))
 
 

@@ -23,7 +23,7 @@ _MOST_FRAMES = 4000
 """Frames used to find a delay; the middle of a longer episode is enough."""
 _LONGEST_DELAY = 1.5
 """Largest delay considered [s]; no controller answers later."""
-# Negligible fraction of the variance: the square of a tenth of the motion.
+# Negligible fraction of the variance. An error of a tenth of the motion causes 0.01.
 _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
@@ -49,7 +49,7 @@ RATE_WINDOW = 0.2
 change from frame to frame is mostly noise."""
 MOST_NAMED = 6
 """Largest number of components named in a message."""
-# Relative variance of a window in which a component rests, up to rounding.
+# Largest relative variance of a window in which a component rests: what rounding causes.
 _RESTING = 1e-10
 
 
@@ -221,7 +221,7 @@ class FeatureProfiles:
     def varied(self) -> Bool[np.ndarray, " components"]:
         """Mask of components that are smooth, or whose extremes take many values.
 
-        In short episodes, values such as pixels hardly move, but their levels differ.
+        In short episodes, values such as pixels hardly change, but differ between episodes.
         """
         ends = np.sort(np.concatenate([self.stack("low"), self.stack("high")]), axis=0)
         return self.smooth | ((np.diff(ends, axis=0) > 0).sum(0) > 3)
@@ -403,7 +403,7 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
 def _means(
     values: Float64[np.ndarray, "frames components"], window: int
 ) -> Float64[np.ndarray, "_windows components"]:
-    """Means over `window` frames, beginning at each frame but the last `window` ones."""
+    """Means over `window` frames, from each frame on except for the last `window` frames."""
     sums = np.cumsum(values, axis=0)
     return (sums[window:] - sums[:-window] - values[window:] + values[:-window]) / window
 
@@ -411,7 +411,7 @@ def _means(
 def commanded_rates(
     trackings: Sequence[Mapping[str, Tracking]], fps: float
 ) -> tuple[Float64[np.ndarray, " components"], float] | None:
-    """Evidence that commands named like positions are changes or velocities.
+    """Evidence that commands which have the names of positions are changes or velocities.
 
     Args:
         trackings: Tracking in each episode, as `track_quantities` gives it.
