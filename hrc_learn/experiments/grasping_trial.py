@@ -43,8 +43,8 @@ CAMERA_SHIFT = 0.10
 _CAMERA_MISS = 0.04
 # Largest distance of the object from the middle of the table along each axis [m].
 _OBJECT_REACH = (0.10, 0.08, 0.0)
-# Distance of the start from the joint limits [rad], and smallest height of the end effector
-# there [m].
+# Distance of the start from the joint limits [rad], and smallest height of the end effector at
+# the start [m], for an arm whose `hand_size` is 1.
 _LIMIT_MARGIN, _START_HEIGHT = 0.02, 0.15
 _MOST_STARTS = 200
 """Largest number of random joint positions that are tried as a start."""
@@ -162,8 +162,8 @@ def simulate_grasp(
         rng: Source of image noise and of lost images.
         access: Access to the arm.
         human: Person near the arm; None: no person.
-        page: Page, served in real time, on which users can also draw and pull the arm; None:
-            no page.
+        page: Browser page that shows the run in real time, where users can draw goals and pull
+                at the arm; None: no page.
         observer: Live dashboard and messages.
     """
     workplace = scene.workplace.approached(aiming.approach)

@@ -1,6 +1,7 @@
 """Report of a run: sections, and figures like those of the paper's Experiments 2 and 3.
 
-Each figure shows the recording of a run, with the time interval of each object by its name.
+Most figures take the recording of a run and, by name of the object, the time interval in which
+the robot handled it.
 """
 
 from collections.abc import Mapping, Sequence

@@ -228,7 +228,7 @@ def test_goals_and_regions_that_make_no_sense_change_nothing(graph, node, values
         graph.takers["~/region"](region)
         assert box() == held
     assert graph.log[5] == "a region in frame camera is refused: give it in base_link"
-    assert graph.log[-1].startswith("a region is refused: give edges above 0, along")
+    assert graph.log[-1].startswith("a region is refused: give edges longer than 0,")
     region.pose = goal_at([0.4, 0.1, 0.5], [-1, 0, 0, 0]).pose
     for edges in ([0.1, 0.0, 0.1], [0.1, 0.2, -0.1], [np.nan, 0.1, 0.1]):
         region.scale.x, region.scale.y, region.scale.z = edges

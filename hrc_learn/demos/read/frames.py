@@ -292,8 +292,8 @@ def frame_timestamps(
         k = int(stalled[0])
         text = (
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s: "
-            f"drop the repeated frames (hrc repair), or let frames count as 1/fps apart "
-            f"(mapping={{'time': None}} if a column holds recorded times)"
+            f"drop the repeated frames (hrc repair), or ignore the column of recorded times by "
+            f"mapping={{'time': None}}: frames are then 1/fps apart"
         )
         raise entry.error(text, frame=k + 1, key=key)
     resolution = 2 * np.finfo(np.float32).eps * max(1.0, float(np.abs(time).max()))

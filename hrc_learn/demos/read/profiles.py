@@ -43,7 +43,7 @@ _SAME_UNIT, _LATE = np.log(2.0), 0.75
 commanded positions. `_LATE`: largest delay of such a state [s]."""
 PROMPT = 0.2
 """Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion that is
-delayed by a longer time resembles its own rate."""
+delayed by more resembles the rate of the same motion."""
 RATE_WINDOW = 0.2
 """Time over which joint rates, and commands that they are compared with, are averaged [s]: a
 change from frame to frame is mostly noise."""
