@@ -68,7 +68,7 @@ def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
 
 
 def test_runs_without_a_camera_are_refused_where_it_is_needed(run):
-    with pytest.raises(ValueError, match="needs camera"):
+    with pytest.raises(ValueError, match="needs the camera"):
         marker_figure(replace(run, camera=None), OBJECTS)
 
 
