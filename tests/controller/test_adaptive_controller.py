@@ -376,3 +376,14 @@ def test_a_step_of_the_longest_duration_is_valid():
         command, after = controller.step(state, observe(POSTURE, dt=dt))
         assert command.safety.acted("invalid") != valid
         assert bool(after.blending.level > 0) == valid
+
+
+def test_by_default_the_null_space_returns_with_a_second_and_at_most_0_4_rad_per_s():
+    q = panda.ready
+    pose = panda.forward(q)
+    goals = Goals.at(pose.position, pose.orientation, torch.full((2,), 100.0, dtype=DOUBLE))
+    rest, ahead = goals.resting_at(q).rest, torch.ones(7, dtype=DOUBLE) / 7**0.5
+    assert rest is not None
+    near, far = rest.gradient(q + 1e-4 * ahead), rest.gradient(q + 1e4 * ahead)
+    torch.testing.assert_close(near, 1e-4 * ahead, rtol=1e-3, atol=0)
+    torch.testing.assert_close(far, 0.4 * ahead, rtol=1e-3, atol=0)

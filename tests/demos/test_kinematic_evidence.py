@@ -201,6 +201,17 @@ def test_a_joint_that_counts_the_other_way_is_asked_about(model, tmp_path):
     assert len(demos) == 3
 
 
+def test_zeros_of_joints_are_not_judged_without_positions_of_the_tool(tmp_path):
+    root = write_folder(
+        tmp_path / "set",
+        [{STATE: motion(k)} for k in range(3)],
+        {STATE: [f"joint_{i}.pos" for i in range(6)]},
+    )
+    write_info(root, read_info(root) | {"robot_type": "ur5e"})
+    report = check_dataset(root, units={"joint_position": "rad"})
+    assert not [i for i in (*report.errors, *report.warnings) if "zeros" in str(i)]
+
+
 def test_the_check_says_by_how_many_degrees_zeros_are_off(model, tmp_path):
     offset = np.deg2rad([0, 2.5, 0, -4, 0, 0])
     root, _ = write(tmp_path / "off", model, lambda q: q - offset)

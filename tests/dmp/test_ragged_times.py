@@ -390,3 +390,21 @@ def test_tables_are_kept_and_shorter_in_single_precision():
     periodic = response_of(SpringDamper(), PeriodicBasis(count=9), 0.0)
     assert _table(periodic, 0, double).pieces == len(periodic.forced.coefficients)
     assert _table(periodic, 0, double).others == 2
+
+
+def test_the_gradient_of_one_motion_does_not_depend_on_the_order_of_its_times():
+    response = response_of(SpringDamper(), GaussianBasis(count=12))
+    _, x = random_motions(GaussianBasis(count=12), batch=1)
+    # One time in each piece, so that the pieces fall strictly.
+    falling = torch.linspace(0.98, 0.02, 12, dtype=torch.float64)[None]
+    weights = torch.randn(
+        1, 12, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    gradients = []
+    for times, weight in ((falling, weights), (falling.flip(1), weights.flip(1))):
+        values = x.clone().requires_grad_()
+        y = motion(response, times, values, 0)
+        gradients += torch.autograd.grad((y * weight).sum(), values)
+    dense = torch.einsum("btd,btm->bdm", weights, response.evaluate(falling)[..., 0, :])
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=1e-12)
+    torch.testing.assert_close(gradients[0], dense, rtol=0, atol=1e-9)
