@@ -125,7 +125,7 @@ def measured(run: dict[str, Any], args: Args) -> dict[str, Any]:
     )
     begun = time.process_time()
     with environments(name, TOGETHER, moved=False) as vector:
-        vector.set_attr("_max_episode_steps", LONGEST)
+        vector.set_attr("_max_episode_steps", LONGEST)  # pyright: ignore[reportAttributeAccessIssue]
         done = successes(vector, learned, args.rollouts)
     return {
         "frames": sum(len(e[ACTION]) for e in shown),

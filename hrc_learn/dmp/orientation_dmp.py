@@ -297,12 +297,15 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             Columns and reference. None where PyTorch has to compute them, or if a value is
             wrong; the computation in PyTorch then reports it.
         """
-        E, motion, posed = self.error_columns, self.motion, isinstance(goal, Pose)
+        E, motion = self.error_columns, self.motion
         given = columns.position, columns.rate, columns.target
-        one = goal is not None and frame.ndim == 1 and posed == (E.start > 0)
-        if not one or type(motion) is not JointDMP or not fits_numpy(frame, *given):
+        if goal is None or frame.ndim != 1 or isinstance(goal, Pose) != (E.start > 0):
             return None
-        parts = (goal.orientation, goal.position) if posed else (goal,)
+        if type(motion) is not JointDMP or not fits_numpy(frame, *given):
+            return None
+        parts: list[Any] = [goal]
+        if isinstance(goal, Pose):
+            parts = [goal.orientation, goal.position]
         parts = [to_tensor(x, frame.dtype, frame.device) for x in parts]
         if [x.shape for x in parts] != [(4,), (3,)][: len(parts)]:
             return None
@@ -310,7 +313,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         q, place = numbers[:4], numbers[4:]
         if not (0.5 < (norm := math.hypot(*q)) < math.inf and math.isfinite(sum(place))):
             return None
-        offset = motion._buffers["goal"].tolist()[E]
+        offset = motion.goal.tolist()[E]
         q = quaternion.product_of_components(exp_numbers(offset), [x / norm for x in q])
         y, rate, target = moved = [x.tolist() for x in given]
         y[E], rate[E] = retarget_numbers(y[E], rate[E], frame.tolist(), q)

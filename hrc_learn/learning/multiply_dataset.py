@@ -225,7 +225,9 @@ class MultipliedColumns:
         """
         main, phase, tool = made.source, made.phase.numpy(), self._robot.forward(made.joints)
         paths = {name: np.tile(at, (len(phase), 1)) for name, at in scene.items()}
-        q = self._taught.positions(self._source[main].joint_position)
+        joints = self._source[main].joint_position
+        assert joints is not None
+        q = self._taught.positions(joints)
         q = np.stack([np.interp(phase, np.arange(len(q)), angle) for angle in q.T], axis=1)
         hand = self._taught.arm.forward(torch.from_numpy(q)).inverse()
         for name in paths.keys() & self.objects:
