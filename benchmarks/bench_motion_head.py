@@ -39,8 +39,6 @@ from hrc_learn.viz import palette
 from hrc_learn.viz.figures import STYLE, WIDTH
 
 # pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
 # MuJoCo's classes are compiled, and its stubs omit most of them.
 
 JOINTS, LINK = 5, 0.2
