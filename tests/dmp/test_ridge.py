@@ -7,8 +7,9 @@ from demo_motions import minimum_jerk
 from torch.autograd import gradcheck
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import JointDMP, fit_ridge
+from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper, fit_ridge, response_of
 from hrc_learn.dmp.learned_motion import choose
+from hrc_learn.dmp.solvers import solve_normal
 
 S = torch.linspace(0, 1, 200, dtype=torch.float64)
 CONTEXTS = torch.tensor([[0.0, 0.2], [0.5, 1.0], [1.0, 0.1], [0.3, 0.7], [0.8, 0.6]]).double()
@@ -97,3 +98,16 @@ def test_contexts_that_do_not_fit_are_refused(each, model):
         fit_ridge(CONTEXTS[:1], CONTEXTS[:1], 0.1)
     with pytest.raises(ValueError, match="regularization must be positive"):
         fit_ridge(CONTEXTS, CONTEXTS, 0.0)
+
+
+@pytest.mark.parametrize(("ratio", "undetermined"), [(2e-3, False), (5e-4, True)])
+def test_a_function_that_samples_hardly_see_is_undetermined_before_cholesky_fails(
+    ratio, undetermined
+):
+    response = response_of(SpringDamper(), GaussianBasis(count=8))
+    # Singular values of the samples by function; two columns to reproduce.
+    seen = torch.tensor([*7 * [1.0], ratio], dtype=torch.float64)
+    gram = torch.diag(seen**2)
+    products = torch.block_diag(gram, torch.eye(2, dtype=torch.float64))[None]
+    assert not torch.linalg.cholesky_ex(gram).info
+    assert solve_normal(response, 8, products, 1e-9)[2].item() is undetermined
