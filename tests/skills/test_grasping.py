@@ -155,8 +155,6 @@ def test_a_camera_that_never_sees_the_object_is_named():
     pose = scene.camera.pose @ np.diag([1.0, -1, -1, 1])  # upwards
     blind = replace(scene, camera=replace(scene.camera, pose=pose))
     with pytest.raises(ValueError, match=r"in the camera's view: turn the camera"):
-        ValueError, match=r"leaves the object in the camera's view: turn the camera"
-    ):
         GraspingScene.draw(
             replace(WORKPLACE, scene=blind), GraspingSceneConfig(), np.random.default_rng(0)
         )
