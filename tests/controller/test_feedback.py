@@ -1,16 +1,18 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.controller import BlendingConfig
+from hrc_learn.controller import BlendingConfig, Goals
 from hrc_learn.controller.resolved_rate import (
     BlendingState,
     VisionBlending,
     approach_velocity,
     fade,
     next_task_level,
+    regional_feedback,
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.regions import PostureRegion
@@ -167,3 +169,24 @@ def test_an_approach_is_as_slow_as_the_caps_of_the_tool_ask():
         assert torch.nn.functional.cosine_similarity(v, posture.goal - q, dim=0) > 1 - 1e-12
     free = approach_velocity(posture, q, J, torch.full((2,), 100.0, dtype=torch.float64))
     torch.testing.assert_close(free, -posture.gradient(q))
+
+
+def test_the_requested_decay_of_the_pixel_error_is_capped_and_otherwise_unchanged():
+    pose, blending = panda.forward(panda.ready), VisionBlending()
+    goals = Goals.at(pose.position, pose.orientation, pixel(700.0, 500.0))
+    seen = replace(
+        blending.initial_state(panda.ready),
+        feature=pixel(720.0, 540.0),
+        level=pixel(1.0, 0.0)[0],
+    )
+    J_s = torch.eye(2, 6, dtype=torch.float64) * 1000.0  # px/m
+    distance = math.hypot(20.0, 40.0)
+
+    def requested(rate):
+        xi_x = regional_feedback(goals, pose, seen, J_s, rate).xi_x
+        return (J_s @ J_s.mT @ xi_x).norm().item()  # px/s
+
+    free = requested(math.inf)
+    assert free > 0.0
+    assert requested(2 * free / distance) == pytest.approx(free, rel=1e-12)
+    assert requested(0.1 * free / distance) == pytest.approx(0.1 * free + 1.0, rel=1e-9)
