@@ -220,7 +220,7 @@ def test_the_program_grasps(skill, tmp_path):
     assert values["object_held_lifted_and_carried_home"] == 1
     assert values["successes"] == 1
     files = {path.name for path in (tmp_path / "run").rglob("*")}
-    assert files >= {"report.html", "run.rrd", "regions.png"}
+    assert files >= {"report.html", "run.rrd", "trajectories.png"}
 
 
 @pytest.mark.slow
