@@ -1,6 +1,7 @@
 """The documentation site: what becomes a page, and what makes the build fail."""
 
 import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -90,6 +91,30 @@ def test_every_name_of_our_faces_is_described_or_linked():
 def test_a_section_follows_the_order_of_its_index(tmp_path):
     pages = build_docs.section(checkout(tmp_path), "howto")
     assert pages == ["howto/index.md", "howto/more.md", "howto/guide.md"]
+
+
+@pytest.mark.parametrize("section", ["howto", "concepts", "benchmarks"])
+def test_the_index_of_a_section_links_all_of_its_pages(section):
+    folder = ROOT / "docs" / section
+    index = (folder / "index.md").read_text("utf-8")
+    pages = {page.name for page in folder.glob("*.md")} - {"index.md"}
+    assert not [name for name in sorted(pages) if f"]({name}" not in index]
+
+
+def test_no_wrapped_line_of_a_list_begins_like_another_entry():
+    entry, wrapped = re.compile(r"(\s*)(\d+\.|[-*+]) "), []
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        number = 0  # of the last entry of the current list
+        for line in page.read_text("utf-8").splitlines():
+            found = entry.match(line)
+            if found is None:
+                number = number if line.strip() else 0
+            elif found[2][0].isdigit():
+                # A number at the start of a wrapped line becomes an entry of its own.
+                if number and int(found[2][:-1]) != number + 1:
+                    wrapped.append(f"{page.name}: {line}")
+                number = int(found[2][:-1])
+    assert not wrapped
 
 
 @builder
