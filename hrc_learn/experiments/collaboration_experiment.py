@@ -121,7 +121,7 @@ class CollaborationExperiment(CollaborationScenario):
     ) -> Sequence[Section]:
         """Report sections: timeline, grasping, person, worker, motion, missing null space."""
         notes = [
-            f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
+            f"At {note.time:.1f} s ({pick.item.name}), {note.mishap}: {note.what}."
             for pick in run.picks
             for note in pick.recoveries
         ]

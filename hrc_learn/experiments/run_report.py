@@ -185,7 +185,7 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
             title="Path of the gripper's marker (dot: first seen, cross: target)",
         )
         if image.get_legend_handles_labels()[0]:  # none if the marker was never seen
-            image.legend(loc="upper right", frameon=True, framealpha=0.75, edgecolor="none")
+            image.legend(loc="upper right")
         hidden = _out_of_sight(run)
         for first, last in active_intervals(hidden):
             error.axvspan(run.time[first], run.time[last], color=_HIDDEN, alpha=0.25, lw=0)

@@ -195,7 +195,7 @@ def fit_report(
     motions = [JointCurves("demonstration", time, demo, *DEMO_LOOK) for time, demo, _ in shown]
     motions += [JointCurves("reproduction", time, made) for time, _, made in shown]
     joints = joint_grid_figure(fit.names, motions, fit.limits, fit.unit)
-    caption = "The first four demonstrations and their reproductions."
+    caption = f"The first {len(shown)} of {len(fit.time)} demonstrations, with reproductions."
     figures = [Picture("position" if fit.unit == "m" else "joints", joints, caption)]
     return Report(
         title=fit.title,

@@ -75,7 +75,7 @@ def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
     """Show the surroundings of some points, with the same scale on every axis."""
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(tuple(high - low))  # pyright: ignore[reportArgumentType]
+    axes.set_box_aspect(tuple(high - low), zoom=0.77)  # pyright: ignore[reportArgumentType]
 
 
 def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
@@ -177,7 +177,8 @@ def stack_panels(figure: Figure) -> None:
         axes.tick_params(labelbottom=True)
         axes.set_title(fill(axes.get_title("left"), _TITLE), loc="left", fontsize=8)
         if (legend := axes.get_legend()) is not None:
-            axes.legend(**_narrow(legend), loc="upper left", bbox_to_anchor=(0, -0.2))
+            below = 0.0 if axes.name == "3d" else -0.2  # a 3D view leaves its corners free
+            axes.legend(**_narrow(legend), loc="upper left", bbox_to_anchor=(0, below))
     for legend in [*figure.legends]:
         legend.remove()
         figure.legend(**_narrow(legend), loc="outside upper center")

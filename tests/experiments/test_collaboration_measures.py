@@ -434,7 +434,7 @@ def test_a_report_explains_a_missing_null_space(monkeypatch, robot, words):
     sections = experiment().sections(run, {"run": "recording"})
     kind, (recording, spans, notes) = sections[0]
     assert (kind, recording, spans) == ("sections", "recording", {"a": (1.0, 2.0)})
-    assert notes == ["12.3 s, a: missed grasp: tried again."]
+    assert notes == ["At 12.3 s (a), missed grasp: tried again."]
     assert len(sections) == 1 + bool(words)
     if words:
         section: Any = sections[1]

@@ -167,6 +167,27 @@ def test_panels_of_a_phone_stand_above_one_another_at_their_height():
     assert figure.axes[1].get_legend() is None
 
 
+def test_title_labels_and_legend_of_a_view_in_space_fit_a_phone():
+    figure = Figure(figsize=(7.2, 5.2), layout="constrained")
+    axes = space(figure)
+    axes.plot([0, 0.1, -0.5], [-0.7, 0.1, 0.7], [-0.1, 0.3, 0.5], label="demonstration")
+    axes.plot([0, 0.2], [0, 0.1], [0, 0.1], label="path: box")
+    axes.plot([0, 0.2], [0, 0.3], [0, 0.1], label="carried: box")
+    axes.legend(loc="upper right")
+    axes.set_title("Paths of the tool centre point (square: release)", loc="left")
+    frame_space(axes, np.array([[0.05, -0.6, 0.0], [0.6, 0.6, 0.48]]))
+    figure.draw_without_rendering()
+    stack_panels(figure)
+    figure.draw_without_rendering()
+    texts = [axis.label for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+    _, _, width, height = figure.bbox.bounds
+    for drawn in (*texts, axes._left_title, axes.get_legend()):
+        extent = drawn.get_window_extent()
+        assert 0 <= extent.x0 < extent.x1 <= width, drawn
+        assert 0 <= extent.y0 < extent.y1 <= height, drawn
+        assert extent.height > 1
+
+
 def test_views_in_space_keep_their_proportions_on_a_phone():
     figure = Figure(figsize=(7.2, 4.0))
     space(figure)
