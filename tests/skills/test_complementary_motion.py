@@ -14,7 +14,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.skills import ComplementaryMotion, complementary_motion, joint_line
 
-pytestmark = [pytest.mark.simulation, pytest.mark.long]
+pytestmark = pytest.mark.simulation
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
@@ -101,6 +101,7 @@ def test_what_nobody_pushes_is_handed_on_as_it_is():
     assert openings == widths.tolist()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("usual_steps")
 def test_elbow_goes_aside_and_back_while_the_hand_goes_on():
     wishes = line(seconds=3.0, still=5.5)
@@ -132,6 +133,7 @@ def test_the_share_followed_is_the_null_velocity_reached_over_the_one_asked(stre
     assert human.reasons()[-1] == ({"speed"} if strength > 1 else set())
 
 
+@pytest.mark.long
 def test_a_push_ends_where_limits_and_singularities_begin():
     """However long and hard: the hand stays, no joint passes its limit, and they come back."""
     wishes = np.repeat(panda.ready.numpy()[None], round(10.0 / DT), axis=0)
@@ -158,6 +160,7 @@ def test_the_null_space_stops_before_a_limit_that_would_move_the_hand(monkeypatc
     assert hand_off(postures, joints)[0] < 1e-6
 
 
+@pytest.mark.long
 def test_nobody_pushes_the_arm_into_what_is_around_it():
     """A wall across the way of the elbow: it slides along, and the hand goes on."""
     wishes = line(seconds=3.5, still=0.0)
@@ -186,12 +189,13 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
 
 @pytest.mark.usefixtures("usual_steps")
 def test_what_is_near_and_does_not_come_nearer_hinders_nobody():
-    human, wishes = Pusher(SIDEWAYS, 0.0, 1.0), panda.ready.numpy()[None].repeat(6, axis=0)
+    human, wishes = Pusher(SIDEWAYS, 0.0, 1.0), panda.ready.numpy()[None].repeat(3, axis=0)
     _, joints, _ = followed(wishes, human, clearance=lambda q: q.new_full(q.shape[:-1], 0.01))
     assert elbow(joints)[:, 1].diff().abs().min() > 1e-5
-    assert human.reasons() == [set()] * 6
+    assert human.reasons() == [set()] * 3
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("usual_steps")
 def test_where_an_arm_aside_cannot_go_on_it_waits_and_then_does_everything_that_was_asked():
     wishes, blocked = line(seconds=3.0, still=4.5), {}
@@ -237,6 +241,7 @@ def test_beginning_anew_forgets_the_push():
     assert not motion.waits
 
 
+@pytest.mark.long
 def test_paths_beside_the_policys_own_keep_the_limits():
     """A random one, on which the task alone, or a stop, would lead joints aside beyond them."""
     rng = np.random.default_rng(10)
@@ -253,6 +258,7 @@ def test_paths_beside_the_policys_own_keep_the_limits():
     assert hand_off(postures, joints)[0] < 1e-6
 
 
+@pytest.mark.long
 def test_joints_far_aside_hold_the_policy_until_they_are_nearer():
     """Where the end effector rests the null space leads back as it led aside."""
     wishes = line(seconds=3.0, still=5.5)
@@ -265,6 +271,7 @@ def test_joints_far_aside_hold_the_policy_until_they_are_nearer():
     np.testing.assert_allclose(joints[-1], wishes[-1], atol=1e-3)
 
 
+@pytest.mark.long
 def test_a_push_far_aside_is_balanced_by_the_return_and_its_fraction_reported():
     posture = np.array([0.59, -0.25, -0.05, -2.05, 0.0, 1.61, 1.13])
     human = Pusher(2 * SIDEWAYS, 0.2, 1e9)
@@ -277,6 +284,7 @@ def test_a_push_far_aside_is_balanced_by_the_return_and_its_fraction_reported():
     assert "task_waits" in kept
 
 
+@pytest.mark.long
 def test_joints_that_stay_aside_are_not_led_back_however_far_they_are():
     config = YieldingConfig(after_push="stay")
     wishes = line(seconds=3.0, still=0.5)

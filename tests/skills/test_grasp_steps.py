@@ -13,7 +13,13 @@ from unchecked import shapes_unchecked
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, gripper_down, panda
 from hrc_learn.skills import grasping
-from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspJob, _reachable_probe
+from hrc_learn.skills.grasping import (
+    Grasping,
+    GraspingConfig,
+    GraspJob,
+    UndetectedObjectError,
+    _reachable_probe,
+)
 from hrc_learn.skills.placing import BlockedPathError, Plan, check_plan
 from hrc_learn.skills.work_cell import MissedGraspError
 
@@ -376,3 +382,115 @@ def test_a_plan_may_end_at_a_joint_limit_but_not_beyond(beyond):
                 check_plan(plan, world, None)
         else:
             check_plan(plan, world, None)
+
+
+class Look:
+    """A clock, and a camera that sees an object from one time on, or never."""
+
+    def __init__(self, cell, seen_from):
+        self._cell, self.seen_from, self.looks = cell, seen_from, []
+        cell.wait_for_detection, cell.hold_pose = self.detect, self.hold
+
+    def detect(self):
+        self.looks.append(self._cell.time)
+        seen = {4: "another"}
+        if self._cell.time >= self.seen_from - 1e-9:
+            seen[11] = SimpleNamespace(pixel=np.array([640.0, 500.0]), angle=0.3)
+        return SimpleNamespace(features=seen)
+
+    def hold(self, duration):
+        self._cell.time += duration
+
+
+BOX: Any = SimpleNamespace(name="box", marker=SimpleNamespace(id=11))
+
+
+@pytest.mark.parametrize(("seen_from", "looks"), [(0.0, 1), (0.06, 3), (9.0, 5)])
+def test_an_object_is_looked_for_until_the_timeout_at_the_rate_of_images(
+    made, seen_from, looks
+):
+    """An image every third step of 10 ms; the last one is taken at the timeout itself."""
+    made._config = GraspingConfig(detection_timeout=0.12)
+    look = Look(made._cell, seen_from)
+    found = made._detect(BOX)
+    assert (found is None) == (seen_from > 1.0)
+    np.testing.assert_allclose(look.looks, 0.03 * np.arange(looks), atol=1e-9)
+    assert made._cell.did == ["detect"]
+
+
+@pytest.fixture
+def looking(made):
+    """A grasp that locates an object; the arm is 1 rad away from home."""
+    made._config = GraspingConfig(detection_timeout=0.06)
+    made._visual, made._cell.config.after_push = "visual target", "return"
+    made._workplace.hover_turns = (-0.5, 0.5)
+    made._posture = lambda: POSTURES[0]
+    made.homeward = []
+    made.go_home = lambda: made.homeward.append(made._cell.time)
+    return made
+
+
+@pytest.mark.parametrize(("after_push", "rests"), [("return", True), ("stay", False)])
+def test_a_located_object_is_the_target_and_the_arm_stays_where_it_is(
+    looking, after_push, rests
+):
+    looking._cell.config.after_push = after_push
+    Look(looking._cell, 0.0)
+    target = looking.locate(BOX)
+    np.testing.assert_array_equal(target.item, [640.0, 500.0])
+    assert (target.angle, target.visual, target.turn_range) == (
+        0.3,
+        "visual target",
+        (-0.5, 0.5),
+    )
+    assert target.posture is POSTURES[0]
+    assert target.rest is (POSTURES[0] if rests else None)
+    assert looking.homeward == []
+
+
+@pytest.mark.parametrize(("away", "goes"), [(0.04, False), (-0.06, True), (0.06, True)])
+def test_an_arm_that_may_hide_the_object_goes_home_and_looks_again(looking, away, goes):
+    """One joint, in either direction; an arm at home hides nothing."""
+    joints = HOME.clone()
+    joints[3] += away
+    looking._cell.joints = joints
+    look = Look(looking._cell, 99.0)
+    looking.go_home = lambda: (
+        looking.homeward.append(looking._cell.time),
+        setattr(look, "seen_from", 0.0),
+    )
+    if goes:
+        assert looking.locate(BOX).angle == 0.3
+    else:
+        with pytest.raises(UndetectedObjectError, match="does not see marker 11 of 'box'"):
+            looking.locate(BOX)
+    assert len(looking.homeward) == goes
+    assert looking._cell.did == ["detect"] * (1 + goes)
+
+
+def test_an_object_out_of_view_is_named_with_what_to_do(looking):
+    Look(looking._cell, 99.0)
+    with pytest.raises(UndetectedObjectError, match=r"Move the object into the camera's view"):
+        looking.locate(BOX)
+    assert len(looking.homeward) == 1
+
+
+@pytest.mark.parametrize(("occluded", "noted"), [(0.25, []), (0.35, ["marker occluded"])])
+def test_an_occlusion_of_more_than_a_few_images_is_noted(made, monkeypatch, occluded, noted):
+    asked = []
+    monkeypatch.setattr(
+        grasping,
+        "longest_occlusion",
+        lambda log, pose, start, chain: asked.append(start) or occluded,
+    )
+    made._workplace.tool_marker = 7
+    made._cell.log = made._cell.chain = None
+    made._cell.time = 2.5
+    made.servo.servo_to = lambda target: 1.75
+    job = GraspJob(item=BOX)
+    made._servo(job, "target")
+    assert job.servo_time == 1.75
+    assert [note.mishap for note in job.recoveries] == noted
+    assert made._cell.tracked_markers == (7,)
+    assert made._cell.did == ["servo"]
+    assert asked == [2.5]

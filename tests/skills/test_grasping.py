@@ -47,7 +47,7 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.visual_target import VisualTarget
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 
-pytestmark = [pytest.mark.simulation, pytest.mark.long]
+pytestmark = pytest.mark.simulation
 
 WORKPLACE = Workplace()
 
@@ -89,6 +89,7 @@ def grasped(skill, scene):
     )
 
 
+@pytest.mark.long
 def test_the_object_is_held_though_the_camera_was_turned(grasp):
     assert succeeded(grasp)
     assert grasp.world.holds("box")
@@ -105,6 +106,7 @@ def succeeded(run):
     return not run.failure and not evaluate(grasping_metrics(), run).faults
 
 
+@pytest.mark.long
 def test_the_image_jacobian_is_wrong_at_first_and_right_at_the_descent(grasp):
     _, last = jacobian_errors(grasp)
     assert last < 0.02
@@ -113,6 +115,7 @@ def test_the_image_jacobian_is_wrong_at_first_and_right_at_the_descent(grasp):
     assert np.linalg.norm(known[0] - known[-1]) > 0.5 * np.linalg.norm(known[-1])
 
 
+@pytest.mark.long
 def test_feedback_goes_from_joint_space_to_the_image(grasp):
     log = grasp.cell.log
     first, last = np.flatnonzero(np.isfinite(log["target"]).all(axis=1))[[0, -1]]
@@ -121,6 +124,7 @@ def test_feedback_goes_from_joint_space_to_the_image(grasp):
     assert log["potential"][last] < 1e-2
 
 
+@pytest.mark.long
 def test_the_recording_tells_how_the_estimate_came_to_the_truth(grasp):
     run = GraspingExperiment(aiming=Path()).recordings(grasp)["run"]
     assert run.camera is not None
@@ -134,6 +138,7 @@ def test_the_recording_tells_how_the_estimate_came_to_the_truth(grasp):
     assert np.isfinite(run.potential_rate[known]).all()
 
 
+@pytest.mark.long
 def test_a_scene_is_remote_unhurt_and_seen():
     config = GraspingSceneConfig(random_camera=True)
     scene = GraspingScene.draw(WORKPLACE, config, np.random.default_rng(4))
@@ -150,6 +155,7 @@ def test_a_scene_is_remote_unhurt_and_seen():
     assert 0 < tilt < 0.25
 
 
+@pytest.mark.long
 def test_a_camera_that_never_sees_the_object_is_named():
     scene = WORKPLACE.scene
     pose = scene.camera.pose @ np.diag([1.0, -1, -1, 1])  # upwards
@@ -160,6 +166,7 @@ def test_a_camera_that_never_sees_the_object_is_named():
         )
 
 
+@pytest.mark.long
 def test_a_roll_turns_the_image_about_its_middle(grasp):
     camera, shown = grasp.scene.workplace.scene.camera, WORKPLACE.scene.camera
     point = WORKPLACE.hover().position.numpy()

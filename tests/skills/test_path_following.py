@@ -15,7 +15,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.skills import TaskFailedError, WorkCellConfig, joint_line
 
-pytestmark = [pytest.mark.simulation, pytest.mark.long]
+pytestmark = pytest.mark.simulation
 
 DT = 0.02
 """Step of the long simulations [s]: twice the usual one halves their cost."""
@@ -27,6 +27,7 @@ def cell():
     return cell_with(ObedientArm(panda.ready.numpy()))
 
 
+@pytest.mark.long
 def test_the_joints_move_along_a_path_as_fast_as_it_runs(cell):
     far = torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3, -0.3], dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
@@ -92,6 +93,7 @@ def hand_off(cell):
     return float((hand.position - planned.position).norm(dim=-1).max()), float(turn.max())
 
 
+@pytest.mark.long
 def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_goes_on():
     path = transfer()
     free, pushed = along_transfer(0.0), along_transfer(1.0)
@@ -115,6 +117,7 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
     assert speed < np.abs(free.log["joint_velocity"]).max() + 0.4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("straight", "after_push", "share", "farther"),
     [
@@ -152,6 +155,7 @@ def test_nobody_pushes_joints_so_far_that_they_do_not_find_back(
     assert cell.log["followed"][50] == pytest.approx(share, abs=0.1)
 
 
+@pytest.mark.long
 def test_who_pushes_is_told_that_a_path_which_waits_leads_the_joints_back():
     null = np.linalg.svd(panda.jacobian(panda.ready).numpy())[2][-1]
 
@@ -172,6 +176,7 @@ def test_who_pushes_is_told_that_a_path_which_waits_leads_the_joints_back():
     assert hindered(cell, "too_far")[-1]
 
 
+@pytest.mark.long
 def test_a_path_that_waits_is_not_gone_back_while_the_joints_come_nearer():
     """However slowly: here for longer than it takes to give up."""
     path = transfer()
@@ -188,11 +193,13 @@ def test_a_path_that_waits_is_not_gone_back_while_the_joints_come_nearer():
     assert off[1:][released & ~rests][0] < 1.45
 
 
+@pytest.mark.long
 def test_who_holds_the_arm_aside_for_ever_is_not_waited_for_so_long():
     with pytest.raises(TaskFailedError, match="held aside"):
         pushed_along(transfer(), PUSH, (0.3, 60.0), longest_wait=1.0)
 
 
+@pytest.mark.long
 def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
     class Stuck(ObedientArm):
         def advance(self, duration):
@@ -207,6 +214,7 @@ def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
     assert len(cell.log) == len(path)
 
 
+@pytest.mark.long
 def test_joints_stay_beside_the_path_if_wanted():
     path = transfer()
     cell = pushed_along(path, PUSH, (0.5, 2.5), after_push="stay")
@@ -215,6 +223,7 @@ def test_joints_stay_beside_the_path_if_wanted():
     assert len(cell.log) == len(path)
 
 
+@pytest.mark.long
 def test_nobody_pushes_the_arm_into_what_is_around_it():
     """A wall where the elbow would be pushed to; the hand goes on all the same."""
     path = transfer()
@@ -243,6 +252,7 @@ def along_a_singularity():
     return path.numpy(), int(smallest.argmin())
 
 
+@pytest.mark.long
 def test_a_path_waits_before_its_singularity_while_a_person_holds_the_elbow_aside():
     path, narrow = along_a_singularity()
     cell = pushed_along(path, 0.5 * PUSH, (0.2, 3.0))
@@ -263,12 +273,14 @@ def test_a_path_waits_before_its_singularity_while_a_person_holds_the_elbow_asid
     assert time[-1] > 3.0 + len(path) * DT / 4
 
 
+@pytest.mark.long
 def test_joints_that_stay_beside_a_path_come_back_to_it_before_its_singularity():
     path, _ = along_a_singularity()
     cell = pushed_along(path, 0.5 * PUSH, (0.2, 1.0), after_push="stay")
     np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
 
 
+@pytest.mark.long
 def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
     path, narrow = along_a_singularity()
     begin = DT * narrow
@@ -282,6 +294,7 @@ def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
     assert (cell.log["followed"][pushed] == 0).all()
 
 
+@pytest.mark.long
 def test_the_path_waits_where_the_arm_aside_would_meet_something():
     """A wall across the way of the elbow that is pushed aside, but not of the planned one."""
     path = transfer()

@@ -19,7 +19,7 @@ from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_li
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation import ScriptedPerturbation
 
-pytestmark = [pytest.mark.simulation, pytest.mark.long]
+pytestmark = pytest.mark.simulation
 
 ARM = whole_arm(Workplace().scene.arm)
 SEPARATION = SeparationConfig(reaction_time=0.03, clearance=0.08)
@@ -103,6 +103,7 @@ def beside(tracker, **config):
 IN_THE_WAY = sideways(0.35).position.numpy()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("move", [follow, straight])
 def test_the_arm_waits_before_who_stands_in_its_way_and_goes_on_when_they_have_left(move):
     free = beside(Visitor(IN_THE_WAY, 0.0, 0.0))
@@ -154,6 +155,7 @@ class Follower(Visitor):
         return replace(super().read(), velocity=velocity)
 
 
+@pytest.mark.long
 def test_an_arm_that_moves_away_rests_by_the_time_that_somebody_catches_up_with_it():
     visitor = Follower(sideways(-1.3).position.numpy(), 0.0, 1.3)
     cell = beside(visitor)
@@ -169,6 +171,7 @@ def test_an_arm_that_moves_away_rests_by_the_time_that_somebody_catches_up_with_
     assert cell.log["pace"][apart < 0.2].max() < 0.9
 
 
+@pytest.mark.long
 def test_a_task_is_given_up_when_nobody_frees_the_way():
     cell = beside(Visitor(IN_THE_WAY, 0.0, 99.0), longest_wait=0.5)
     with pytest.raises(TaskFailedError, match="in the way"):
@@ -176,6 +179,7 @@ def test_a_task_is_given_up_when_nobody_frees_the_way():
     assert 1.0 < cell.time < 5.0
 
 
+@pytest.mark.long
 def test_limits_of_the_arm_itself_are_not_waited_for():
     """Out of reach, where lines lead past what the joints can do."""
     cell = beside(Visitor(IN_THE_WAY, 0.0, 0.0))
@@ -193,6 +197,7 @@ def test_an_arm_that_does_not_know_where_people_are_rests():
     assert cell.task_time < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("mode", "moves"), [("expert", False), ("both", True)])
 def test_the_null_space_makes_way_by_itself_if_it_is_told_to(mode, moves):
     """Of somebody who stands beside the forearm, while the end effector is held."""
