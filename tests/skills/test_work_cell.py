@@ -1,6 +1,8 @@
 """The control loop of a work cell, on an arm that does as it is told."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,11 +10,18 @@ import torch
 from obedient_arm import ObedientArm, cell_with, hindered
 from unchecked import shapes_unchecked
 
+from hrc_learn.controller.arm_loop_state import MoveJoints
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills import (
+    StoppedByPersonError,
+    TaskFailedError,
+    WorkCell,
+    WorkCellConfig,
+    joint_line,
+)
 from hrc_learn.skills.marker_sensor import SeenFeature
 
 pytestmark = pytest.mark.simulation
@@ -358,3 +367,127 @@ def test_a_straight_line_slows_down_for_an_arm_that_falls_behind():
     assert cell.time > 1.4 + 0.5
     assert planned.diff().min() > -1e-9
     torch.testing.assert_close(hand[-1], lowered(0.15).position, rtol=0, atol=2e-3)
+
+
+class Stops(Human):
+    """Asks to stop from one time on; between 0.1 s and 0.1 s before that, also pushes."""
+
+    def __init__(self, at, push=0.0):
+        self.at, self._push = at, push
+
+    def read(self, state):
+        pushes = 0.1 <= state.time < self.at - 0.1
+        return HumanInput(
+            nullspace_input=self._push * self_motion(panda.ready) * pushes,
+            stop="enough" if state.time >= self.at - 1e-9 else "",
+        )
+
+
+def test_an_arm_that_a_person_stops_brakes_to_rest_within_its_acceleration():
+    cell = cell_with(ObedientArm(panda.ready.numpy()), Stops(0.3))
+    speed = torch.zeros(7).double()
+    speed[0] = 0.5
+    with pytest.raises(StoppedByPersonError, match=r"^stopped: enough$"):
+        turn(cell, speed)
+    arm, dt = cell._arm, cell.config.dt
+    assert not arm.velocity.any()
+    commanded = cell.log["command_velocity"][:, 0]
+    stop = round(0.3 / dt)
+    moving = int((np.abs(commanded) > 1e-6).sum())
+    slower = -np.diff(commanded[stop - 1 : moving])
+    assert (slower > 0).all()
+    assert slower.max() <= float(panda.limits.acceleration[0]) * dt * (1 + 1e-9)
+    assert len(commanded) - stop < 0.5 / dt
+    # The task did not end by itself: the request alone raised.
+    assert commanded[:stop].max() == pytest.approx(0.5, rel=1e-6)
+
+
+def turn(cell, speed):
+    while cell.time < 9.0:
+        cell.step(speed)
+
+
+def test_an_arm_that_does_not_come_to_rest_is_given_up_after_a_second(monkeypatch):
+    """Its filter would brake for longer."""
+    config = WorkCellConfig(dt=0.02)
+    cell = cell_with(ObedientArm(panda.ready.numpy()), Stops(0.06), config=config)
+    monkeypatch.setattr(
+        type(cell), "step", lambda self, velocity: self._act(MoveJoints(joint_velocity=TURNING))
+    )
+    with pytest.raises(StoppedByPersonError):
+        cell.hold_pose(0.1)
+    assert cell.time == pytest.approx(0.06 + 1.0, abs=2.5 * cell.config.dt)
+
+
+TURNING = torch.full((7,), 0.01, dtype=torch.float64)
+
+
+def test_detection_is_awaited_on_an_arm_that_holds_its_pose(cell):
+    """Images of the past do not count, however many arrive."""
+    arm = cell._arm
+    cell._markers._sensor = SlowCamera(arm)
+    turning = torch.zeros(7).double()
+    turning[0] = 0.2
+    for _ in range(30):
+        cell.step(turning)
+    begun, steps = cell.time, len(cell.log)
+    observed = cell.wait_for_detection()
+    assert begun <= observed.time <= cell.time
+    assert observed is cell.observation
+    # At most 70 ms until an image is taken, 50 ms until it arrives, two steps between looks.
+    assert 0.05 <= cell.time - begun <= 0.07 + 0.05 + 0.05
+    waited = len(cell.log) - steps
+    assert waited % cell.config.detect_every == 0
+    assert np.abs(cell.log["command_velocity"][-1]).max() < 0.05
+
+
+def test_joints_pushed_aside_return_after_the_end_of_a_path_unless_they_are_to_stay():
+    """The path lasts 0.5 s; a person pushes during its first half."""
+    goal = panda.ready.clone()
+    goal[0] += 0.2
+    path = joint_line(panda.ready, goal, speed=1.875 * 0.2 / 0.5, dt=0.02).numpy()
+    off, steps = {}, {}
+    for after in ("return", "stay"):
+        config = WorkCellConfig(dt=0.02, after_push=after)
+        person = Stops(0.35, push=6.0)
+        person.read = pushing_only(person.read)
+        cell = cell_with(ObedientArm(path[0]), person, config=config)
+        assert cell.follow_path(path) == len(path)
+        assert cell.plan is None
+        off[after] = float(np.abs(cell.joints.numpy() - path[-1]).max())
+        steps[after] = len(cell.log)
+    assert 3 * off["return"] < off["stay"]
+    assert len(path) <= steps["stay"] < steps["return"] < len(path) + 5.0 / 0.02
+
+
+def pushing_only(read):
+    """The same person, who does not stop the arm."""
+    return lambda state: replace(read(state), stop="")
+
+
+def test_a_return_that_does_not_succeed_ends_after_five_seconds(monkeypatch):
+    path = np.repeat(panda.ready.numpy()[None], 2, axis=0)
+    cell = cell_with(ObedientArm(path[0]), config=WorkCellConfig(dt=0.1))
+    observe = cell._loop.observe
+
+    def never_back(state, reading):
+        state, limitations = observe(state, reading)
+        return replace(state, aside=torch.tensor(True)), limitations
+
+    monkeypatch.setattr(cell._loop, "observe", never_back)
+    assert cell.follow_path(path) == 2
+    assert 5.0 <= cell.time <= 5.0 + 4 * cell.config.dt
+
+
+def test_distances_are_those_of_the_people_who_are_tracked(cell):
+    assert cell.distances is None
+    people: Any = SimpleNamespace(distances="distances")
+    with shapes_unchecked():
+        cell._reading = replace(cell._reading, people=people)
+    assert cell.distances == "distances"
+
+
+def test_an_image_that_is_taken_at_once_needs_no_waiting(cell):
+    cell._markers._sensor = CountingSensor()
+    assert cell.wait_for_detection().time == cell.time
+    assert len(cell.log) == 0
