@@ -179,3 +179,35 @@ def test_the_object_is_held_out_for_25_s(waiting):
     shown, end = person.hand_over, person.hand_over.visit.end
     at = until(world, person, lambda: person.hand_over is not shown)
     assert 25.0 < at - end < 25.1
+
+
+@shapes_unchecked()
+def test_movements_of_one_visit_are_those_of_its_person_in_the_trackers_images():
+    """An ideal tracker sees where the hand is: the plan itself is the oracle."""
+    rng, home = np.random.default_rng(3), waiting_pose(WORKPLACE).position.numpy()
+    worker = Worker(WorkerConfig.draw(rng))
+    plan = random_hand_over(
+        worker, rng, bench=WORKPLACE.scene.table, thickness=ITEM.half_size[2]
+    )
+    found = _movements(plan, home, Imperfections.ideal(), np.random.default_rng(0))
+    kinds = [reach.kind for reach in plan.reaches]
+    assert [kind for *_, kind in found] == kinds
+    for (time, hand, robot, kind), reach in zip(found, plan.reaches, strict=True):
+        assert time[0] == 0.0
+        assert len(time) == len(hand) == len(robot) >= 8
+        steps = np.diff(time) * surroundings.IMAGE_RATE
+        np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+        assert steps.min() > 0.5
+        # The samples end before the hand arrives, by less than the fastest part of a second.
+        assert time[-1] <= reach.end - reach.begin + 0.5
+        met = plan.place if kind == HAND_OVER else home
+        np.testing.assert_allclose(robot[0], home, atol=1e-9)
+        np.testing.assert_allclose(robot[-1], met, atol=1e-9)
+        # Half of a minimum jerk motion is done after half of its time, one side mirrors the
+        # other (Flash and Hogan 1985).
+        along = np.interp(time[-1] * np.array([0.25, 0.5, 0.75]), time, robot @ (met - home))
+        along = (along - home @ (met - home)) / max((met - home) @ (met - home), 1e-12)
+        if kind == HAND_OVER:
+            assert along[1] == pytest.approx(0.5, abs=0.02)
+            assert along[0] + along[2] == pytest.approx(1.0, abs=0.02)
+            assert along[0] == pytest.approx(0.1035, abs=0.02)

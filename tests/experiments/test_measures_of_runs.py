@@ -2,11 +2,14 @@
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
+from hrc_learn.experiments import surroundings
 from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
 from hrc_learn.experiments.grasping_experiment import (
     ROTATION_SCALE,
@@ -15,10 +18,11 @@ from hrc_learn.experiments.grasping_experiment import (
 )
 from hrc_learn.experiments.surroundings import points_to_see, unmarked_for, workplace_for
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian.perspective import MARKER
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.sim import World
 from hrc_learn.sim.hand_over import Reach
-from hrc_learn.sim.scene import overhead_camera
+from hrc_learn.sim.scene import UnmarkedLook, overhead_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.receiving import Receipt
 
@@ -217,3 +221,25 @@ def test_what_a_scene_cannot_be_is_said():
     skill = SimpleNamespace(jacobian=SimpleNamespace(camera=None), landmarks=None)
     with pytest.raises(ValueError, match="--markerless needs a model that was learned without"):
         unmarked_for(Workplace(), skill, None, 0)
+
+
+def test_a_run_without_markers_has_another_look_than_the_demonstrations(monkeypatch):
+    """Demonstrations use the seeds from 0 on; a run uses none of these."""
+    seen = []
+    monkeypatch.setattr(
+        surroundings,
+        "unmarked",
+        lambda scene, look, point: seen.append((scene, look.seed, point)) or scene,
+    )
+    camera = torch.arange(13.0).double()
+    skill: Any = SimpleNamespace(jacobian=SimpleNamespace(camera=camera), landmarks="seen")
+    workplace = Workplace()
+    with shapes_unchecked():
+        for seed in (0, 7):
+            assert unmarked_for(workplace, skill, UnmarkedLook(), seed) == workplace
+    (scene, first, point), (_, second, _) = seen
+    assert scene is workplace.scene
+    assert second - first == 7
+    assert first >= 10_000
+    # The point of the tool that the camera model sees, at the end of its parameters.
+    np.testing.assert_array_equal(point, camera[MARKER].numpy())
