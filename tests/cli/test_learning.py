@@ -2,12 +2,15 @@
 
 import json
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 from commands import done
 from lerobot_folders import joint_path, write_folder
 
+from hrc_learn import distributed
+from hrc_learn.cli import fit_command
 from hrc_learn.cli.fit_command import open_moving
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.viz.report import read_report
@@ -98,6 +101,22 @@ def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):
     # A motion of half a metre, read as half a millimetre.
     figures = json.loads((tmp_path / "f.json").read_text())
     assert figures["position_largest_max"] < 1e-3
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_one_of_several_processes_prints_and_writes(poses, tmp_path, monkeypatch, rank):
+    """The others fit their part of the demonstrations in silence."""
+    demos, _ = open_moving(poses, ())
+    demos.notes = ("a guess",)
+    monkeypatch.setattr(fit_command, "_open", lambda args: (demos, ["one is left out"]))
+    monkeypatch.setattr(distributed, "processes", lambda: nullcontext(rank))
+    model = tmp_path / "model"
+    fit = ("fit", "--dataset", poses, "--n-basis", 10, "--several", "streamed")
+    output = done(*fit, "--channels", "position", "--out", model).output
+    notes = [line for line in output.splitlines() if line.startswith("note: ")]
+    assert notes == ([] if rank else ["note: one is left out", "note: a guess"])
+    assert model.exists() == (rank == 0)
+    assert ("Model" in output) == (rank == 0)
 
 
 def test_an_evaluation_on_what_was_learned_from_says_so(poses, tmp_path):

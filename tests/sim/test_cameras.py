@@ -7,6 +7,7 @@ import torch
 from sample_runs import sample_run
 
 from hrc_learn.geometry import Body, Box, Capsule, Pose
+from hrc_learn.geometry.shapes import Line
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     HAND_MARKER,
@@ -318,3 +319,27 @@ def test_a_board_is_held_ten_centimetres_before_a_marker_for_its_interval(world)
             np.testing.assert_allclose(board, marker + 0.1 * towards)
         else:
             np.testing.assert_allclose(board, NOWHERE)
+
+
+def test_lines_of_a_recording_are_arrows_or_rods_until_the_scene_is_full():
+    scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string("<mujoco/>"), maxgeom=2)
+    start, end, colour = (
+        np.array([0.1, 0.2, 0.3]),
+        np.array([0.1, 0.2, 0.9]),
+        (0.25, 0.5, 0.75, 1.0),
+    )
+    for head in (True, False, False):
+        cameras._add_line(
+            scene, Line(start=start, end=end, width=0.01, colour=colour, head=head)
+        )
+    assert scene.ngeom == 2
+    arrow, rod = scene.geoms[:2]
+    assert arrow.type == mujoco.mjtGeom.mjGEOM_ARROW
+    assert rod.type == mujoco.mjtGeom.mjGEOM_CAPSULE
+    for geom in (arrow, rod):
+        np.testing.assert_allclose(geom.rgba, colour)
+        np.testing.assert_allclose(geom.mat[:, 2], [0.0, 0.0, 1.0], atol=1e-6)
+        assert geom.size[0] == pytest.approx(0.01)
+    # An arrow begins at its place, a rod has its middle there.
+    np.testing.assert_allclose(arrow.pos, start, atol=1e-6)
+    np.testing.assert_allclose(rod.pos, (0.1, 0.2, 0.6), atol=1e-6)
