@@ -406,3 +406,132 @@ def test_it_gives_up_after_its_own_time_and_counts_no_time_of_people(
     hidden = "was not detected" in text
     assert raised.value.mishap == ("marker occluded" if hidden else "missed grasp")
     assert cell.time - begun == pytest.approx(passed, abs=0.05)
+
+
+def test_a_hold_keeps_the_camera_estimate_and_the_orientation_for_its_duration():
+    """New images improve the estimate, but do not move the target meanwhile."""
+    cell = Cell()
+    step, seen = IdealStep(cell, [0.001]), []
+    move = step.step
+
+    def noting(state, now, target):
+        seen.append((target.kept_camera, state.held, state.wanted_orientation))
+        return move(state, now, target)
+
+    step.step = noting
+    with shapes_unchecked():
+        servo = VisualServo(cell, step)
+        wanted = servo.state.goal_orientation
+        servo.hold(target_above(), 0.1)
+    assert cell.time == pytest.approx(0.1)
+    assert len(seen) == 5
+    for kept, held, orientation in seen:
+        torch.testing.assert_close(kept, CAMERA)
+        assert held.tolerance == CONFIG.marker_tolerance
+        torch.testing.assert_close(orientation, wanted)
+    assert servo.state.held is None
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+def test_the_orientation_is_the_aligned_one_turned_by_the_person(aligned):
+    cell = Cell()
+    with shapes_unchecked():
+        servo = VisualServo(cell, IdealStep(cell, [0.001]))
+    half = torch.tensor([np.cos(0.15), 0, 0, np.sin(0.15)])  # 0.3 rad about the vertical
+    drawn = replace(servo.state.drawn, turn=half)
+    wanted = about_vertical(0.5) if aligned else None
+    servo.state = replace(servo.state, drawn=drawn, wanted_orientation=wanted)
+    found = servo.orientation(about_vertical(-0.2))
+    expected = about_vertical((0.5 if aligned else -0.2) + 0.3)
+    assert abs(float(found @ expected)) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("out", [False, True])
+def test_a_marker_out_of_the_image_is_to_be_detected_again(out):
+    """The next step then raises the end effector no more, as before its first image."""
+    cell = Cell()
+    step, detected = IdealStep(cell, [0.001]), []
+    step.out_of_view = lambda state, time: out
+    move = step.step
+
+    def noting(state, now, target):
+        detected.append(state.detected)
+        return move(state, now, target)
+
+    step.step = noting
+    with shapes_unchecked():
+        servo = VisualServo(cell, step)
+        servo.state = replace(servo.state, detected=True, last_detection=0.0)
+        servo._step_within(target_above(), 0.0)
+    assert detected == [not out]
+
+
+def wanting(law, monkeypatch, *, uncertainty=0.0, angle=0.1, detected=True, known=True):
+    """State after an image in which the object has a direction, and the arguments used."""
+    asked = []
+
+    def turn(*given):
+        asked.append(given)
+        return 0.3
+
+    monkeypatch.setattr(law, "_angle", SimpleNamespace(turn=turn) if known else None)
+    monkeypatch.setattr(law, "uncertainty", lambda state, target: uncertainty)
+    state = replace(law.initial_state(panda.ready), detected=detected)
+    target = SimpleNamespace(
+        angle=angle, above=ABOVE, turn_range=(-1.0, 1.0), heading=lambda camera: 0.7
+    )
+    now = replace(reading(MIDDLE), pose=Pose(ABOVE.position, about_vertical(0.2)))
+    with shapes_unchecked():
+        return law._with_wanted_orientation(state, now, target), asked
+
+
+def test_the_end_effector_turns_as_demonstrated_towards_the_object(law, monkeypatch):
+    state, (asked,) = wanting(law, monkeypatch)
+    heading, reference, now, turns, _ = asked
+    assert (heading, turns) == (0.7, (-1.0, 1.0))
+    assert torch.equal(reference, ABOVE.orientation)
+    assert float(now) == pytest.approx(0.2, abs=1e-9)
+    assert state.chosen_turn == 0.3
+    same = abs(float(state.wanted_orientation @ about_vertical(0.3)))
+    assert same == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "turns"),
+    [
+        ({"uncertainty": 0.03}, True),  # within 3 cm the direction of the object is known
+        ({"uncertainty": 0.0301}, False),
+        ({"angle": None}, False),
+        ({"detected": False}, False),
+        ({"known": False}, False),
+    ],
+)
+def test_it_turns_only_if_camera_marker_and_demonstrations_show_where(
+    law, monkeypatch, given, turns
+):
+    state, asked = wanting(law, monkeypatch, **given)
+    assert (state.wanted_orientation is not None) == turns
+    assert len(asked) == turns
+
+
+def test_the_heading_of_an_object_is_that_of_an_edge_of_its_marker():
+    """Two points on the edge, projected by the simulator's own camera, give the direction."""
+    tool_offset = np.array([0.0, 0.0, 0.08])
+    visual = VisualTarget(offset=tool_offset, error=np.nan)
+    down = quaternion.rotate(ABOVE.orientation, torch.from_numpy(tool_offset)).numpy()
+    place = ABOVE.position.numpy() + down
+    # A camera from the side, in whose image angles are not those on the table.
+    eye, middle = np.array([0.6, 0.3, 0.5]), np.array([0.0, 0.1, 0.0])
+    camera = overhead_camera().look_at(place + eye, place + middle)
+    for heading in (-0.8, 0.3, 1.2):
+        along = np.array([np.cos(heading), np.sin(heading), 0.0])
+        first, second = (camera.project(place + s * 0.005 * along) for s in (-1, 1))
+        edge = second - first
+        target = target_above(
+            visual=visual,
+            item=(first + second) / 2,
+            angle=float(np.arctan2(edge[1], edge[0])),
+        )
+        found = target.heading(camera_vector(camera))
+        assert found == pytest.approx(heading, abs=1e-3)
+    assert target_above().heading(camera_vector(camera)) is None
