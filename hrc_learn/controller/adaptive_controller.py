@@ -208,10 +208,9 @@ class AdaptiveController(nn.Module):
             [config.linear_speed, config.angular_speed],
             [config.approach_linear_speed, config.approach_angular_speed],
         ]
-        self.register_buffer("caps", torch.tensor(caps, dtype=torch.float64))
-
-    caps: Tensor
-    """Linear and angular speed caps of the task and of a joint-space approach [m/s, rad/s]."""
+        self.caps = nn.Buffer(torch.tensor(caps, dtype=torch.float64))
+        """Caps on linear and angular speed of the task and of a joint-space approach, (2, 2)
+        [m/s, rad/s]."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True):
         # Regions are not modules, but have to change device and dtype with this module.

@@ -72,25 +72,6 @@ class LimitBarrier(nn.Module):
     values are constants, so they do not add computation to a step.
     """
 
-    velocity: Tensor
-    """v_max [rad/s]."""
-    acceleration: Tensor
-    """A [rad/s^2]."""
-    jerk: Tensor
-    """j [rad/s^3]."""
-    walls: Tensor
-    """Lower and upper limits less the margin, times the signs of `sides` (2, n) [rad]."""
-    sides: Tensor
-    """Signs of the lower and the upper limit, (2, 1)."""
-    knee: Tensor
-    """c [rad/s]."""
-    knee_square: Tensor
-    """c^2."""
-    twice_acceleration: Tensor
-    """2 A of Q [rad/s^2]."""
-    reserve: Tensor
-    """v_hat - v at a = 0, which is A^2/(2 j) [rad/s]."""
-
     def __init__(
         self,
         limits: MotionLimits,
@@ -119,21 +100,24 @@ class LimitBarrier(nn.Module):
             o, d = limits.velocity_offset + _TOLERANCE, limits.deceleration
             slowest, decay_time = slowest.minimum(d), decay_time.maximum(o / d)
             margins = margins.maximum((o + reserve) ** 2 / (2 * d))
-        knee = slowest * (decay_time + delay)
-        walls = torch.stack([-limits.lower - margins, limits.upper - margins])
-        constants = {
-            "velocity": limits.velocity.clone(),
-            "acceleration": A.clone(),
-            "jerk": j.clone(),
-            "walls": walls,
-            "sides": torch.tensor([[1.0], [-1.0]]).to(walls),
-            "knee": knee,
-            "knee_square": knee**2,
-            "twice_acceleration": 2 * slowest,
-            "reserve": reserve,
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value)
+        self.velocity = nn.Buffer(limits.velocity.clone())
+        """v_max [rad/s]."""
+        self.acceleration = nn.Buffer(A.clone())
+        """A [rad/s^2]."""
+        self.jerk = nn.Buffer(j.clone())
+        """j [rad/s^3]."""
+        self.walls = nn.Buffer(torch.stack([-limits.lower - margins, limits.upper - margins]))
+        """Lower and upper limits less the margin, times the signs of `sides` (2, n) [rad]."""
+        self.sides = nn.Buffer(torch.tensor([[1.0], [-1.0]]).to(self.walls))
+        """Signs of the lower and the upper limit, (2, 1)."""
+        self.knee = nn.Buffer(slowest * (decay_time + delay))
+        """c [rad/s]."""
+        self.knee_square = nn.Buffer(self.knee**2)
+        """c^2."""
+        self.twice_acceleration = nn.Buffer(2 * slowest)
+        """2 A of Q [rad/s^2]."""
+        self.reserve = nn.Buffer(reserve)
+        """v_hat - v at a = 0, which is A^2/(2 j) [rad/s]."""
 
     def usable(
         self, dt: float | Float[Tensor, "*#batch 1"]
@@ -295,19 +279,6 @@ class SpeedBarrier(nn.Module):
     they move by at most dt (x + A D). A step lasts up to (1 + jitter) dt.
     """
 
-    deceleration: Tensor
-    """A/kappa, deceleration of gentle braking [rad/s^2]."""
-    jerk: Tensor
-    """j [rad/s^3]."""
-    fade: Tensor
-    """tau, time in which the braking fades out at its end [s]."""
-    decay: Tensor
-    """Largest A/c of the joints [1/s]."""
-    distal: Tensor
-    """1 at (i, j) for j >= i, otherwise 0 (n, n)."""
-    slowing: Tensor
-    """A D, by which a joint may have been faster when its position was read [rad/s]."""
-
     def __init__(
         self, joints: LimitBarrier, cap: float, *, delay: float = 0.0, jitter: float = 0.0
     ):
@@ -325,16 +296,18 @@ class SpeedBarrier(nn.Module):
         gentle = min(cap, 1.0) * (2 * _RAMP * j * joints.velocity).sqrt()
         # A joint that may not move has a velocity limit of zero.
         deceleration = torch.minimum(A, gentle).clamp(min=1e-3 * A)
-        constants = {
-            "deceleration": deceleration,
-            "jerk": j.clone(),
-            "fade": (deceleration / j).amax() / 2,
-            "decay": (joints.twice_acceleration / (2 * joints.knee)).amax(),
-            "distal": torch.ones(len(A), len(A)).triu().to(A),
-            "slowing": A * delay,
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value)
+        self.deceleration = nn.Buffer(deceleration)
+        """A/kappa, deceleration of gentle braking [rad/s^2]."""
+        self.jerk = nn.Buffer(j.clone())
+        """j [rad/s^3]."""
+        self.fade = nn.Buffer((deceleration / j).amax() / 2)
+        """tau, time in which the braking fades out at its end [s]."""
+        self.decay = nn.Buffer((joints.twice_acceleration / (2 * joints.knee)).amax())
+        """Largest A/c of the joints [1/s]."""
+        self.distal = nn.Buffer(torch.ones(len(A), len(A)).triu().to(A))
+        """1 at (i, j) for j >= i, otherwise 0 (n, n)."""
+        self.slowing = nn.Buffer(A * delay)
+        """A D, by which a joint may have been faster when its position was read [rad/s]."""
 
     def braking_time(self, velocity: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 1"]:
         """T, the time constant of the braking motion at a velocity [s]."""

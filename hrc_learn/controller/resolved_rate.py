@@ -391,14 +391,12 @@ class BlendingState:
 class VisionBlending(nn.Module):
     """Level of vision feedback, from the measured feature."""
 
-    centre: Tensor
-    """Middle of the image [px]; pixels count from 0, so it is also the half size."""
-
     def __init__(self, config: BlendingConfig | None = None):
         super().__init__()
         self.config = config = config or BlendingConfig()
         size = torch.tensor(config.image_size, dtype=torch.float64)
-        self.register_buffer("centre", (size - 1) / 2)
+        self.centre = nn.Buffer((size - 1) / 2)
+        """Middle of the image [px]; pixels count from 0, so it is also the half size."""
 
     def initial_state(self, like: Float[Tensor, "*batch n"], points: int = 1) -> BlendingState:
         """State before the first image.

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import check_settings, everywhere, is_number
@@ -188,25 +188,20 @@ class CameraEstimator(ImageJacobianEstimator):
         )
         bias, scale = config.residual, component_scale(camera, config.rotation_scale)
         one = weight_covariance(network.centers, bias, bias / 2)
-        self.register_buffer("reference", camera, persistent=False)
-        self.register_buffer("precision", precision, persistent=False)
-        self.register_buffer("residual", torch.block_diag(*[one] * 6), persistent=False)
-        self.register_buffer("scale", scale, persistent=False)
+        self.reference = nn.Buffer(camera, persistent=False)
+        """Camera of the demonstrations, (13,)."""
+        self.precision = nn.Buffer(precision, persistent=False)
+        """Prior precision of optics and marker, zero for the rest, (13, 13)."""
+        self.residual = nn.Buffer(torch.block_diag(*[one] * 6), persistent=False)
+        """Prior covariance of the weights of one image row, (P, P)."""
+        self.scale = nn.Buffer(scale, persistent=False)
+        """Metres per unit of each component of a twist, (6,)."""
         rolls = camera.new_zeros(config.hypotheses, 6)
         rolls[:, 2] = -torch.arange(config.hypotheses) * (2 * math.pi / config.hypotheses)
-        self.register_buffer("rolls", rolls, persistent=False)
+        self.rolls = nn.Buffer(rolls, persistent=False)
+        """Initial rotations of the hypotheses about the optical axis, as twists, (hypotheses,
+        6)."""
         self.size = 6 * K
-
-    reference: Tensor
-    """Camera of the demonstrations, (13,)."""
-    precision: Tensor
-    """Prior precision of optics and marker, zero for the rest, (13, 13)."""
-    residual: Tensor
-    """Prior covariance of the weights of one image row, (P, P)."""
-    scale: Tensor
-    """Metres per unit of each component of a twist, (6,)."""
-    rolls: Tensor
-    """Initial rotations of the hypotheses about the optical axis, as twists (hypotheses, 6)."""
 
     def initial_state(self, *batch: int) -> CameraState:
         """State with the demonstrations' camera, rotated for each hypothesis, and no frames."""

@@ -218,12 +218,6 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
 
     config: Config
 
-    scale: Tensor
-    """Metres per unit of each component of a twist, (6,)."""
-
-    bound: Tensor
-    """Largest absolute value of each entry of the weights, (entries, 1)."""
-
     def __init__(self, network: RBFImageJacobian, config: Config):
         """Prepare the scales.
 
@@ -242,8 +236,10 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         self.config = config
         scale = component_scale(network.centers, config.rotation_scale)
         bound = config.weight_bound * scale.repeat(network.rows).unsqueeze(-1)
-        self.register_buffer("scale", scale, persistent=False)
-        self.register_buffer("bound", bound, persistent=False)
+        self.scale = nn.Buffer(scale, persistent=False)
+        """Metres per unit of each component of a twist, (6,)."""
+        self.bound = nn.Buffer(bound, persistent=False)
+        """Largest absolute value of each entry of the weights, (entries, 1)."""
 
     def initial_state(self, *batch: int) -> Any:
         """The network's weights and no key frame."""
@@ -503,11 +499,6 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
 
     constant = True
 
-    first_covariance: Tensor
-    """Initial covariance, (P, P)."""
-    walk: Tensor
-    """Covariance that the random walk adds per second, (P, P)."""
-
     def __init__(self, network: RBFImageJacobian, config: KalmanConfig | None = None):
         """Prepare the filter.
 
@@ -528,11 +519,13 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             scale = scale.repeat_interleave(len(network.centers))
             covariance = scale * covariance * scale[:, None]
         covariance = (covariance + covariance.mT) / 2  # exactly symmetric
-        self.register_buffer("first_covariance", covariance, persistent=False)
+        self.first_covariance = nn.Buffer(covariance, persistent=False)
+        """Initial covariance, (P, P)."""
         # All neurons drift equally; the six components drift independently.
         K = len(network.centers)
         walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
-        self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
+        self.walk = nn.Buffer(self.config.drift**2 * walk, persistent=False)
+        """Covariance that the random walk adds per second, (P, P)."""
 
     def initial_state(self, *batch: int) -> KalmanState:
         """The network's weights with their initial covariance, and no key frame."""

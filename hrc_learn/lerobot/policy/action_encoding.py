@@ -22,13 +22,6 @@ class ActionEncoding(nn.Module):
     orientation of a gripper that points down. The coordinates do not jump there.
     """
 
-    mean: Tensor
-    """Mean of each component, (A)."""
-    std: Tensor
-    """Spread of each component, (A)."""
-    reference: Tensor
-    """Unit quaternions (w, x, y, z), one for each rotation vector."""
-
     def __init__(self, width: int, triples: Sequence[Sequence[int]]):
         """Start with a mean of zero, a spread of one and references without rotation.
 
@@ -38,10 +31,13 @@ class ActionEncoding(nn.Module):
         """
         super().__init__()
         self.triples = [list(triple) for triple in triples]
-        self.register_buffer("mean", torch.zeros(width))
-        self.register_buffer("std", torch.ones(width))
+        self.mean = nn.Buffer(torch.zeros(width))
+        """Mean of each component, (A)."""
+        self.std = nn.Buffer(torch.ones(width))
+        """Spread of each component, (A)."""
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
-        self.register_buffer("reference", identity.repeat(len(self.triples), 1))
+        self.reference = nn.Buffer(identity.repeat(len(self.triples), 1))
+        """Unit quaternions (w, x, y, z), one for each rotation vector."""
 
     def to_coordinates(
         self, actions: Float[Tensor, "*batch T A"]

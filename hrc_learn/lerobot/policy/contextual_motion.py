@@ -47,13 +47,6 @@ class ContextualMotion(nn.Module):
     divided by the spring's stiffness, which makes them about as large as the motion.
     """
 
-    centre: Tensor
-    """Context at which the primitives are `base`."""
-    low: Tensor
-    """Lowest context; lower values are clamped."""
-    high: Tensor
-    """Highest context; higher values are clamped."""
-
     def __init__(
         self, response: Response, width: int, context: int, features: int, hidden: int
     ):
@@ -72,9 +65,12 @@ class ContextualMotion(nn.Module):
         count = response.basis.count + 3
         self.base = nn.Parameter(torch.zeros(width * count + 1))
         self.slopes = nn.Parameter(torch.zeros(context, width * count + 1))
-        self.register_buffer("centre", torch.zeros(context))
-        self.register_buffer("low", torch.full((context,), -torch.inf))
-        self.register_buffer("high", torch.full((context,), torch.inf))
+        self.centre = nn.Buffer(torch.zeros(context))
+        """Context at which the primitives are `base`."""
+        self.low = nn.Buffer(torch.full((context,), -torch.inf))
+        """Lowest context; lower values are clamped."""
+        self.high = nn.Buffer(torch.full((context,), torch.inf))
+        """Highest context; higher values are clamped."""
         last = nn.Linear(hidden, width * count + 1)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

@@ -16,7 +16,7 @@ from lerobot.processor import (
     make_default_pre_post_processors as make_motion_chunk_pre_post_processors,
 )
 from lerobot.utils.constants import ACTION, OBS_STATE
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hrc_learn.lerobot.policy.action_encoding import (
@@ -151,24 +151,20 @@ class MotionChunkPolicy(MotionPolicy):
     name = "motion_chunk"  # pyright: ignore[reportAssignmentType]
     config: MotionChunkConfig
 
-    error: Float[Tensor, ""]
-    """Root mean square distance of the nearest plan from the demonstrations, in spreads."""
-    levels: Float[Tensor, "2 A"]
-    """Smallest and largest value of each component of the action, whitened."""
-    velocity_spread: Float[Tensor, "F"]
-    """Root mean square velocity of the demonstrated states, whitened [1/s]; empty if velocities
-    are not used."""
-
     def _build(self, stats: Statistics | None) -> None:
         config = self.config
         widths, width = self.encoder.widths, len(self.encoding.mean)
         states = config.state_names if OBS_STATE in widths else None
         # Rotation vectors in the state are encoded like those of actions, so they do not jump.
         self.turning = ActionEncoding(widths.get(OBS_STATE, 0), rotation_triples(states))
-        self.register_buffer("error", torch.ones(()))
-        self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
+        self.error = nn.Buffer(torch.ones(()))
+        """Root mean square distance of the nearest plan from the demonstrations, in spreads."""
+        self.levels = nn.Buffer(torch.tensor([[-1.0], [1.0]]).repeat(1, width))
+        """Smallest and largest value of each component of the action, whitened, (2, A)."""
         moving = widths.get(OBS_STATE, 0) if config.history else 0
-        self.register_buffer("velocity_spread", torch.ones(moving))
+        self.velocity_spread = nn.Buffer(torch.ones(moving))
+        """Root mean square velocity of the demonstrated states, whitened, (F,) [1/s]; empty if
+        velocities are not used."""
         if stats is not None:
             self._find_levels(stats)
         config.two_level_actions = config.two_level_actions or []

@@ -40,13 +40,6 @@ class ChunkDecoder(nn.Module):
     lets it begin in a given state.
     """
 
-    maps: Float[Tensor, "4 samples M"]
-    """Linear map from coefficients to position, velocity, acceleration and jerk at each action.
-    The last sample lies one action period after the last action; it is the chunk's final state.
-    """
-    projection: Float[Tensor, "M samples"]
-    """Linear map from a demonstrated chunk to its coefficients."""
-
     def __init__(
         self,
         chunk_size: int,
@@ -80,10 +73,14 @@ class ChunkDecoder(nn.Module):
         maps = torch.stack([position, velocity, acceleration, jerk])
         # The maps follow from the settings, so they are not saved. They are in double
         # precision, as jerk spans many orders of magnitude.
-        self.register_buffer("maps", maps, persistent=False)
+        self.maps = nn.Buffer(maps, persistent=False)
+        """Linear map from coefficients to position, velocity, acceleration and jerk at each
+        action, (4, samples, M). The last sample lies one action period after the last action;
+        it is the chunk's final state."""
         normal = position.T @ position + NOISE**2 * unit
         projection = torch.linalg.solve(normal, position.T)
-        self.register_buffer("projection", projection, persistent=False)
+        self.projection = nn.Buffer(projection, persistent=False)
+        """Linear map from a demonstrated chunk to its coefficients, (M, samples)."""
 
     @property
     def size(self) -> int:
@@ -176,10 +173,6 @@ class ChunkNetwork(nn.Module):
     return motions that look alike.
     """
 
-    mean: Float[Tensor, "D M"]
-    spread: Float[Tensor, "D M"]
-    """Statistics of the coefficients of demonstrated chunks."""
-
     def __init__(
         self,
         *,
@@ -209,8 +202,9 @@ class ChunkNetwork(nn.Module):
         super().__init__()
         self.numbers, self.columns, self.n_plans = numbers, columns, n_plans
         self.samples, self.two_level = decoder.samples, two_level
-        self.register_buffer("mean", torch.zeros(columns, decoder.size))
-        self.register_buffer("spread", torch.ones(columns, decoder.size))
+        self.mean = nn.Buffer(torch.zeros(columns, decoder.size))
+        self.spread = nn.Buffer(torch.ones(columns, decoder.size))
+        """Statistics of the coefficients of demonstrated chunks, (D, M)."""
         self.linear = nn.Linear(numbers, columns * decoder.size)
         self.levels = nn.Linear(hidden, self.samples * two_level)
         self.into = nn.Linear(features + moving + 1, hidden)

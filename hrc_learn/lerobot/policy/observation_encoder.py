@@ -125,11 +125,6 @@ type Observation = Mapping[str, Any]
 class ObservationEncoder(nn.Module):
     """Encodes the numbers and images of one moment as one vector of features."""
 
-    mean: Tensor
-    """Mean of each number."""
-    std: Tensor
-    """Scale by which each number is divided."""
-
     def __init__(
         self,
         widths: Mapping[str, int],
@@ -153,8 +148,10 @@ class ObservationEncoder(nn.Module):
         """
         super().__init__()
         self.widths = dict(widths)
-        self.register_buffer("mean", torch.zeros(sum(widths.values())))
-        self.register_buffer("std", torch.ones(sum(widths.values())))
+        self.mean = nn.Buffer(torch.zeros(sum(widths.values())))
+        """Mean of each number."""
+        self.std = nn.Buffer(torch.ones(sum(widths.values())))
+        """Scale by which each number is divided."""
         # Names of modules must not contain dots, but keys of features do.
         self.cameras = nn.ModuleDict(
             {

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
@@ -143,8 +142,6 @@ class MotionPolicy(PreTrainedPolicy):
     name = "motion"  # pyright: ignore[reportAssignmentType]
 
     config: Any
-    measured: Int[Tensor, "A"]
-    """State columns that measure the action's components; -1: not measured."""
 
     def __init__(
         self,
@@ -189,7 +186,8 @@ class MotionPolicy(PreTrainedPolicy):
         states = config.state_names if OBS_STATE in widths else None
         self.encoding = ActionEncoding(width, rotation_triples(names))
         columns = matched_columns(names, states, (width, widths.get(OBS_STATE, 0)))
-        self.register_buffer("measured", torch.tensor(columns))
+        self.measured = nn.Buffer(torch.tensor(columns))
+        """State columns that measure the action's components, (A,); -1: not measured."""
         if config.pretrained_path is not None:
             self._build(None)
         else:
