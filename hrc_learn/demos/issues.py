@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Any, Literal
 
 _UNPRINTABLE = re.compile(
@@ -39,13 +40,20 @@ def counted(number: int, noun: str) -> str:
 def aligned(rows: Sequence[tuple[str, ...]], side: Literal["<", ">"] = "<") -> Iterator[str]:
     """A table as text; the last column is not padded.
 
+    If a terminal is too narrow for all columns but the last, the first cell of each row has a
+    line of its own.
+
     Args:
         rows: Cells of each row.
         side: "<" for cells at the left of their columns, ">" at the right.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
+    # A file or a pipe has no width.
+    narrow = sum(widths) + 2 * len(widths) > get_terminal_size((100_000, 24)).columns
     for row in rows:
         cells = [f"{cell:{side}{w}}" for cell, w in zip(row, widths, strict=False)]
+        if narrow:
+            cells[0] = f"{row[0]}\n"
         yield "  ".join([*cells, row[-1]]).rstrip()
 
 

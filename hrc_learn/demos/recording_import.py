@@ -83,9 +83,8 @@ class ImportPlan:
             sure, why = f"{100 * decision.confidence:.0f} %", decision.evidence
             text = f"{role} of {len(selection.columns)}"
             given = "given" if role in self.options.units else "declared"
-            rows.append(
-                (", ".join(self._tokens(selection.columns)), text, units, sure, why or given)
-            )
+            fields = ", ".join(self._tokens(selection.columns))
+            rows.append((fields, text, units, sure, why or given))
         for key, (places, _) in meaning.kept.items():
             fields = ", ".join(self._tokens(places))
             rows.append((fields, f"{key}, as recorded", "?", "", "no unit is known"))

@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import sys
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, write_info
 
 from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
-from hrc_learn.demos.issues import ValidationReport, warning
+from hrc_learn.demos.issues import ValidationReport, aligned, warning
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation
@@ -645,3 +647,22 @@ def test_standing_still_is_meant_relative_to_the_motion(tmp_path, size, noise, f
     root = write_folder(tmp_path / "set", episodes, {STATE: NAMES})
     said = [finding.message for finding in check_dataset(root).warnings]
     assert any("of standing still" in message for message in said) == found
+
+
+@pytest.mark.parametrize(
+    ("columns", "lines"),
+    [
+        ("14", ["column  unit  why", "joints  rad   declared", "x       m     by its name"]),
+        ("13", ["column\n  unit  why", "joints\n  rad   declared", "x\n  m     by its name"]),
+    ],
+)
+def test_the_first_cell_has_its_own_line_in_a_narrow_terminal(monkeypatch, columns, lines):
+    monkeypatch.setenv("COLUMNS", columns)
+    rows = [("column", "unit", "why"), ("joints", "rad", "declared"), ("x", "m", "by its name")]
+    assert [*aligned(rows)] == lines
+
+
+def test_a_table_in_a_file_has_one_line_per_row(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr(sys, "__stdout__", StringIO())
+    assert [*aligned([("word " * 50, "why"), ("b", "c")])][1] == f"{'b':250}  c"
