@@ -3,6 +3,8 @@
 The camera that is moved is OpenCV's.
 """
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from hrc_learn.jacobian import (
     CameraReference,
     CameraWatch,
     ImageDemonstration,
+    camera_motion,
     camera_placements,
     fit_camera,
     object_height,
@@ -632,3 +635,96 @@ def test_a_correction_without_a_motion_forgets_frames_before_its_last_second():
     correction.clear()
     assert not correction._frames
     assert correction.motion is None
+
+
+def placed(monkeypatch, places, frames=None, near=()):
+    """Placements of episodes whose camera stands at places along its x axis [mm].
+
+    All points are 1 m before the camera, in episodes `near` 0.5 m: there, the image moves
+    twice as far. `frames`: frames with the marker in each episode.
+    """
+    frames = frames or [12] * len(places)
+    twists = torch.zeros(len(places), 6, dtype=torch.float64)
+    twists[:, 3] = torch.tensor(places, dtype=torch.float64) / 1e3
+    camera = torch.zeros(13).double()
+    kept = [k for k, count in enumerate(frames) if count >= 10]
+    monkeypatch.setattr(camera_motion, "_camera_of_episodes", lambda *_: (camera, twists[kept]))
+    monkeypatch.setattr(camera_motion, "marker_points", lambda camera, points: points)
+
+    def episode(k):
+        points = torch.tensor([[0.0, 0.0, 0.5 if k in near else 1.0]]).double()
+        points = points.expand(frames[k], 3)
+        return SimpleNamespace(seen=lambda: (points, points[:, :2]))
+
+    with shapes_unchecked():
+        return camera_placements([episode(k) for k in range(len(places))], IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("places", "near", "groups"),
+    [
+        ([0, 1, 0, 1, 5.9], (), [(0, 1, 2, 3, 4)]),
+        ([0, 1, 0, 1, 6.1], (), [(0, 1, 2, 3), (4,)]),
+        # The larger displacement counts, of the points of either episode.
+        ([0, 1, 0, 1, 4], (4,), [(0, 1, 2, 3), (4,)]),
+        ([0, 1, 0, 1, 0, 4, 3, 4], (), [(0, 1, 2, 3, 4, 5, 6, 7)]),
+        # Each is compared with the first episode of a placement, and joins the first that fits.
+        ([0, 1, 2, 3, 4, 5, 6.9, 7, 6.9, 0], (), [(0, 1, 2, 3, 4, 5, 9), (6, 7, 8)]),
+        ([9, 9, 9, 0, 0, 0, 9, 9], (), [(0, 1, 2, 6, 7), (3, 4, 5)]),
+    ],
+)
+def test_an_episode_joins_the_first_placement_within_six_median_differences(
+    monkeypatch, places, near, groups
+):
+    found = placed(monkeypatch, places, near=near)
+    assert [placement.episodes for placement in found] == groups
+
+
+def test_a_placement_has_the_median_motion_of_its_episodes(monkeypatch):
+    first, second = placed(monkeypatch, [0, 1, 3, 50, 51, 53, 52])
+    assert (first.episodes, second.episodes) == ((0, 1, 2), (3, 4, 5, 6))
+    assert first.motion.distance == first.motion.displacement == 0.0
+    assert float(second.motion.twist[3]) == pytest.approx((51.5 - 1.0) / 1e3)
+    # A focal length of 1 px and points at 1 m: as many pixels as metres.
+    assert second.motion.displacement == pytest.approx(0.0505)
+    assert float(second.motion.twist.norm()) == pytest.approx(0.0505)
+
+
+def test_episodes_that_show_too_little_belong_to_no_placement(monkeypatch):
+    first, second = placed(
+        monkeypatch, [0, 1, 2, 90, 1, 0, 2], frames=[10, 9, 12, 11, 12, 12, 12]
+    )
+    assert (first.episodes, second.episodes) == ((0, 2, 4, 5, 6), (3,))
+    assert placed(monkeypatch, [0, 1, 2], frames=[10, 9, 9]) == []
+    assert len(placed(monkeypatch, [0, 1, 2], frames=[10, 9, 10])) == 1
+
+
+@pytest.mark.simulation
+def test_the_motion_of_each_episode_is_undone_before_the_next_fit(monkeypatch):
+    """With a true camera, later fits see the images of a camera that stood still."""
+    true = torch.tensor(
+        [np.log(1700.0), 731.0, 530.0, LENS[0], *ROTATION, *SHIFT, *MARKER]
+    ).double()
+    fits = []
+
+    def fit(demos, image_size):
+        fits.append([demo.feature for demo in demos])
+        return SimpleNamespace(camera=true)
+
+    monkeypatch.setattr(camera_motion, "fit_camera", fit)
+    knocks = [np.deg2rad([0.4, 0.0, 0.0]), np.zeros(3), np.deg2rad([-0.2, 0.3, 0.0])]
+    demos = [
+        demonstration(np.random.default_rng(3), moved(turn, np.zeros(3)), frames=40, noise=0.0)
+        for turn in knocks
+    ]
+    camera, twists = camera_motion._camera_of_episodes(demos, IMAGE)
+    assert torch.equal(camera, true)
+    # Each is relative to the median: of the second, which did not move.
+    np.testing.assert_allclose(twists[:, :3], knocks, atol=2e-5)
+    np.testing.assert_allclose(twists[:, 3:], np.zeros((3, 3)), atol=2e-5)
+    # The same motion in all three: their images agree once the camera's motion is undone.
+    seen = demos[1].visible
+    assert float((fits[0][0] - fits[0][1])[seen].abs().max()) > 5.0
+    for episodes in fits[1:]:
+        for feature in episodes:
+            np.testing.assert_allclose(feature[seen], demos[1].feature[seen], atol=0.05)

@@ -287,3 +287,25 @@ def test_twist_counts_rotation_in_the_base_frame():
 def test_settings_out_of_range_are_named(kind, settings, message):
     with pytest.raises(ValueError, match=message):
         kind(**settings)
+
+
+@pytest.mark.parametrize(
+    ("most", "kept"), [(1, [0]), (2, [0, 6]), (3, [0, 3, 6]), (7, range(7)), (9, range(7))]
+)
+def test_thinned_pairs_are_spread_from_the_first_to_the_last(most, kept):
+    number = torch.arange(7.0).double()[:, None]
+    quaternions = torch.tensor([1.0, 0, 0, 0]).double().expand(7, 4)
+    samples = MotionSamples(
+        before=Pose(number.expand(7, 3), quaternions),
+        after=Pose(number.expand(7, 3) + 0.5, quaternions),
+        dr=number.expand(7, 6),
+        dx=number.expand(7, 2),
+    ).thinned(most)
+    expected = torch.tensor([float(k) for k in kept]).double()
+    for values in (
+        samples.dx,
+        samples.dr,
+        samples.before.position,
+        samples.after.position - 0.5,
+    ):
+        assert torch.equal(values[:, 0], expected)

@@ -181,3 +181,23 @@ def test_load_names_what_is_wrong(tmp_path):
     (folder / "model.safetensors").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="not a safetensors file"):
         RBFImageJacobian.load(folder)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_the_first_pixel_is_that_of_a_pinhole_at_every_pose(batch):
+    """Focal length 500 px, the camera above the origin looks down, no lens, no offset."""
+    camera = torch.tensor([np.log(500.0), 320, 240, 0, np.pi, 0, 0, 0, 0, 1.5, 0, 0, 0])
+    network = random_network()
+    network.camera = camera.double()
+    r = pose_vectors(*batch)
+    pixel = network.first_pixel(r)
+    assert pixel.shape == (*batch, 2)
+    for index in np.ndindex(batch):
+        x, y, z = r[index][:3].tolist()
+        # Half a turn about x: y and z change their signs, the camera is at a height of 1.5 m.
+        expected = [320 + 500 * x / (1.5 - z), 240 - 500 * y / (1.5 - z)]
+        np.testing.assert_allclose(pixel[index], expected, atol=1e-6)
+
+
+def test_without_a_camera_there_is_no_first_pixel():
+    assert random_network().first_pixel(pose_vectors(2)) is None

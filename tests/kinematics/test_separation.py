@@ -268,3 +268,13 @@ def test_a_link_that_is_a_ball_has_its_distance_from_boxes_too(dtype):
     place = panda.link_poses(q)[:, 3].apply(torch.tensor(ball.start).to(dtype))
     outside = ((place - centre).abs() - half).clamp_min(0).norm(dim=-1)
     torch.testing.assert_close(arm.box_distance(q, centre, half), outside - 0.05)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_an_arm_of_one_capsule_touches_itself_nowhere(batch):
+    arm = CapsuleArm(
+        panda, [LinkCapsule(link=4, start=(0.0,) * 3, end=(0.1, 0, 0), radius=9.0)]
+    )
+    assert arm.pairs == []
+    distance = arm.self_distance(panda.ready.expand(*batch, 7))
+    assert torch.equal(distance, torch.full(batch, torch.inf, dtype=torch.float64))

@@ -1,5 +1,6 @@
 """Steps from video to landmarks, each with features of a camera that OpenCV models."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +10,11 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.geometry import Pose
+from hrc_learn.learning import markerless_fitting
 from hrc_learn.learning.markerless_fitting import (
     _below,
     _common_object,
@@ -23,6 +26,7 @@ from hrc_learn.learning.markerless_fitting import (
     _tool,
     _Tracks,
     _tracks,
+    find_landmarks,
 )
 from hrc_learn.learning.visual_servo_fitting import _ends
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
@@ -341,3 +345,116 @@ def test_ends_are_those_of_the_demonstrations_whose_object_was_found():
     np.testing.assert_array_equal([end.object_pixel for end in ends], [[1, 1], [2, 2]])
     with pytest.raises(ValueError, match=f"episode 5: no {OBJECT_FEATURE}, unlike other"):
         _ends(demos)
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """A search whose numbers of explained tracks are given for each camera and link."""
+
+    def run(counts, item=None, sure=((1.0, None, 3.0), (2.0,))):
+        tried = []
+        there = torch.tensor([[0.5, 0.1, 0.2]]).double()
+        quarter = torch.tensor([[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]]).double()
+        unit = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).double()
+        links = {"tool": Pose(there, unit), "wrist": Pose(there + 0.1, quarter)}
+        fits = [SimpleNamespace(camera=name) for name in range(len(counts))]
+        place = np.array([0.03, 0.02, 0.01])
+        camera = torch.arange(13.0).double()
+        search = SimpleNamespace(
+            picked="picked",
+            followed=8,
+            features=lambda: "features",
+            follow=lambda landmarks, seen: [
+                [None if d is None else SimpleNamespace(deviation=d) for d in row]
+                for row in sure
+            ],
+            object=lambda seen: item,
+            picture=lambda findings, objects: ("picture", objects),
+        )
+
+        def points(tracks, pose, number, width):
+            tried.append(number)
+            count = counts[number][next(k for k, v in links.items() if v is pose)]
+            return None, torch.arange(20) < count
+
+        for name, value in {
+            "ImageReader": lambda folder: SimpleNamespace(
+                cameras=[], size=lambda key: (48, 64)
+            ),
+            "camera_key": lambda cameras, camera: "KEY",
+            "_with_poses": lambda source, demos: ["first", "second"],
+            "_Search": lambda *given: search,
+            "_poses": lambda demos, picked: links["tool"],
+            "_wrist": lambda *given: [_Link(links["wrist"])],
+            "_tracks": lambda features, width: "tracks",
+            "_cameras": lambda *given: iter(fits),
+            "_points": points,
+            "_tool": lambda *given: (
+                SimpleNamespace(place=place, link=given[1]),
+                camera,
+            ),
+            "Landmarks": Kept,
+            "_described": lambda demos, findings, objects: (demos, objects),
+            "_ENOUGH": 15,
+            "FEWEST_POINTS": 5,
+        }.items():
+            monkeypatch.setattr(markerless_fitting, name, value)
+        source: Any = SimpleNamespace(folder="folder", source="SET", load=lambda: "loaded")
+        with shapes_unchecked():
+            return find_landmarks(source), tried, links
+
+    return run
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Landmarks without checks."""
+
+    tool: Any
+    image_size: tuple[int, int]
+    objects: Any = None
+
+
+def test_camera_and_link_are_those_that_explain_the_most_tracks(found):
+    counts = [{"tool": 6, "wrist": 9}, {"tool": 12, "wrist": 3}, {"tool": 11, "wrist": 12}]
+    fit, tried, links = found(counts)
+    assert tried == [0, 0, 1, 1, 2, 2]
+    assert fit.landmarks.tool.link.pose is links["tool"]
+    assert fit.landmarks.image_size == (64, 48)
+    np.testing.assert_allclose(fit.camera[10:], [0.03, 0.02, 0.01])
+    np.testing.assert_array_equal(fit.camera[:10], np.arange(10.0))
+
+
+def test_no_further_camera_is_tried_once_enough_tracks_are_explained(found):
+    fit, tried, _ = found([{"tool": 6, "wrist": 15}, {"tool": 20, "wrist": 20}])
+    assert tried == [0, 0]
+    # A point on the wrist, seen from the tool: a quarter turn, then 0.1 m along each axis.
+    np.testing.assert_allclose(fit.camera[10:], [0.1 - 0.02, 0.1 + 0.03, 0.1 + 0.01])
+
+
+@pytest.mark.parametrize(("most", "refused"), [(4, True), (5, False)])
+def test_a_few_tracks_that_move_as_the_arm_may_be_chance(found, most, refused):
+    counts = [{"tool": most, "wrist": 1}]
+    if refused:
+        with pytest.raises(
+            ValueError, match=r"SET, KEY: nothing .* \(4 points found, 5 needed"
+        ):
+            found(counts)
+    else:
+        found(counts)
+
+
+def test_a_video_without_a_camera_that_fits_has_no_points(found):
+    with pytest.raises(ValueError, match="0 points found, 5 needed"):
+        found([])
+
+
+def test_figures_count_the_frames_in_which_the_tool_is_sure(found):
+    fit, _, _ = found([{"tool": 9, "wrist": 1}])
+    assert fit.seen == pytest.approx(3 / 8)
+    assert fit.deviation == 2.0
+    assert fit.landmarks.objects is None
+    assert fit.demos[1] == fit.picture[1] == [None, None]
+    fit, _, _ = found([{"tool": 9, "wrist": 1}], item=("views", ["a", "b"]))
+    assert fit.landmarks.objects == {"object": "views"}
+    assert fit.demos[1] == fit.picture[1] == ["a", "b"]
