@@ -145,6 +145,21 @@ class TestTheLaw:
         command, _ = self.controller.step(self.state, observe(self.q, goals=aimed))
         assert (command.xi_x * (700 - target) > 0).all()
 
+    def test_the_null_space_is_drawn_to_a_posture_at_its_rate_besides_the_persons_input(self):
+        """Near the posture, before saturation: the null-space part of rate times offset."""
+        ahead = torch.linspace(-1, 1, 7, dtype=DOUBLE)
+        drawn = self.controller.goals.resting_at(self.q - 1e-5 * ahead, rate=2.0, speed=9.0)
+        project = null_space_projector(panda.jacobian(self.q))
+        speeds = [
+            self.controller.step(
+                self.state, observe(self.q, nullspace_input=self.d, goals=goals)
+            )
+            for goals in (drawn, self.controller.goals)
+        ]
+        returning, free = (command.null_velocity for command, _ in speeds)
+        expected = -2.0 * 1e-5 * project @ ahead
+        torch.testing.assert_close(returning - free, expected, rtol=1e-4, atol=1e-12)
+
     def test_the_module_is_not_changed_by_a_step(self):
         before = [p.clone() for p in self.controller.state_dict().values()]
         leaves = [leaf.clone() for leaf in _pytree.tree_leaves(self.state)]

@@ -131,6 +131,23 @@ def test_frames_that_are_not_finite_are_dropped_if_allowed():
     assert 5 not in edits.drop_bad_frames(late, True).kept
 
 
+def test_a_feature_that_was_not_visible_need_not_be_finite():
+    """Frames 3 and 4 show no marker; frame 9 shows one at no place."""
+    pixels = np.stack([SLOW, SLOW], axis=1)
+    pixels[[3, 4, 9], [0, 1, 1]] = np.nan
+    visible = np.ones(60)
+    visible[3], visible[4] = 0.0, -1.0
+    given = edit(pixels, role="feature", unit="px", seen=visible)
+    seen = ColumnSelection(role="feature_visible", columns=(("seen", 0),), labels=("seen",))
+    columns = replace(given.columns, selections=given.selections | {"feature_visible": seen})
+    given = replace(given, columns=columns)
+    left = edits.drop_bad_frames(given, True)
+    assert [k for k in range(60) if k not in left.kept] == [9]
+    # Without a column that says whether it was visible, each value counts.
+    unsaid = edits.drop_bad_frames(edit(pixels, role="feature", unit="px"), True)
+    assert [k for k in range(60) if k not in unsaid.kept] == [3, 4, 9]
+
+
 @pytest.mark.parametrize(("held", "dropped"), [(6, 5), (7, 0)])
 def test_repeats_of_a_tenth_of_a_second_are_dropped(held, dropped):
     """At 50 Hz: six equal frames last 0.1 s."""

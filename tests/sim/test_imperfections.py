@@ -11,6 +11,7 @@ from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import CommandChannel, Imperfections, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.vision import ImageNoise
 
 WORKPLACE = Workplace()
 HOVER = WORKPLACE.hover_joints().numpy()
@@ -307,3 +308,11 @@ def test_heights_and_loads_are_in_proportion_to_the_hand():
     np.testing.assert_allclose(half.object_heights, whole.object_heights / 2)
     assert half.payload == pytest.approx(whole.payload / 8)
     np.testing.assert_array_equal(half.encoder_offset, whole.encoder_offset)
+
+
+def test_noise_and_blur_of_a_camera_come_on_top_of_its_own():
+    own, ideal = ImageNoise(), Imperfections.ideal().camera_noise
+    assert (ideal.noise, ideal.blur) == (own.noise, own.blur)
+    worse = replace(Imperfections.ideal(), image_noise=2.0, image_blur=0.25).camera_noise
+    assert worse.noise - own.noise == pytest.approx(2.0)
+    assert worse.blur - own.blur == pytest.approx(0.25)
