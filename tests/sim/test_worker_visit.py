@@ -9,6 +9,7 @@ from hrc_learn.kinematics.collision import segment_box_distance
 from hrc_learn.sim import SceneConfig, Worker, WorkerConfig, random_visit
 from hrc_learn.sim.worker import PARTS, WORKER_ITEM_HALF_SIZE
 from hrc_learn.sim.worker_visit import (
+    BenchScript,
     HumanSpeeds,
     PoseWriter,
     WorkerPose,
@@ -409,3 +410,25 @@ def test_a_turn_is_never_more_than_half(angle, other):
     assert np.exp(1j * found) == pytest.approx(np.exp(1j * angle))
     vector = np.array([np.cos(angle), np.sin(angle)])
     assert np.exp(1j * direction(3 * vector)) == pytest.approx(np.exp(1j * angle))
+
+
+def test_an_object_is_carried_before_the_body_the_same_way_in_either_hand():
+    """The right hand mirrors the left one; the other hand hangs."""
+    worker, begun = Worker(), []
+    for side in (0, 1):
+        script = BenchScript(
+            worker, np.random.default_rng(0), bench=TABLE, across=(0.3, 0.5), sway=0.2
+        )
+        script.enter(2.0, HumanSpeeds(), side)
+        assert script.times[0] == 2.0
+        begun.append(script.rows[0][4:].reshape(2, 3))
+    hanging = worker.hanging_hands()
+    np.testing.assert_allclose(begun[0][0] * [1, -1, 1], begun[1][1])
+    for side in (0, 1):
+        np.testing.assert_allclose(begun[side][1 - side], hanging[1 - side])
+        carried = begun[side][side]
+        # Before the body, within its breadth, and between the hips and the shoulders.
+        assert 0.1 < carried[0] < worker.arm_length
+        assert 0 < abs(carried[1]) < 0.5 * abs(hanging[side, 1])
+        assert np.sign(carried[1]) == np.sign(hanging[side, 1])
+        assert 0.5 < carried[2] / worker.config.stature < 0.75

@@ -1,18 +1,22 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from seen_cameras import camera_network, camera_vector
+from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.jacobian.fitting import ImageJacobianFitReport
-from hrc_learn.jacobian.perspective import marker_pixels
+from hrc_learn.jacobian.perspective import FOCAL, marker_pixels
 from hrc_learn.kinematics import gripper_down
+from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.scene import overhead_camera
-from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.visual_skill import MarkerAngle, VisualServoSkill
 from hrc_learn.skills.visual_target import LONGEST_OFFSET, VisualTarget
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
@@ -156,6 +160,56 @@ def test_a_skill_knows_its_metrics_only_where_it_was_fitted(tmp_path):
         VisualServoSkill(jacobian=fitted, target=None).metrics()
 
 
+def test_metrics_of_a_fitted_skill_are_in_their_units():
+    """Of a camera of 800 px, known to one percent and 4 mm; one cell has no pairs."""
+    vector = torch.zeros(13, dtype=torch.float64)
+    vector[FOCAL] = np.log(800.0)
+    camera = SimpleNamespace(
+        camera=vector, deviation=lambda part: 0.01 * (part == FOCAL), place_deviation=0.004
+    )
+    report = ImageJacobianFitReport(
+        pairs=9, motion=20.0, error=1.0, held_out_error=2.0, noise=1.0
+    )
+
+    def best(error, noise, width):
+        return SimpleNamespace(
+            held_out_error=error,
+            config=SimpleNamespace(pixel_noise=noise),
+            neurons=SimpleNamespace(width=width),
+        )
+
+    rounds = (best(5.0, 1.0, 0.1), best(3.0, 0.5, 0.2), best(3.5, 0.4, 0.3))
+    skill: Any = SimpleNamespace(
+        jacobian=SimpleNamespace(report=report, centers=[0] * 13, camera_fit=camera),
+        cells=SimpleNamespace(relative=np.array([0.2, 0.9, 0.3]), pairs=np.array([4, 0, 1])),
+        learned=SimpleNamespace(rounds=rounds, kept=rounds[1], best=1),
+        target=None,
+        approach=None,
+        angle=None,
+        landmarks=None,
+    )
+    with shapes_unchecked():
+        metrics = VisualServoSkill.metrics(skill)
+    expected = {
+        "pairs": 9,
+        "neurons": 13,
+        "motion_px": 20,
+        "fit_error_px": 1,
+        "held_out_error_px": 2,
+        "held_out_relative": 0.1,
+        "held_out_relative_worst_cell": 0.3,
+        "focal_px": 800,
+        "focal_relative_std": 0.01,
+        "camera_place_std_mm": 4,
+        "pixel_noise_px": 0.5,
+        "width": 0.2,
+        "learning_rounds": 1,
+        "before_learning_error_px": 5,
+        "after_learning_error_px": 3,
+    }
+    assert metrics == pytest.approx(expected)
+
+
 def test_landmarks_survive_the_disk(tmp_path):
     rng = np.random.default_rng(0)
 
@@ -188,3 +242,22 @@ def test_landmarks_survive_the_disk(tmp_path):
         for got, given in views:
             np.testing.assert_array_equal(got.pixels, given.pixels)
             np.testing.assert_array_equal(got.descriptors, given.descriptors)
+
+
+def test_each_part_of_a_skill_is_written_if_it_was_learned(tmp_path):
+    """A model without an object has none of its files, and is read back so."""
+    VisualServoSkill(jacobian=network(), target=None).save(tmp_path / "bare")
+    assert [path.name for path in (tmp_path / "bare").iterdir()] == ["jacobian"]
+    bare = VisualServoSkill.load(tmp_path / "bare")
+    assert (bare.target, bare.approach, bare.angle, bare.landmarks) == (None,) * 4
+    target = VisualTarget(offset=OFFSET, error=1.5)
+    approach = Approach(orientation_wxyz=(0.0, 1.0, 0.0, 0.0), spread_rad=0.1, turned_rad=0.0)
+    angle = MarkerAngle(offset_rad=0.3, spread_rad=0.02)
+    parts = {"target": target, "approach": approach, "angle": angle}
+    for name, part in parts.items():
+        only = {"target": None} | {name: part}
+        VisualServoSkill(jacobian=network(), **only).save(tmp_path / name)
+        loaded = VisualServoSkill.load(tmp_path / name)
+        assert [key for key in parts if getattr(loaded, key) is not None] == [name]
+    assert VisualServoSkill.load(tmp_path / "approach").approach == approach
+    assert VisualServoSkill.load(tmp_path / "angle").angle == angle
