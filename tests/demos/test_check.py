@@ -10,10 +10,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, write_info
 
 from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
 from hrc_learn.demos.issues import ValidationReport, aligned, warning
+from hrc_learn.kinematics import panda
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation
@@ -666,3 +668,22 @@ def test_a_table_in_a_file_has_one_line_per_row(monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
     monkeypatch.setattr(sys, "__stdout__", StringIO())
     assert [*aligned([("word " * 50, "why"), ("b", "c")])][1] == f"{'b':250}  c"
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_zeros_of_joints_are_only_compared_with_recorded_positions(tmp_path, posed):
+    """A Panda whose joint 4 is 3 degrees off, recorded with and without its tool."""
+    q = panda.ready.numpy() + 0.25 * joint_path(120, joints=7)
+    tool = panda.forward(torch.from_numpy(q)).position.numpy()
+    read = q + np.deg2rad([0, 0, 0, 3.0, 0, 0, 0])
+    with DatasetWriter(tmp_path / "set", FPS, "panda", panda.joint_names) as writer:
+        writer.start_episode("reach")
+        for k in range(len(q)):
+            more = {"position": tool[k]} if posed else {}
+            writer.add_frame(joint_position=read[k], **more)
+        writer.save_episode()
+    report = check_dataset(tmp_path / "set")
+    assert report.errors == []
+    found = [str(issue) for issue in report.warnings if "zeros of joints" in str(issue)]
+    assert len(found) == posed
+    assert not posed or "panda_joint4 -" in found[0]
