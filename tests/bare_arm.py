@@ -2,7 +2,8 @@
 
 import torch
 
-from hrc_learn.kinematics import Arm, ArmShape, JointLimits, LinkCapsule, SerialChain, panda
+from hrc_learn.kinematics import Arm, JointLimits, LinkCapsule, SerialChain, panda
+from hrc_learn.kinematics.arm import ArmShape
 
 
 def bare(left_out=(2,), name="cut", slides=()):

@@ -28,7 +28,6 @@ from hrc_learn.jacobian.model_selection import CellErrors as CellErrors
 from hrc_learn.jacobian.model_selection import EvidenceConfig as EvidenceConfig
 from hrc_learn.jacobian.model_selection import EvidenceResult as EvidenceResult
 from hrc_learn.jacobian.model_selection import EvidenceRound as EvidenceRound
-from hrc_learn.jacobian.model_selection import HeldOutSamples as HeldOutSamples
 from hrc_learn.jacobian.model_selection import cross_validate as cross_validate
 from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evidence
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian

@@ -1,8 +1,6 @@
 """Serial arms from their descriptions: kinematics, Jacobians, inverses, shapes."""
 
 from hrc_learn.kinematics.arm import Arm as Arm
-from hrc_learn.kinematics.arm import ArmShape as ArmShape
-from hrc_learn.kinematics.arm import FingerJoint as FingerJoint
 from hrc_learn.kinematics.arm import UnreachableError as UnreachableError
 from hrc_learn.kinematics.arm import comfortable_posture as comfortable_posture
 from hrc_learn.kinematics.chain import SerialChain as SerialChain
@@ -11,8 +9,6 @@ from hrc_learn.kinematics.collision import GraspedBox as GraspedBox
 from hrc_learn.kinematics.collision import LinkCapsule as LinkCapsule
 from hrc_learn.kinematics.collision import Separation as Separation
 from hrc_learn.kinematics.collision import separation as separation
-from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
-from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
 from hrc_learn.kinematics.franka import fr3 as fr3
 from hrc_learn.kinematics.franka import panda as panda
 from hrc_learn.kinematics.inverse import SINGULAR_BELOW as SINGULAR_BELOW

@@ -1,7 +1,6 @@
 """The workplace in MuJoCo: arm, furniture, objects, cameras, contacts."""
 
 from hrc_learn.protocols import Touch as Touch
-from hrc_learn.sim.arm_model import FINGER_STROKE as FINGER_STROKE
 from hrc_learn.sim.arm_model import ArmModelConfig as ArmModelConfig
 from hrc_learn.sim.arm_model import whole_arm as whole_arm
 from hrc_learn.sim.cameras import CameraChange as CameraChange
@@ -16,12 +15,9 @@ from hrc_learn.sim.imperfections import Imperfections as Imperfections
 from hrc_learn.sim.recorded_world import MotionLog as MotionLog
 from hrc_learn.sim.recorded_world import MovingBodies as MovingBodies
 from hrc_learn.sim.recorded_world import RecordedWorld as RecordedWorld
-from hrc_learn.sim.recorded_world import WorkerDistance as WorkerDistance
 from hrc_learn.sim.scene import HAND_MARKER as HAND_MARKER
-from hrc_learn.sim.scene import NOWHERE as NOWHERE
 from hrc_learn.sim.scene import ObjectConfig as ObjectConfig
 from hrc_learn.sim.scene import SceneConfig as SceneConfig
-from hrc_learn.sim.scene import build_scene as build_scene
 from hrc_learn.sim.step_checks import PhysicsError as PhysicsError
 from hrc_learn.sim.worker import Worker as Worker
 from hrc_learn.sim.worker import WorkerConfig as WorkerConfig

@@ -1,6 +1,5 @@
 """Skills: visual servoing, grasping, placing, pick and place. They know no device drivers."""
 
-from hrc_learn.skills.arm_motion import PositionServo as PositionServo
 from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.grasping import Grasping as Grasping

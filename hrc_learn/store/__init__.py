@@ -29,7 +29,6 @@ from hrc_learn.store._folder import EXPORT as EXPORT
 from hrc_learn.store._folder import MADE_BY as MADE_BY
 from hrc_learn.store._folder import MANIFEST as MANIFEST
 from hrc_learn.store._folder import MODEL as MODEL
-from hrc_learn.store._folder import RESULTS as RESULTS
 from hrc_learn.store._folder import Kind as Kind
 from hrc_learn.store._folder import cache_home as cache_home
 from hrc_learn.store._folder import changed_files as changed_files

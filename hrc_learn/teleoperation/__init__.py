@@ -12,7 +12,6 @@ from hrc_learn.teleoperation.hand_guiding import (
 from hrc_learn.teleoperation.hand_guiding import (
     force_to_nullspace_input as force_to_nullspace_input,
 )
-from hrc_learn.teleoperation.scripted_expert import ScriptedExpert as ScriptedExpert
 from hrc_learn.teleoperation.scripted_expert import ScriptedForce as ScriptedForce
 from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation as ScriptedPerturbation
 from hrc_learn.teleoperation.scripted_expert import random_pulls as random_pulls

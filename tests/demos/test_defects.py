@@ -8,7 +8,8 @@ import pytest
 from broken_copies import DEFECTS, HARMLESS, STATE, Copy
 from lerobot_folders import joint_path, write_folder
 
-from hrc_learn.demos import DatasetError, Issue, check_dataset, load_demos
+from hrc_learn.demos import DatasetError, check_dataset, load_demos
+from hrc_learn.demos.issues import Issue
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation

@@ -8,7 +8,6 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
     JointDMP,
-    MotionPrimitive,
     MovingGoalDMP,
     OrientationDMP,
     PoseDMP,
@@ -18,6 +17,7 @@ from hrc_learn.dmp import (
     stack,
 )
 from hrc_learn.dmp.exported_dmp import export_dmp, resting_inputs, state_tensors
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.geometry import Pose, quaternion
 
 TIME, POSITION = arm_motion(n_samples=120, n_joints=5, moving_start=True)

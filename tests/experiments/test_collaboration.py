@@ -34,7 +34,8 @@ from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import Observer
 from hrc_learn.experiments.surroundings import THREE_OBJECTS, with_objects
 from hrc_learn.geometry import Box, quaternion
-from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
+from hrc_learn.sim import CameraChange, Imperfections, OcclusionInterval
+from hrc_learn.sim.scene import NOWHERE
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.marker_sensor import LatencyConfig

@@ -8,7 +8,8 @@ from hrc_learn.experiments.surroundings import (
     draw_object_poses,
     with_objects,
 )
-from hrc_learn.sim import FINGER_STROKE, World
+from hrc_learn.sim import World
+from hrc_learn.sim.arm_model import FINGER_STROKE
 from hrc_learn.sim.workplace import Workplace
 
 WORKPLACE = with_objects(Workplace(), THREE_OBJECTS)

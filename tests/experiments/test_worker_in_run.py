@@ -18,16 +18,9 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda, separation
 from hrc_learn.kinematics.registry import arm
 from hrc_learn.log import StepLog
-from hrc_learn.sim import (
-    MotionLog,
-    Worker,
-    WorkerConfig,
-    WorkerDistance,
-    World,
-    random_visit,
-    whole_arm,
-)
+from hrc_learn.sim import MotionLog, Worker, WorkerConfig, World, random_visit, whole_arm
 from hrc_learn.sim.arm_model import ArmModelConfig
+from hrc_learn.sim.recorded_world import WorkerDistance
 from hrc_learn.sim.worker import PARTS, REGIONS
 from hrc_learn.sim.workplace import Workplace, gripper_down
 from hrc_learn.skills.grasping import as_load

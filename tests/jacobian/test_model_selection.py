@@ -9,7 +9,6 @@ from torch.testing import assert_close
 
 from hrc_learn.jacobian import (
     EvidenceConfig,
-    HeldOutSamples,
     ImageJacobianFitConfig,
     RBFCenters,
     RBFImageJacobian,
@@ -18,7 +17,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.jacobian.fitting import KeyFrameConfig, MotionSamples, weight_covariance
-from hrc_learn.jacobian.model_selection import NegativeLogEvidence
+from hrc_learn.jacobian.model_selection import HeldOutSamples, NegativeLogEvidence
 
 CAMERA = Pinhole.overhead(roll=0.7)
 

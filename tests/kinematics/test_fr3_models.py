@@ -10,7 +10,8 @@ import torch
 from sampling import generator, within
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import LINK_CAPSULES, fr3
+from hrc_learn.kinematics import fr3
+from hrc_learn.kinematics.franka import LINK_CAPSULES
 
 _SPEC = find_spec("franky_sim")
 pytestmark = pytest.mark.skipif(_SPEC is None, reason="franky-sim has models of the FR3")

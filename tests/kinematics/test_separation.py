@@ -7,15 +7,9 @@ import sampling
 import torch
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import (
-    TOOL_LINK,
-    CapsuleArm,
-    GraspedBox,
-    LinkCapsule,
-    panda,
-    separation,
-)
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, LinkCapsule, panda, separation
 from hrc_learn.kinematics.collision import nearest_on_segment_and_box, segment_distance
+from hrc_learn.kinematics.franka import TOOL_LINK
 
 BOX = GraspedBox(half_size=(0.04, 0.022, 0.03), centre=(0.0, 0.005, 0.01))
 ARM = panda.whole

@@ -6,7 +6,8 @@ import pytest
 import torch
 from lerobot_samples import SampleWindows, reaching, write_dataset
 
-from hrc_learn.dmp import GaussianBasis, SpringDamper, Trajectory, response_of
+from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.lerobot.policy import policy_base
 from hrc_learn.lerobot.policy.contextual_motion import (
     DURATIONS,

@@ -7,9 +7,12 @@ import sampling
 import torch
 from grasp_trials import PEDESTAL, TABLE
 
-from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda
+from hrc_learn.kinematics import CapsuleArm, panda
 from hrc_learn.kinematics.collision import segment_box_distance
-from hrc_learn.sim import FINGER_STROKE, SceneConfig, build_scene, whole_arm
+from hrc_learn.kinematics.franka import LINK_CAPSULES
+from hrc_learn.sim import SceneConfig, whole_arm
+from hrc_learn.sim.arm_model import FINGER_STROKE
+from hrc_learn.sim.scene import build_scene
 from hrc_learn.sim.step_checks import body_geoms
 
 FAR = 3.0

@@ -11,7 +11,6 @@ from hrc_learn.geometry.shapes import Line
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     HAND_MARKER,
-    NOWHERE,
     CameraChange,
     ChangingCamera,
     OcclusionInterval,
@@ -24,6 +23,7 @@ from hrc_learn.sim import (
     open_camera,
 )
 from hrc_learn.sim.cameras import EGLCamera
+from hrc_learn.sim.scene import NOWHERE
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.vision import CameraModel, MarkerDetector, SyntheticCamera, centre

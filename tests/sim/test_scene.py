@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.geometry import Box
-from hrc_learn.sim import HAND_MARKER, SceneConfig, Worker, WorkerConfig, build_scene
+from hrc_learn.sim import HAND_MARKER, SceneConfig, Worker, WorkerConfig
 from hrc_learn.sim.scene import (
     NOWHERE,
     OCCLUDER,
@@ -17,6 +17,7 @@ from hrc_learn.sim.scene import (
     CabinetConfig,
     ObjectConfig,
     UnmarkedLook,
+    build_scene,
     marked_plate,
     overhead_camera,
     unmarked,

@@ -8,17 +8,9 @@ import pytest
 import torch
 
 from hrc_learn.kinematics import panda, separation
-from hrc_learn.sim import (
-    MovingBodies,
-    Worker,
-    WorkerConfig,
-    WorkerDistance,
-    World,
-    build_scene,
-    random_visit,
-    whole_arm,
-)
-from hrc_learn.sim.scene import WORKER_BODIES, WORKER_ITEM
+from hrc_learn.sim import MovingBodies, Worker, WorkerConfig, World, random_visit, whole_arm
+from hrc_learn.sim.recorded_world import WorkerDistance
+from hrc_learn.sim.scene import WORKER_BODIES, WORKER_ITEM, build_scene
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 

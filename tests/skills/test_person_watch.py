@@ -19,12 +19,12 @@ from hrc_learn.sim import (
     Imperfections,
     Worker,
     WorkerConfig,
-    WorkerDistance,
     WorkerSensor,
     World,
     random_visit,
     whole_arm,
 )
+from hrc_learn.sim.recorded_world import WorkerDistance
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load

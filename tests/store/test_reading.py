@@ -15,7 +15,6 @@ import torch
 
 from hrc_learn.store import (
     MANIFEST,
-    RESULTS,
     Count,
     Metres,
     Radians,
@@ -31,6 +30,7 @@ from hrc_learn.store import (
     require_unchanged,
     write_json,
 )
+from hrc_learn.store._folder import RESULTS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,12 +12,11 @@ from hrc_learn.kinematics import coarse_orientation, gripper_down, panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.teleoperation import (
     InteractionForceConfig,
-    ScriptedExpert,
     ScriptedForce,
     ScriptedPerturbation,
     force_to_nullspace_input,
 )
-from hrc_learn.teleoperation.scripted_expert import GuidedPath, Tremor
+from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
 
 # The force stands for the same velocity: what is tested is the mapping.
 PINV = InteractionForceConfig(mapping="pinv", rate=1.0, stiffness=1.0, speed=1e9, damping=1.0)
