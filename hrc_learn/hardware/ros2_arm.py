@@ -11,6 +11,7 @@ import math
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -97,12 +98,19 @@ class Ros2Arm(Connected):
         received: Arrival time of the newest joint state, by this machine's monotonic clock [s].
     """
 
-    def __init__(self, chain: SerialChain, config: Ros2Config | None = None):
+    def __init__(
+        self,
+        chain: SerialChain,
+        config: Ros2Config | None = None,
+        answer: Callable[[], None] = lambda: None,
+    ):
         """Wait for joint states and controllers.
 
         Args:
             chain: Kinematics and limits of the arm.
             config: Topics and settings.
+            answer: Called after each new joint state once the arm is connected, in the thread
+                that has received the state.
 
         Raises:
             ModuleNotFoundError: ROS 2 is not installed.
@@ -110,6 +118,7 @@ class Ros2Arm(Connected):
         """
         self.config = config = config or Ros2Config()
         self._chain, self._names, self.ignored = chain, chain.joint_names, 0
+        self._answer = lambda: None
         self.session = Ros2Session("hrc_arm")
         from geometry_msgs.msg import WrenchStamped
         from sensor_msgs.msg import JointState
@@ -154,6 +163,7 @@ class Ros2Arm(Connected):
             raise
         self._dog.start()
         atexit.register(self.close)
+        self._answer = answer
 
     def _await_state(self) -> None:
         with self._changed:
@@ -232,6 +242,7 @@ class Ros2Arm(Connected):
         if config.interface == "position" and self._velocity.any():
             with self._lock:
                 self._send(self._velocity, state)
+        self._answer()
 
     def read(self) -> ArmState:
         """Return the newest state; `time` is the stamp of its message [s].
@@ -251,15 +262,6 @@ class Ros2Arm(Connected):
                 "and the network."
             )
         return state
-
-    def wait(self, after: float, timeout: float) -> bool:
-        """Wait for a state newer than a given time; False after the timeout [s].
-
-        A state before that time is newer, too: the clock has been reset.
-        """
-        with self._changed:
-            newer = lambda: self._state is not None and self._state.time != after  # noqa: E731
-            return self._changed.wait_for(newer, timeout)
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
         """Set the joint velocities to hold [rad/s].

@@ -3,7 +3,8 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,9 +87,10 @@ class ControllerNode:
         self._seeing = threading.Lock()
         self._arm: Ros2Arm | None = None
         self._runner: StepRunner
-        self._active, self.stopped = threading.Event(), ""
+        self._inactive, self.stopped = threading.Event(), ""
+        self._inactive.set()
         self._thread: threading.Thread | None = None
-        self._heard = self._shown = self._diagnosed = self._pushed = 0.0
+        self._heard = self._shown = self._diagnosed = self._pushed = self._last = 0.0
         self._taken = 0.0  # time of the joint state at the newest feature's exposure [s]
         self._states = deque[tuple[float, np.ndarray]](maxlen=_HISTORY)
         self._path = deque[Any](maxlen=_PATH)  # messages: making them anew would cost 5 us each
@@ -169,7 +171,7 @@ class ControllerNode:
 
             self._detector = MarkerDetector([marker])
         self._runner.step()  # the first step is slower than all others
-        self._arm = Ros2Arm(self._chain, self._config)
+        self._arm = Ros2Arm(self._chain, self._config, self._answer)
 
     def activate(self) -> None:
         """Hold the tool where it is, and follow goals from now on.
@@ -187,16 +189,18 @@ class ControllerNode:
         values["goals.vision_enabled"][...] = values["feature_visible"][...] = 0
         values["nullspace_input"][:] = 0
         self._runner.start(state.joint_position, state.joint_velocity)
-        self._heard, self.stopped = time.monotonic(), ""
-        self._active.set()
-        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+        self._heard, self._last, self.stopped = time.monotonic(), 0.0, ""
+        self._inactive.clear()
+        self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
         self._thread.start()
 
     def deactivate(self) -> None:
         """Bring the arm to rest."""
-        self._active.clear()
+        self._inactive.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(1.0)
+        with self._seeing:  # a step may be under way
+            pass
         if self._arm is not None:
             self._arm.stop()
 
@@ -209,46 +213,58 @@ class ControllerNode:
 
     shutdown = cleanup
 
-    def _run(self) -> None:
-        """Answer each joint state with a command, until deactivated."""
-        arm, last = self._arm, 0.0
+    def _watch(self) -> None:
+        """Stop when joint states or heartbeats stay away, until deactivated."""
+        arm = self._arm
         assert arm is not None
-        with torch.inference_mode():
-            while self._active.is_set():
-                try:
-                    arm.wait(last, self._config.silence / 4)
-                    last = self._step(arm, last)
-                except Exception as error:  # whatever its kind, the arm must stop
-                    self.stopped = str(error)
-                    self.node.get_logger().error(f"deactivated: {error}")
-                    self._active.clear()
-                    arm.stop()
-                    self._report(time.monotonic())
-                    self.node.trigger_deactivate()
+        while not self._inactive.wait(self._config.silence / 4):
+            with self._stopping_faults():
+                arm.read()
+                self._check_heartbeat()
 
-    def _step(self, arm: Ros2Arm, last: float) -> float:
-        state, received, now = arm.read(), arm.received, time.monotonic()
-        limit = self._value("heartbeat")
-        if limit and now - self._heard > limit:
-            raise ArmFaultError(f"no heartbeat for {now - self._heard:.2f} s: send ~/heartbeat")
-        if state.time == last:
-            return last
-        values = self._runner.observation
-        if last:
-            values["dt"][...] = min(max(state.time - last, 1e-3), self._config.silence)
-        values["joint_position"][:] = state.joint_position
-        if now - self._pushed > _PUSH:
-            values["nullspace_input"][:] = 0
-        with self._seeing:
+    @contextmanager
+    def _stopping_faults(self) -> Iterator[None]:
+        """Bring the arm to rest and deactivate the node if the block raises an error."""
+        try:
+            yield
+        except Exception as error:  # whatever its kind, the arm must stop
+            if self._inactive.is_set():
+                return
+            self.stopped = str(error)
+            self.node.get_logger().error(f"deactivated: {error}")
+            self.deactivate()
+            self._report(time.monotonic())
+            self.node.trigger_deactivate()
+
+    def _check_heartbeat(self) -> None:
+        limit, silent = self._value("heartbeat"), time.monotonic() - self._heard
+        if limit and silent > limit:
+            raise ArmFaultError(f"no heartbeat for {silent:.2f} s: send ~/heartbeat")
+
+    def _answer(self) -> None:
+        """Answer a joint state with a command, in the thread that has received it."""
+        with self._stopping_faults(), self._seeing, torch.inference_mode():
+            if self._inactive.is_set():
+                return
+            self._check_heartbeat()
+            arm, values, now = self._arm, self._runner.observation, time.monotonic()
+            assert arm is not None
+            state = arm.read()
+            if self._last:
+                step = max(state.time - self._last, 1e-3)
+                values["dt"][...] = min(step, self._config.silence)
+            self._last = state.time
+            values["joint_position"][:] = state.joint_position
+            if now - self._pushed > _PUSH:
+                values["nullspace_input"][:] = 0
             values["feature_age"][...] = state.time - self._taken
             command = self._runner.step()
             values["feature_new"][...] = 0
             self._states.append((state.time, state.joint_position))
-        arm.command(command)
-        self.commands += 1
-        self.latencies.append(time.monotonic() - received)
-        self._report(now)
-        return state.time
+            arm.command(command)
+            self.commands += 1
+            self.latencies.append(time.monotonic() - arm.received)
+            self._report(now)
 
     def _checked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
         """Wrap a callback so that its errors are logged; else they would end the thread."""

@@ -24,17 +24,17 @@ PATIENCE = 20.0
 
 
 class Arm:
-    """An arm that does what it is commanded, and lets the node on for one state at a time.
+    """An arm that does what it is commanded; the test decides when a joint state comes.
 
     Attributes:
+        answer: Called after each new joint state.
         fault: Raised by reading.
     """
 
     def __init__(self, clock):
         self.q, self.velocity, self.time = READY.copy(), np.zeros(7), 100.0
         self.clock, self.fault, self.ignored, self.received = clock, None, 3, clock.now
-        self.calls, self.commands, self.waits = [], [], threading.Condition()
-        self.waiting = self.new = False
+        self.calls, self.commands, self.answer = [], [], lambda: None
 
     def read(self):
         if self.fault is not None:
@@ -46,34 +46,20 @@ class Arm:
             gripper_width=0.0,
         )
 
-    def wait(self, after, timeout):
-        assert timeout == 0.2 / 4  # of the silence
-        with self.waits:
-            self.waiting = True
-            self.waits.notify_all()
-            self.waits.wait_for(lambda: self.new, 0.05)
-            self.waiting, self.new = not self.new, False
-
     def turn(self, dt=DT):
-        """Let the node answer a state that is newer by so much [s]."""
-        with self.waits:
-            assert self.waits.wait_for(lambda: self.waiting, PATIENCE)
-            self.q, self.time = self.q + dt * self.velocity, self.time + dt
-            self.clock.now += dt
-            self.received = self.clock.now - 2e-3
-            self.new, self.waiting = True, False
-            self.waits.notify_all()
-            self.waits.wait_for(lambda: self.waiting or "stop" in self.calls, PATIENCE)
+        """Receive a joint state that is newer by so much [s]."""
+        self.q, self.time = self.q + dt * self.velocity, self.time + dt
+        self.clock.now += dt
+        self.received = self.clock.now - 2e-3
+        self.answer()
 
     def command(self, velocity):
         self.velocity = np.array(velocity)
         self.commands.append(self.velocity)
 
     def stop(self):
-        with self.waits:
-            self.velocity = np.zeros(7)
-            self.calls.append("stop")
-            self.waits.notify_all()
+        self.velocity = np.zeros(7)
+        self.calls.append("stop")
 
     def recover(self):
         self.calls.append("recover")
@@ -94,8 +80,12 @@ def arm(graph):
 
 @pytest.fixture
 def node(graph, arm, monkeypatch):
+    def connect(chain, config, answer):
+        arm.answer = answer
+        return arm
+
     monkeypatch.setattr(ros2_node, "Ros2Session", lambda name, make: graph)
-    monkeypatch.setattr(ros2_node, "Ros2Arm", lambda chain, config: arm)
+    monkeypatch.setattr(ros2_node, "Ros2Arm", connect)
     monkeypatch.setattr(ros2_node, "time", graph)
     runners, controllers = [], []
 
@@ -378,9 +368,6 @@ def test_steps_follow_the_clock_of_the_robot_within_bounds(arm, node, values):
         arm.turn(dt)
         if taken is not None:
             assert values["dt"] == pytest.approx(taken)
-    commands = len(arm.commands)
-    arm.turn(0.0)  # no newer state
-    assert len(arm.commands) == commands
 
 
 @pytest.mark.parametrize("reason", ["silence", "heartbeat", "crash"])
@@ -452,7 +439,6 @@ def test_limits_of_time_are_exclusive(graph, arm, node):
     for _ in range(16):
         arm.turn(1 / 64)
     assert node.stopped == ""  # a quarter of a second without a heartbeat
-    assert node._thread.daemon
     assert len(arm.commands) == 16
     # Markers in the first step, and in those more than 0.1 s after the last: each seventh.
     assert len(sent(graph, "~/markers")) == 3
@@ -462,6 +448,37 @@ def test_limits_of_time_are_exclusive(graph, arm, node):
             break
         threading.Event().wait(0.01)
     assert node.stopped == "no heartbeat for 0.27 s: send ~/heartbeat"
+
+
+def test_a_state_after_the_end_is_not_answered(graph, arm, node, values):
+    arm.turn()
+    graph.trigger_deactivate()
+    commands = len(arm.commands)
+    arm.turn()
+    assert len(arm.commands) == commands
+
+
+def test_deactivating_waits_for_the_step_under_way(graph, arm, node, values):
+    step, inside, go_on = node.runners[-1].step, threading.Event(), threading.Event()
+
+    def slow():
+        inside.set()
+        assert go_on.wait(PATIENCE)
+        return step()
+
+    node.runners[-1].step = slow
+    answering = threading.Thread(target=arm.turn)
+    answering.start()
+    assert inside.wait(PATIENCE)
+    ending = threading.Thread(target=graph.trigger_deactivate)
+    ending.start()
+    ending.join(0.2)
+    assert "stop" not in arm.calls  # a command after the stop would move the arm
+    go_on.set()
+    answering.join(PATIENCE)
+    ending.join(PATIENCE)
+    assert arm.calls[-1] == "stop"
+    assert not arm.velocity.any()
 
 
 def test_diagnostics_come_each_second(graph, arm, node, values):
