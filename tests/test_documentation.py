@@ -132,6 +132,17 @@ def test_the_site_opens_without_a_network(tmp_path):
     assert not list(out.rglob("_*"))
 
 
+@builder
+@pytest.mark.long
+def test_formulas_and_figures_are_shown_as_written(tmp_path):
+    formula = "1 + rho^2/s^2, theta(r) + 1/2, J^+ (J J^+)^T, 5.1/8.4, 90th, ~0.5 to ~1, a == b"
+    text = CHECKOUT["docs/howto/guide.md"] + f"\n{formula}\n"
+    root = checkout(tmp_path / "checkout", **{"docs/howto/guide.md": text})
+    out = tmp_path / "site"
+    assert build_docs.build(root, out) == []
+    assert formula in (out / "howto" / "guide.html").read_text()
+
+
 @pytest.mark.long
 @builder
 @pytest.mark.parametrize(
