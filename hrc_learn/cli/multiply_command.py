@@ -20,6 +20,7 @@ from hrc_learn.demos.dataset_views import arm_of_dataset
 from hrc_learn.demos.issues import aligned
 from hrc_learn.experiments.motion_judge import Judge, JudgeConfig, Replay, Trial, judging
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.learning import multiply_motions as motions
 from hrc_learn.learning.multiply_dataset import MultipliedColumns, MultipliedWriter, pose_of
@@ -52,6 +53,8 @@ class ObjectConfig:
     yaw: tuple[float, float] = (0.0, 0.0)
     """Range of its rotation about the vertical, from the demonstrated orientation [rad]."""
 
+    __post_init__ = check_settings
+
 
 @dataclass(frozen=True, kw_only=True)
 class MultiplyConfig:
@@ -74,6 +77,7 @@ class MultiplyConfig:
     """Episodes to learn from. Default: all."""
 
     def __post_init__(self) -> None:
+        check_settings(self, not_negative=("seed", "start"))
         if not 0 <= self.style <= 1:
             raise ValueError(f"style must be from 0 to 1, but is {self.style}.")
         if not 0 < self.speed[0] <= self.speed[1]:

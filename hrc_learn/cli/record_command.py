@@ -239,7 +239,7 @@ class _LeaderConfig:
     """Frames per second, which is also the rate of the loop."""
 
     def __post_init__(self) -> None:
-        check_settings(self, finite=["duration", "fps"], not_negative=["pause"])
+        check_settings(self, positive=["duration", "fps"], not_negative=["pause"])
 
 
 @dataclass(frozen=True, kw_only=True)

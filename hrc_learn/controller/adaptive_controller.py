@@ -76,6 +76,8 @@ class ControllerConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter."""
 
+    unbounded = "linear_speed", "angular_speed", "vision_rate"
+
     def __post_init__(self):
         speeds = "linear_speed", "angular_speed"
         approach = "approach_linear_speed", "approach_angular_speed"

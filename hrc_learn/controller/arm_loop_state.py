@@ -55,6 +55,8 @@ class ArmLoopConfig(YieldingConfig):
     """Source of null-space motion: a person's push, the repulsion from people near the arm, or
     both; None: a person's push."""
 
+    unbounded = "longest_wait", "back_after", "direct_return_after"
+
     def __post_init__(self) -> None:
         super().__post_init__()
         positive = "dt", "longest_wait", "back_after", "direct_return_after"

@@ -25,7 +25,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -88,6 +88,8 @@ class ContactConfig:
     load: float = 0.5
     """Mass of an object in the gripper, at the tool centre point [kg]."""
 
+    unbounded = ("padding",)
+
     def __post_init__(self) -> None:
         surface, masses = ("area", "padding"), ("rotor_inertia", "load")
         check_settings(self, positive=surface, not_negative=masses, fraction=["used"])
@@ -121,9 +123,8 @@ class SeparationConfig:
     """Surface and inertia of the arm, for power and force limiting."""
 
     def __post_init__(self):
-        terms, modes = ("human_speed", "reaction_time", "clearance"), get_args(PersonMode)
-        one_of = [("mode", modes)]
-        check_settings(self, positive=["deceleration"], not_negative=terms, one_of=one_of)
+        terms = "human_speed", "reaction_time", "clearance"
+        check_settings(self, positive=["deceleration"], not_negative=terms)
 
     def protective_distance(
         self, speed: Float[Tensor, "*batch"], human_speed: Float[Tensor, "*batch"] | None = None

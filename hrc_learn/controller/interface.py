@@ -14,8 +14,9 @@ from torch import Tensor
 
 from hrc_learn.controller.constraint_layer import ConstraintConfig, ConstraintReport, Distances
 from hrc_learn.controller.contact_limits import SeparationConfig
-from hrc_learn.geometry.numerics import check_settings
+from hrc_learn.geometry.numerics import check_choice, check_settings
 from hrc_learn.kinematics import TaskSpace
+from hrc_learn.kinematics.inverse import TASK_ROWS
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import (
     AxisRegion,
@@ -58,6 +59,8 @@ class SafetyConfig:
     """Settings of the quadratic program that keeps limits and distances; in this program, the
     null space yields to the task. None: each joint brakes by itself before its limits, and no
     distance is kept."""
+
+    unbounded = ("tcp_speed",)
 
     def __post_init__(self):
         check_settings(
@@ -196,6 +199,7 @@ class Goals:
         Raises:
             ValueError: The target lies outside the image.
         """
+        check_choice("task", task, TASK_ROWS)
         enabled = target is not None
         if target is None:
             target = centre.new_tensor(image_size) / 2

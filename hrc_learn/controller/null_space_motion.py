@@ -87,9 +87,8 @@ class YieldingConfig:
     slides along an obstacle."""
 
     def __post_init__(self) -> None:
-        speeds, one_of = ("elbow_speed", "return_speed"), [("after_push", ("return", "stay"))]
-        positive = "damping", "nullspace_rise", "pose_gain", *speeds
-        check_settings(self, positive=positive, not_negative=["clearance"], one_of=one_of)
+        positive = "damping", "nullspace_rise", "pose_gain", "elbow_speed", "return_speed"
+        check_settings(self, positive=positive, not_negative=["clearance"])
 
 
 def guided_elbow_speed(cap: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -155,8 +155,7 @@ class WayMakingConfig:
     def __post_init__(self):
         if not self.near < self.far:
             raise ValueError(f"near must be below far, but they are {self.near} and {self.far}")
-        one_of = [("mode", get_args(WayMaking))]
-        check_settings(self, positive=("speed", "smoothing"), one_of=one_of)
+        check_settings(self, positive=("speed", "smoothing"))
 
     @property
     def automatic(self) -> bool:

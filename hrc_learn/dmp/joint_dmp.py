@@ -230,8 +230,10 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             goal: Goal of the motion; None: as demonstrated.
 
         Raises:
-            ValueError: A limit that is not positive, or a wrong number of limits.
+            ValueError: No limit, a limit that is not positive, or a wrong number of limits.
         """
+        if velocity is None and acceleration is None:
+            raise ValueError("a limit is needed: give velocity or acceleration, or both")
         fine = torch.linspace(0, 1, LIMIT_SAMPLES, dtype=torch.float64).to(self.start.device)
         motion = self.rollout(fine * self.duration[..., None].double(), start, goal)
         factors = [torch.zeros_like(self.duration)]

@@ -89,8 +89,8 @@ class MotionHead(nn.Module):
             goal_centre: Centre of the goals, (D,); None: the start of each motion.
 
         Raises:
-            ValueError: A duration, delay or amplitude of wrong sign, or a wrong number of
-                values.
+            ValueError: A duration, delay or amplitude of wrong sign, a wrong number of values,
+                or no column.
         """
         super().__init__()
         low, high = duration if isinstance(duration, tuple) else (duration, duration)
@@ -99,6 +99,8 @@ class MotionHead(nn.Module):
                 "duration must be positive, with an ordered range, and delay not negative; got "
                 f"{duration} and {delay}"
             )
+        if not columns >= 1:
+            raise ValueError(f"columns must be at least 1, got {columns}")
         self.columns = columns
         self.shortest, self.longest, self.latest = low, high, delay
         self.response = response_of(SpringDamper(), GaussianBasis(count=n_basis), 1.0)

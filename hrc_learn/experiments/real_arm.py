@@ -100,7 +100,8 @@ class ArmSite:
     effector pauses the task."""
 
     def __post_init__(self) -> None:
-        check_settings(self, fraction=("dynamics", "speed"))
+        fraction = "dynamics", "speed"
+        check_settings(self, fraction=fraction, not_negative=["camera_delay"])
 
     @property
     def chain(self) -> Arm:
@@ -282,6 +283,7 @@ def run_on_arm(
         # The arm's clock times the loop: a simulator may be slower than real time.
         rate = Rate(config.dt, clock=lambda: arm.read().time)
         held: str | None = None
+        trips = getattr(arm, "trips", 0)
 
         def take_up() -> None:
             """Put the object that the cell holds into the hand of the simulated arm."""
@@ -291,9 +293,15 @@ def run_on_arm(
                 believed.put_in_hand(held)
 
         def advance(duration: float) -> None:
+            nonlocal trips
             rate.wait()
             take_up()
             believed.follow(arm.read(), held)
+            if trips != (trips := getattr(arm, "trips", 0)):
+                # The driver's process has stopped the arm: the next command starts from rest.
+                safety, still = cell.loop_state.safety, torch.zeros_like(cell.joints)
+                safety = replace(safety, velocity=still, acceleration=still)
+                cell.loop_state = replace(cell.loop_state, safety=safety)
 
         def check(plan: Plan) -> None:
             take_up()

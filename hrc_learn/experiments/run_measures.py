@@ -398,5 +398,6 @@ def _distance_across(
 
 
 def _lag_samples(time: Float[np.ndarray, " time"]) -> int:
-    """Number of samples within the largest lag."""
-    return round(_LAG / float(np.median(np.diff(time)))) if len(time) > 1 else 0
+    """Number of samples within the largest lag; repeated times do not count."""
+    steps = np.diff(np.unique(time))
+    return round(_LAG / float(np.median(steps))) if len(steps) else 0

@@ -8,8 +8,10 @@ threshold and the closed form above it. The form that is not selected is evaluat
 argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+import math
+from collections.abc import Collection, Iterable, Sequence
+from functools import cache
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -50,29 +52,28 @@ def check_settings(
     settings: object,
     *,
     positive: Iterable[str] = (),
-    finite: Iterable[str] = (),
     not_negative: Iterable[str] = (),
     below_one: Iterable[str] = (),
     fraction: Iterable[str] = (),
-    one_of: Iterable[tuple[str, tuple[str, ...]]] = (),
 ) -> None:
-    """Check that settings are in their ranges; NaN is in no range.
+    """Check that settings are in their ranges.
+
+    Every number, also within a tuple, must be finite, unless the class attribute `unbounded`
+    holds its name; NaN is in no range. A setting annotated with `Literal` must be one of its
+    values. A dataclass without ranges can use this function as its `__post_init__`.
 
     Args:
         settings: Object with the settings as attributes.
         positive: Names of settings that must be positive.
-        finite: Names of settings that must be positive and finite.
         not_negative: Names of settings that must be zero or positive.
         below_one: Names of settings that must be in [0, 1).
         fraction: Names of settings that must be in (0, 1].
-        one_of: Names of settings, each with its possible values.
 
     Raises:
         ValueError: A setting is not in its range.
     """
     rules = (
         (positive, "must be positive", lambda x: x > 0),
-        (finite, "must be positive and finite", lambda x: 0 < x < torch.inf),
         (not_negative, "must not be negative", lambda x: x >= 0),
         (below_one, "must be in [0, 1)", lambda x: 0 <= x < 1),
         (fraction, "must be in (0, 1]", lambda x: 0 < x <= 1),
@@ -82,9 +83,27 @@ def check_settings(
             value = getattr(settings, name)
             if not holds(value):
                 raise ValueError(f"{name} {rule}, but is {value}")
-    for name, known in one_of:
-        if (value := getattr(settings, name)) not in known:
-            raise ValueError(f"{name} must be {' or '.join(known)}, but is {value!r}")
+    for name, known in _choices(type(settings)).items():
+        check_choice(name, getattr(settings, name), known)
+    for name, value in vars(settings).items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        wrong = [x for x in numbers if isinstance(x, float) and not math.isfinite(x)]
+        if wrong and (math.isnan(wrong[0]) or name not in getattr(settings, "unbounded", ())):
+            raise ValueError(f"{name} must be finite, but is {value}")
+
+
+def check_choice(name: str, value: object, known: Collection[object]) -> None:
+    """Raise ValueError unless a value is one of the known ones."""
+    if value not in known:
+        text = " or ".join(x if isinstance(x, str) and x else repr(x) for x in known)
+        raise ValueError(f"{name} must be {text}, but is {value!r}")
+
+
+@cache
+def _choices(kind: type) -> dict[str, tuple[object, ...]]:
+    """Values of each attribute of a class that is annotated with `Literal`."""
+    hints = {k: getattr(v, "__value__", v) for k, v in get_type_hints(kind).items()}
+    return {k: get_args(v) for k, v in hints.items() if get_origin(v) is Literal}
 
 
 def cos_and_sinc(square: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:

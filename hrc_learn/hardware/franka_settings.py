@@ -33,12 +33,7 @@ class Load:
     the speed of this point like that of the tool. None: no such limit."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.mass < math.inf:
-            raise ValueError(f"mass of a load must not be negative, but is {self.mass} kg.")
-        for name in ("centre", "far_end"):
-            point = getattr(self, name)
-            if point is not None and not np.isfinite(point).all():
-                raise ValueError(f"{name} of a load must be finite, but is {point} m.")
+        check_settings(self, not_negative=["mass"])
         tensor = np.array(self.inertia)
         if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=0):
             raise ValueError(
@@ -104,8 +99,8 @@ class FrankyConfig:
     """Load on the flange in addition to the end effector; None keeps the arm's setting."""
 
     def __post_init__(self) -> None:
-        finite = "timeout", "grip_force", "grip_speed"
-        check_settings(self, fraction=["dynamics"], finite=finite)
+        positive = "timeout", "grip_force", "grip_speed"
+        check_settings(self, positive=positive, fraction=["dynamics"])
 
     def rest_timeout(self, *limits: ArrayLike) -> float:
         """Timeout for coming to rest from the highest velocities [s].

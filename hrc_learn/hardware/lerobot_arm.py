@@ -67,9 +67,7 @@ class LeRobotConfig:
 
     def __post_init__(self) -> None:
         numbers = "rate", "timeout", "silence", "lag", "blocked", "opening"
-        check_settings(self, finite=numbers)
-        if self.unit not in ("", "deg", "rad"):
-            raise ValueError(f"unit must be deg, rad or empty, but is {self.unit!r}.")
+        check_settings(self, positive=numbers)
 
 
 class LeRobotArm(Connected):

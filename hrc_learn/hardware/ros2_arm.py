@@ -58,8 +58,11 @@ class Ros2Config:
     """Largest distance of commanded positions from the measured ones [rad]."""
     wrench: str = ""
     """Topic of a force and torque sensor (WrenchStamped); empty: no sensor. The wrench acts on
-    the end effector at the tool centre point, along the axes of the end effector or, if its
-    frame is `base`, of the base."""
+    the end effector at the tool centre point, along the axes of its frame: `base` or
+    `wrench_frame`."""
+    wrench_frame: str = "tool0"
+    """Frame with the axes of the end effector; a wrench without a frame is taken to be in it. A
+    wrench in another frame stops the arm."""
     gripper: str = ""
     """Topic of a gripper's position controller (Float64MultiArray); empty: no gripper."""
     gripper_joint: str = ""
@@ -73,11 +76,9 @@ class Ros2Config:
 
     def __post_init__(self) -> None:
         numbers = "timeout", "silence", "startup", "lag", "opening"
-        kinds = "velocity", "position", "trajectory"
-        check_settings(self, finite=numbers, one_of=[("interface", kinds)])
-        travel = self.gripper_open - self.gripper_closed
-        if not travel or not math.isfinite(travel):
-            raise ValueError("gripper_open and gripper_closed must be finite and different.")
+        check_settings(self, positive=numbers)
+        if self.gripper_open == self.gripper_closed:
+            raise ValueError("gripper_open and gripper_closed must be different.")
         if bool(self.gripper) != bool(self.gripper_joint):
             raise ValueError("gripper and gripper_joint belong together: give both or neither.")
 
@@ -131,7 +132,7 @@ class Ros2Arm(Connected):
         self._width = math.nan if config.gripper else 0.0
         # Time of the newest wrench [s]; its frame, its force [N] and its torque [N m].
         self._felt = -math.inf if config.wrench else math.inf
-        self._wrench = "", np.zeros((2, 3))
+        self._wrench, self._refused = ("", np.zeros((2, 3))), ""
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
         # Times of the last command and of the last change of the goal [s].
@@ -174,7 +175,11 @@ class Ros2Arm(Connected):
             missing = sorted({*self._names, self.config.gripper_joint} - {*self._seen, ""})
             why = f"{', '.join(missing)} are not among {', '.join(self._seen)}"
             why = why if missing else "the wrench or their positions are missing or not finite"
-        topic, longest = self.config.joint_states, self.config.startup
+        topic, longest, why = (
+            self.config.joint_states,
+            self.config.startup,
+            self._refused or why,
+        )
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
 
     def _await_controllers(self) -> None:
@@ -188,10 +193,14 @@ class Ros2Arm(Connected):
                 time.sleep(0.02)
 
     def _on_wrench(self, message: Any) -> None:
-        parts = message.wrench.force, message.wrench.torque
+        parts, frame = (message.wrench.force, message.wrench.torque), message.header.frame_id
+        base, known = self.config.base, ("", self.config.base, self.config.wrench_frame)
+        remedy = f"publish it in {base!r}, or set wrench_frame to a frame with the tool's axes"
+        text = f"the wrench on {self.config.wrench} is in frame {frame!r}: {remedy}"
+        self._refused = "" if frame in known else text
         values = np.array([[part.x, part.y, part.z] for part in parts])
-        if np.isfinite(values).all():
-            self._wrench, self._felt = (message.header.frame_id, values), time.monotonic()
+        if not self._refused and np.isfinite(values).all():
+            self._wrench, self._felt = (frame, values), time.monotonic()
 
     def _on_state(self, message: Any) -> None:
         config, now, last = self.config, time.monotonic(), self._state
@@ -257,9 +266,9 @@ class Ros2Arm(Connected):
         wrench = (self._felt, f"wrench on {config.wrench}")
         since, what = min((taken, f"joint state on {config.joint_states}"), wrench)
         if (age := time.monotonic() - since) > config.silence:
+            reason = self._refused or f"the newest {what} is {age:.2f} s old"
             raise ArmFaultError(
-                f"the newest {what} is {age:.2f} s old: the arm is stopped. Check its driver "
-                "and the network."
+                f"{reason}: the arm is stopped. Check its driver and the network."
             )
         return state
 

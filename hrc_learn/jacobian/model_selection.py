@@ -63,7 +63,8 @@ class EvidenceConfig:
     """True if the centres are learned; width, noise and prior are always learned."""
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=("hold_out", "max_samples"))
+        counts = "rounds", "iterations", "patience", "hold_out", "max_samples"
+        check_settings(self, positive=counts, not_negative=["min_improvement"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import Constant, orthonormal_basis
+from hrc_learn.geometry.numerics import Constant, check_choice, orthonormal_basis
 from hrc_learn.kinematics.chain import SerialChain
 
 type TaskSpace = Literal["pose", "nearest pose", "position+axis", "position"]
@@ -78,6 +78,7 @@ def task_error_and_jacobian(
         pose: Wanted pose of the tool centre point.
         task: Constrained part of the pose.
     """
+    check_choice("task", task, TASK_ROWS)
     T, J = chain.transform_and_jacobian(q)
     if task in ("pose", "nearest pose"):
         return Pose.from_matrix(T).twist_to(pose), J
@@ -180,6 +181,7 @@ def task_basis(
         task: Constrained part of the pose.
         rank: `task_rank` of the arm.
     """
+    check_choice("task", task, TASK_ROWS)
     rows = _LINEAR.like(J).expand(*J.shape[:-2], 3, 6)
     if task in ("pose", "nearest pose"):
         if rank < 6:

@@ -18,6 +18,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.lerobot.arm_values import DOWN, GRIPPER, HAND, ActionSpace, ArmValues
@@ -199,6 +200,10 @@ class ArmRobotConfig(ValuesConfig, RobotConfig):
     """Actions a second: the rate of the dataset, or of the rollout."""
     person: PersonConfig = field(default_factory=PersonConfig)
     """Person that guides the body while actions command the end effector."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_settings(self, positive=["fps"])
 
 
 class ArmRobot(Device, Robot):

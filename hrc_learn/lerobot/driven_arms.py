@@ -23,6 +23,7 @@ from lerobot.robots import RobotConfig
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from hrc_learn.controller import SafetyConfig
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.hardware import ArmProcess, FrankyArm, FrankyConfig, Ros2Arm, Ros2Config
 from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.ros2_topics import Ros2Session, found_description, quality
@@ -55,6 +56,7 @@ class DrivenArmConfig(ArmRobotConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_settings(self, positive=["tcp_speed"], fraction=["dynamics"])
         if not 5 <= self.fps <= 1000:
             raise ValueError(f"fps must be from 5 to 1000, but is {self.fps}.")
         if self.person.kind == "scripted":

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from hrc_learn.controller.contact_limits import PersonMode
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import Arm as Driver
 from hrc_learn.protocols import Human
@@ -61,6 +62,8 @@ class PersonConfig:
     """Reaction to the worker: separation monitoring ("ssm"), force limiting ("pfl"), or both
     ("ssm+pfl").
     """
+
+    __post_init__ = check_settings
 
     def names(self, chain: SerialChain) -> tuple[str, ...]:
         """Names of the values observed of the person."""

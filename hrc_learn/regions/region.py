@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.pytree import pytree, static
 
 
@@ -21,6 +22,10 @@ class Region(ABC):
     Methods are pure and batched: the leading dimensions of `x` and of the region's tensors
     broadcast.
     """
+
+    def __post_init__(self) -> None:
+        if not torch.compiler.is_compiling():
+            check_settings(self)
 
     @abstractmethod
     def value(self, x: Float[Tensor, "*batch n"]) -> Tensor:

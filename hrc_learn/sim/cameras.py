@@ -10,7 +10,7 @@ import sys
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.numerics import check_settings
+from hrc_learn.geometry.numerics import check_choice, check_settings
 from hrc_learn.geometry.shapes import Line
 from hrc_learn.protocols import Camera
 from hrc_learn.sim.recorded_world import DrawnWorld, RecordedWorld
@@ -226,6 +226,7 @@ def open_camera(
     Raises:
         RenderingUnavailableError: If `kind` is "egl" and this machine cannot render.
     """
+    check_choice("kind", kind, get_args(CameraKind))
     if kind != "synthetic":
         try:
             return EGLCamera(world, model, rng=rng, noise=noise)

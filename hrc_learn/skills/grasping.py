@@ -114,6 +114,8 @@ class GraspingConfig:
     attempts: int = 3
     """Largest number of starts, including starts that fail before the fingers close."""
 
+    unbounded = ("detection_timeout",)
+
     def __post_init__(self) -> None:
         check_settings(self, positive=("lift", "attempts"), not_negative=["detection_timeout"])
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor
 from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.dmp import JointDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import check_choice
 from hrc_learn.kinematics import (
     Arm,
     SerialChain,
@@ -272,6 +273,7 @@ class PlacingSkill:
         Raises:
             UnreachableError: No joint positions reach the goal.
         """
+        check_choice("space", space, get_args(PlanningSpace))
         # Refuse an unreachable goal before planning, in both spaces.
         end = self.robot.inverse(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed

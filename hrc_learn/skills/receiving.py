@@ -61,6 +61,8 @@ class ReceivingConfig:
     timeout: float = 30.0
     """Give up after this long [s]."""
 
+    unbounded = ("timeout",)
+
     def __post_init__(self) -> None:
         check_settings(self, positive=vars(self))
 

@@ -116,9 +116,12 @@ class VisualServoConfig:
     drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
     """Effect of a person's drawing on the goals."""
 
+    unbounded = "timeout", "occlusion_timeout", "lost_after"
+
     def __post_init__(self) -> None:
-        tolerances = "tolerance", "height_tolerance", "turn_tolerance"
-        check_settings(self, positive=(*tolerances, "max_probes", "turn_rate", "angle", "rate"))
+        positive = "tolerance", "height_tolerance", "turn_tolerance", "max_probes", "turn_rate"
+        not_negative = *self.unbounded, "probe", "rest_rate"
+        check_settings(self, positive=(*positive, "angle", "rate"), not_negative=not_negative)
 
     def scaled(self, size: float) -> "VisualServoConfig":
         """The same settings, with the lengths above the table scaled to a hand.

@@ -19,7 +19,7 @@ from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.controller.null_space_motion import fraction_in_null_space, fraction_kept
 from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.geometry.numerics import check_settings, null_projection
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import Arm, ArmState, Feedback, Human, HumanInput
 from hrc_learn.regions import PositionRegion
@@ -34,14 +34,9 @@ directions, it moves the elbow against the pull (benchmarks/bench_pull_mapping.p
 
 
 def check_positive(settings: object) -> None:
-    """Check that all numbers among the fields of a configuration are positive.
-
-    Raises:
-        ValueError: A number is not positive.
-    """
-    for name, value in vars(settings).items():
-        if isinstance(value, float | int) and not value > 0:
-            raise ValueError(f"{name} must be positive, but is {value}.")
+    """`check_settings` with all numbers among the fields positive."""
+    numbers = [name for name, value in vars(settings).items() if isinstance(value, float | int)]
+    check_settings(settings, positive=numbers)
 
 
 @dataclass(frozen=True, kw_only=True)

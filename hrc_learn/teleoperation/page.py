@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from hrc_learn.geometry import Box, Pose
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.store import json_text
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
@@ -75,6 +76,7 @@ class PageConfig(AddressConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_settings(self, positive=("silence", "timeout"))
         level = np.array(self.touch_points).reshape(-1, 3)[:, :2]
         apart = np.linalg.norm(level[:, None] - level, axis=-1)[~np.eye(len(level), dtype=bool)]
         if len(level) < 3 or not (apart >= _APART).all():

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import UnreachableError, coarse_orientation, gripper_down
 from hrc_learn.protocols import Camera, Human, HumanInput
 from hrc_learn.sim import HAND_MARKER, World
@@ -51,8 +52,8 @@ class DemonstrationConfig:
     """Control steps from one recorded frame to the next."""
 
     def __post_init__(self) -> None:
-        if self.record_every < 1:
-            raise ValueError(f"record_every must be at least 1, but is {self.record_every}.")
+        positive = "duration", "record_every"
+        check_settings(self, positive=positive, not_negative=("tremor", "settle"))
 
     @property
     def fps(self) -> float:

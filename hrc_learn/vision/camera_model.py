@@ -51,7 +51,8 @@ class CameraModel:
                 f"{np.linalg.det(R):.3g}. CameraModel.look_at() builds a pose from two points."
             )
         sizes = self.width, self.height, self.focal
-        if not min(self.width, self.height, *self.focal) > 0:
+        numbers = [*sizes[:2], *self.focal, *self.principal, *self.distortion]
+        if not (np.isfinite(numbers).all() and min(numbers[:4]) > 0):
             raise ValueError(f"width, height and focal must be positive, but are {sizes}.")
 
     def look_at(

@@ -30,7 +30,7 @@ class ImageNoise:
     """Standard deviation of the noise, in grey levels of 255; 0 switches it off."""
 
     def __post_init__(self) -> None:
-        if not (self.blur >= 0 and self.noise >= 0):
+        if not (0 <= self.blur < np.inf and 0 <= self.noise < np.inf):
             raise ValueError(f"blur and noise must not be negative: {self.blur}, {self.noise}.")
 
     def degrade(

@@ -419,7 +419,8 @@ def viewer(monkeypatch):
         raise KeyboardInterrupt  # instead of waiting for it
 
     monkeypatch.setattr(dashboard_commands.subprocess, "run", start)
-    monkeypatch.setattr(dashboard_commands.threading.Event, "wait", lambda event: None)
+    waiting = SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
+    monkeypatch.setattr(dashboard_commands, "threading", waiting)
     monkeypatch.setattr(dashboard_page, "serve_recordings", serve)
     monkeypatch.setattr(dashboard_page, "_viewer_contents", dict)
     return opened

@@ -152,3 +152,5 @@ def test_durations_of_a_batch_keep_both_limits_towards_another_goal():
         dmp.admissible_duration(velocity=0.0)
     with pytest.raises(ValueError, match=r"acceleration must have shape \(\.\.\., 2\), got"):
         dmp.admissible_duration(acceleration=[1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match="give velocity or acceleration, or both"):
+        dmp.admissible_duration(goal=goal)

@@ -46,6 +46,13 @@ def test_where_there_is_no_path_there_is_no_distance():
     assert np.isnan(path_distance(held[:1], np.full((1, 3), np.nan), TIME[:1])).all()
 
 
+def test_a_clock_that_stalls_does_not_end_the_measurement():
+    time = np.repeat(TIME[::4], 4)
+    beside = arc(TIME) + np.array([0.0, 0.0, 0.003])
+    np.testing.assert_allclose(path_distance(beside, arc(TIME), time), 0.003, atol=1e-5)
+    assert np.isfinite(path_distance(beside, arc(TIME), np.zeros(300))).all()
+
+
 def pushed_aside(planned):
     """Joints that go along their null space for a second and a half; a log of it."""
     q, log = panda.ready.clone(), StepLog()

@@ -88,6 +88,38 @@ def test_a_task_moves_the_arm_and_the_world_that_is_believed_follows(world, tmp_
     assert {"run.rrd", "log.npz"} <= {file.name for file in (tmp_path / "run").iterdir()}
 
 
+def test_after_a_stop_by_the_driver_the_arm_starts_from_rest(world, monkeypatch):
+    """The arm's process stops it at step 20: the commands after it begin at zero velocity."""
+    sent = []
+
+    class Process:
+        trips = 0
+
+        def __getattr__(self, name):
+            return getattr(world.arm, name)
+
+        def command(self, velocity):
+            sent.append(velocity)
+            self.trips += len(sent) == 20
+            world.arm.command(velocity if len(sent) != 20 else 0 * velocity)
+
+    @contextmanager
+    def opened(site):
+        yield Process()
+
+    def task(cell, check):
+        for _ in range(40):
+            cell.step(torch.tensor([0.0, 0, 0, 0, 0, 0, 0.4], dtype=torch.float64))
+        return ""
+
+    monkeypatch.setattr(on_arm, "opened_arm", opened)
+    run_on_arm(SITE, WORKPLACE, task)
+    speeds = np.abs(np.array(sent)[:, 6])
+    assert speeds[19] == pytest.approx(0.4, abs=1e-3)
+    assert speeds[20] < 0.5 * speeds[19]
+    assert speeds[-1] == pytest.approx(0.4, abs=1e-3)
+
+
 @pytest.mark.parametrize("error", [TaskFailedError, CameraError])
 def test_a_task_that_fails_says_why(world, error, tmp_path):
     def task(cell, check):

@@ -1,7 +1,9 @@
 """Small matrices written out for compilers, against LAPACK, and constants."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -151,7 +153,6 @@ def test_it_is_converted_once():
     ("rule", "good", "bad", "words"),
     [
         ("positive", [1e-9, 2.0], [0.0, -1.0], "x must be positive, but is"),
-        ("finite", [1e-9, 2.0], [0.0, math.inf], "x must be positive and finite, but is"),
         ("not_negative", [0.0, 2.0], [-1e-9], "x must not be negative, but is"),
         ("below_one", [0.0, 0.99], [-1e-9, 1.0], r"x must be in \[0, 1\), but is"),
         ("fraction", [1e-9, 1.0], [0.0, 1.01], r"x must be in \(0, 1\], but is"),
@@ -163,6 +164,29 @@ def test_settings_are_held_to_their_range(rule, good, bad, words):
     for value in (*bad, math.nan):
         with pytest.raises(ValueError, match=f"{words} {value}"):
             check_settings(SimpleNamespace(x=value), **{rule: ["x"]})
+
+
+@dataclasses.dataclass
+class Settings:
+    """Settings without ranges of their own."""
+
+    kind: Literal["", "one"] = ""
+    size: tuple[float, float] = (1.0, 2.0)
+    cap: float = 1.0
+    unbounded = ("cap",)
+
+    __post_init__ = check_settings
+
+
+def test_all_settings_are_finite_and_names_are_known():
+    assert Settings(kind="one", cap=math.inf).cap == math.inf
+    for wrong, words in (
+        ({"cap": math.nan}, "cap must be finite, but is nan"),
+        ({"size": (1.0, math.inf)}, r"size must be finite, but is \(1.0, inf\)"),
+        ({"kind": "two"}, "kind must be '' or one, but is 'two'"),
+    ):
+        with pytest.raises(ValueError, match=words), shapes_unchecked():
+            Settings(**wrong)
 
 
 def frozen(array):

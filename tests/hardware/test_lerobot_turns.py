@@ -189,9 +189,9 @@ def test_the_gripper_opens_by_its_share_of_the_opening(servos, connect):
     ("settings", "message"),
     [
         *(({name: 0.0}, f"{name} must be positive") for name in ("rate", "opening", "lag")),
-        ({"blocked": math.nan}, "blocked must be positive and finite"),
-        ({"timeout": math.inf}, "timeout must be positive and finite"),
-        ({"unit": "grad"}, "unit must be deg, rad or empty, but is 'grad'"),
+        ({"blocked": math.nan}, "blocked must be positive"),
+        ({"timeout": math.inf}, "timeout must be finite"),
+        ({"unit": "grad"}, "unit must be '' or deg or rad, but is 'grad'"),
     ],
 )
 def test_settings_are_checked(settings, message):

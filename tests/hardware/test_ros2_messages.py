@@ -362,7 +362,7 @@ def test_each_newer_state_is_answered_in_the_thread_that_receives_it(graph):
         ({"gripper_joint": "g"}, "belong together"),
         ({"opening": 0.0}, "opening must be positive"),
         ({"gripper_closed": 0.04}, "gripper_open and gripper_closed must be"),
-        ({"gripper_open": np.nan}, "gripper_open and gripper_closed must be"),
+        ({"gripper_open": np.nan}, "gripper_open must be finite"),
     ],
 )
 def test_settings_are_checked(settings, message):
@@ -474,6 +474,19 @@ def test_a_wrench_becomes_torques_of_the_joints_as_in_mujoco(graph):
         text = r"the newest wrench on /wrench is 0\.2[12] s old: the arm is stopped"
         with pytest.raises(ArmFaultError, match=text):
             arm.command(np.zeros(7))
+
+
+def test_a_wrench_in_an_unknown_frame_stops_the_arm(graph):
+    with feeling_arm(graph) as arm:
+        for step in range(3):
+            graph.now += 0.15
+            feel(graph, np.ones(3), np.ones(3), "sensor_link")
+            graph.state(10.0 + 0.15 * (step + 1), READY)
+        text = "on /wrench is in frame 'sensor_link': publish it in 'base_link', or set wrench"
+        with pytest.raises(ArmFaultError, match=text):
+            arm.read()
+        feel(graph, np.ones(3), np.ones(3), "tool0")
+        assert np.isfinite(arm.read().external_torque).all()
 
 
 def test_a_push_that_the_sensor_feels_pauses_the_task(graph):

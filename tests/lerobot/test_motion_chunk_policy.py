@@ -593,9 +593,9 @@ def test_the_learning_rate_rises_and_then_falls_to_nothing(steps, warm_up):
         ({"chunk_size": 3, "n_action_steps": 2}, "chunk_size must be at least 4, got 3"),
         ({"history": 0, "state_noise": 0.0, "blend_time": 1e-9}, ""),
         ({"history": -1}, "history must be at least 0, got -1"),
-        ({"state_noise": float("nan")}, "state_noise must be at least 0, got nan"),
+        ({"state_noise": float("nan")}, "state_noise must be finite, but is nan"),
         ({"blend_time": 0.0}, "blend_time must be positive seconds, got 0.0"),
-        ({"blend_time": float("nan")}, "blend_time must be positive seconds, got nan"),
+        ({"blend_time": float("nan")}, "blend_time must be finite, but is nan"),
     ],
 )
 def test_settings_have_their_least_values(settings, complaint):

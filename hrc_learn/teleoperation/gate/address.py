@@ -46,7 +46,7 @@ class AddressConfig:
             raise ValueError(f"port must be 0 to 65535, but is {self.port}.")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate and key must be given together, or neither.")
-        if self.most_clients < 1:
+        if not self.most_clients >= 1:
             raise ValueError(f"most_clients must be at least 1, but is {self.most_clients}.")
 
     @property
