@@ -102,6 +102,13 @@ def status_of(work: Callable[[], int]) -> int:
             raise
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "allocate memory" not in str(error):
+            raise
+        print(
+            f"failed: not enough memory for so much at once: {one_line(error)}", file=sys.stderr
+        )
+        return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 1

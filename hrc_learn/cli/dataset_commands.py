@@ -98,8 +98,8 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
         units=said.units | args.units,
         time=args.time or said.time,
         joint_names=tuple(_words(args.joint_names)) or said.joint_names,
-        duration=args.duration or said.duration,
-        fps=args.fps or said.fps,
+        duration=said.duration if args.duration is None else args.duration,
+        fps=said.fps if args.fps is None else args.fps,
         task=said.task if args.task is None else args.task,
     )
 

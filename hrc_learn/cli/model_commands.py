@@ -18,7 +18,7 @@ from hrc_learn.cli.tokens_command import held_out
 from hrc_learn.demos import DemonstrationSet
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.model_choice import best_models, predict
-from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, sampled
+from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, load_primitive, sampled
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, read_toml, write_json
 from hrc_learn.viz import palette
@@ -38,6 +38,8 @@ def evaluate(args: Evaluate) -> int:
             episode is left to fit.
     """
     refuse_repeats(args.episodes)
+    if args.most_nrmse is not None and not args.most_nrmse >= 0:
+        raise ValueError(f"--most-nrmse must not be negative, but is {args.most_nrmse}")
     if args.model is not None and not args.model.is_dir():
         raise FileNotFoundError(f"there is no model at {args.model}")
     if not args.dataset.is_dir():
@@ -142,6 +144,10 @@ def _demonstrations(args: Evaluate, model: Path, console: Console) -> Demonstrat
                 console.print("note: all of these demonstrations were learned from")
         elif not learned or set(episodes) & learned:
             console.print("note: some of these demonstrations were learned from")
+    elif (model / "joint").is_dir():
+        # Another dataset may hold other joints, or the same joints in another order.
+        names = load_primitive(model / "joint", "joint").joint_names
+        wanted["joint_names"] = names or wanted["joint_names"]
     source, notes = open_moving(args.dataset, episodes, **wanted)
     for note in notes:
         console.print(f"note: {note}")

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS, Demonstration, DemonstrationSet
+from hrc_learn.demos.read.dataset_folder import FASTEST
 from hrc_learn.geometry import quaternion
 
 
@@ -315,8 +316,8 @@ def regular_grid(duration: float | int, fps: float | int) -> Float64[np.ndarray,
     Raises:
         ValueError: `fps` is not positive, or the duration is shorter than a period.
     """
-    if not 0 < fps < np.inf:
-        raise ValueError(f"fps must be positive, got {fps}")
+    if not 0 < fps < FASTEST:
+        raise ValueError(f"fps must be positive and below {FASTEST:g}, got {fps}")
     # The tolerance of a thousandth of a period allows for rounded stamps.
     count = int(np.floor(duration * fps + 1e-3)) + 1
     if count < 2:

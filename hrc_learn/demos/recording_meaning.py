@@ -259,9 +259,12 @@ def read_columns(
     """Values of the columns in one episode, as recorded.
 
     Raises:
-        DatasetError: The fields differ in their numbers of frames.
+        DatasetError: A field holds no numbers, or the fields differ in their numbers of frames.
     """
     names = dict.fromkeys(name for name, _ in places)
+    for name in names:
+        if recording.fields[name].kind in ("text", "other"):
+            raise recording.error("holds no real numbers: save it as numbers", name)
     read = {name: recording.fields[name].numbers() for name in names}
     lengths = {name: len(values) for name, values in read.items()}
     if len({*lengths.values()}) > 1:

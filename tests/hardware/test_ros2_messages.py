@@ -357,7 +357,7 @@ def test_each_newer_state_is_answered_in_the_thread_that_receives_it(graph):
     ("settings", "message"),
     [
         *(({name: 0.0}, f"{name} must be positive") for name in ("timeout", "lag", "startup")),
-        ({"silence": np.inf}, "silence must be positive"),
+        ({"silence": np.inf}, "silence must be finite"),
         ({"gripper": "/g"}, "belong together"),
         ({"gripper_joint": "g"}, "belong together"),
         ({"opening": 0.0}, "opening must be positive"),

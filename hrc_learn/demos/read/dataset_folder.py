@@ -22,7 +22,7 @@ from hrc_learn.demos.read.metadata import QUANTILES, Feature, Statistics, read_f
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import resolved, settle
 
-_FASTEST = 1e6
+FASTEST = 1e6
 """Upper bound of the frame rate [1/s]; no robot reports faster."""
 _REQUIRED = {*QUANTILES, "min", "max", "mean", "std", "count"}
 
@@ -142,7 +142,7 @@ def read_info(root: Path) -> dict:
     number = isinstance(fps, int | float) and not isinstance(fps, bool)
     for key, sound, text in (
         ("codebase_version", generation(version) is not None, "2.0, 2.1 or 3.0"),
-        ("fps", number and 0 < fps < _FASTEST, f"positive and below {_FASTEST:g}"),
+        ("fps", number and 0 < fps < FASTEST, f"positive and below {FASTEST:g}"),
         ("features", isinstance(info["features"], dict), "an object"),
     ):
         if not sound:
