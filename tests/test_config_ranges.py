@@ -34,7 +34,9 @@ def configurations():
                 continue
             if kind.__name__ == "ValuesConfig":  # a part of the robots' configurations
                 continue
-            if kind.__module__ == module.name and kind.__name__.endswith(("Config", "Site")):
+            if kind.__module__ == module.name and kind.__name__.endswith(
+                ("Config", "Site", "Settings")
+            ):
                 required = [
                     field
                     for field in dataclasses.fields(kind)

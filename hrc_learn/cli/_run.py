@@ -105,9 +105,7 @@ def status_of(work: Callable[[], int]) -> int:
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and "allocate memory" not in str(error):
             raise
-        print(
-            f"failed: not enough memory for so much at once: {one_line(error)}", file=sys.stderr
-        )
+        print(f"failed: not enough memory: {one_line(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

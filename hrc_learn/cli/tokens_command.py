@@ -16,6 +16,7 @@ from hrc_learn.cli.arguments import Tokens, refuse_given, sibling
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.dmp.tokens import MotionTokenizer
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.store import new_folder, read_made_by, read_toml, write_json
 from hrc_learn.viz.report import Measurement, show_measurements
 
@@ -42,6 +43,9 @@ class TokenSettings:
     no velocity is used."""
     held_out: int = 5
     """n: every n-th episode is held out of the fit, for the report; 0: none is held out."""
+
+    def __post_init__(self) -> None:
+        check_settings(self, positive=["seconds"], not_negative=["held_out"])
 
 
 class Chunks(NamedTuple):

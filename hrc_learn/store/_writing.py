@@ -220,10 +220,11 @@ class Claim:
         path = self.workspace / _LOCK
         while True:
             _require_ours(self.workspace)
+            with contextlib.suppress(FileExistsError):
+                self.workspace.mkdir()
             try:
-                self.workspace.mkdir(exist_ok=True)
                 file = path.open("a+", encoding="utf-8")
-            except (FileExistsError, FileNotFoundError):
+            except FileNotFoundError:
                 continue  # the last writer has just removed the workspace
             try:
                 if not disk.try_lock(file):

@@ -62,6 +62,38 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     done("evaluate", "--model", model, "--dataset", poses, "--most-nrmse", 1e-9, status=1)
 
 
+def test_a_model_is_not_evaluated_on_other_joints_nor_against_an_impossible_limit(tmp_path):
+    episodes = [{"observation.state": joint_path(40, seed=k)} for k in range(3)]
+    sets = []
+    for names, order in (("abc", [0, 1, 2]), ("cab", [2, 0, 1]), ("abd", [0, 1, 2])):
+        moved = [{key: values[:, order] for key, values in one.items()} for one in episodes]
+        sets.append(write_folder(tmp_path / names, moved, {"observation.state": [*names]}))
+    fit = (
+        "fit",
+        "--dataset",
+        sets[0],
+        "--n-basis",
+        10,
+        "--episodes",
+        0,
+        1,
+        "--channels",
+        "joint",
+    )
+    done(*fit, "--units", "joint_position", "rad", "--out", tmp_path / "model")
+    evaluate = ("evaluate", "--model", tmp_path / "model", "--dataset")
+    figures = tmp_path / "figures.json"
+    done(*evaluate, sets[0], "--episodes", 2, "--json", figures)
+    first = json.loads(figures.read_text())
+    assert done(*evaluate, sets[2], status=2).error.startswith("error: no joint named c")
+    for limit in ("nan", "-1"):
+        refused = done(*evaluate, sets[0], "--most-nrmse", limit, status=2).error
+        assert refused == f"error: --most-nrmse must not be negative, but is {float(limit)}\n"
+    # The same motions with their joints in another order.
+    done(*evaluate, sets[1], "--episodes", 2, "--json", figures)
+    assert json.loads(figures.read_text()) == pytest.approx(first)
+
+
 @pytest.mark.long
 def test_an_episode_of_one_frame_is_left_out_of_a_fit_with_a_note(tmp_path):
     lengths = (60, 1, 50, 1)

@@ -128,6 +128,9 @@ def raising(error):
         (OSError(28, "No space left", "out"), 2, "error: out: No space left"),
         (OSError(28, "No space left"), 2, "error: [Errno 28] No space left"),
         (KeyboardInterrupt(), 1, "interrupted"),
+        (MemoryError("9 TiB"), 1, "failed: not enough memory: 9 TiB"),
+        (RuntimeError("can't allocate memory"), 1,
+         "failed: not enough memory: can't allocate memory"),
     ],
 )  # fmt: skip
 def test_errors_are_one_line_and_a_status(error, status, text, capsys):

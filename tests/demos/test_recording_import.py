@@ -10,7 +10,7 @@ from recording_samples import WAVES as Q
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
-from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.demonstration import Demonstration, float_array
 from hrc_learn.demos.recording_files import Recording, array_field
 from hrc_learn.demos.recording_import import ImportPlan, _images, _with_next_states, plan_import
 from hrc_learn.demos.recording_meaning import understand
@@ -48,6 +48,15 @@ def test_images_of_any_form_become_rgb(pixels, first):
     assert all(image.shape == (16, 16, 3) for image in shown)
     assert all(image.dtype == np.uint8 for image in shown)
     assert {int(v) for image in shown for v in image.ravel()} == {first}
+
+
+def test_complex_numbers_are_no_joint_positions(tmp_path):
+    np.savez(tmp_path / "waves.npz", q=Q + 1j, t=np.arange(len(Q)) / 30)
+    options = ImportOptions(columns={"joint_position": ["q"]}, time="t")
+    with pytest.raises(DatasetError, match=r"waves.npz, q: holds no real numbers"):
+        plan_import([tmp_path / "waves.npz"], options)
+    with pytest.raises(ValueError, match="must be real numbers, but are complex"):
+        float_array(np.full((2, 1), 1j))
 
 
 @pytest.mark.parametrize(("brightest", "first"), [(1.0, 255), (200.0, 200)])

@@ -215,6 +215,12 @@ def test_folders_of_texts_and_values_are_made_where_they_are_missing(tmp_path):
     assert written == {"a": 0.5, "b": 3, "c": None, "d": True}
 
 
+def test_a_folder_that_takes_no_new_files_is_an_error_at_once():
+    """/proc, like a network folder that is away, reports that the new file does not exist."""
+    with pytest.raises(FileNotFoundError, match="hrc"), new_file(Path("/proc/hrc")):
+        pass
+
+
 @pytest.mark.parametrize(("given", "place"), [("caches", "caches"), ("", "home/.cache")])
 def test_caches_are_where_the_user_keeps_them(tmp_path, monkeypatch, given, place):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
