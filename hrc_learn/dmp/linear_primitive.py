@@ -566,9 +566,11 @@ class LinearPrimitive(nn.Module):
 
 
 def check_names(joint_names: Sequence[str] | None, D: int) -> None:
-    """Raise ValueError if there are names, but not D of them."""
+    """Raise ValueError if there are names, but not D different ones."""
     if joint_names is not None and len(joint_names) != D:
         raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
+    if joint_names is not None and len({*joint_names}) != D:
+        raise ValueError(f"joint names must differ, but are {', '.join(joint_names)}")
 
 
 def _tensor_arguments(tensors: Mapping[str, Tensor]) -> dict[str, Any]:

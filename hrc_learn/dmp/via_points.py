@@ -155,9 +155,10 @@ def _change_curve(
     knots, order = _knots(via, window)
     values = torch.nn.functional.pad(missing, (0, 0, 0, 0, 1, 1))
     values = torch.take_along_dim(values, order[..., None, None], dim=-3)
-    active = ~values[..., 0, :].isnan()
-    value, rate = torch.where(active[..., None, :], values, 0.0).unbind(-2)
-    return piecewise_quintic(s, knots, value, rate.nan_to_num(), active)
+    # Where only a rate is given, the curve keeps the position, which may change nevertheless.
+    active = ~values.isnan().all(-2)
+    value, rate = values.nan_to_num().unbind(-2)
+    return piecewise_quintic(s, knots, value, rate, active)
 
 
 def _window(

@@ -37,12 +37,17 @@ def as_tensor(values: ArrayLike, like: Tensor | None = None) -> Tensor:
 
     Returns:
         Tensor of the same shape.
+
+    Raises:
+        ValueError: The values are complex.
     """
     if not isinstance(values, Tensor):
         if isinstance(values, np.ndarray):
             # PyTorch accepts neither negative strides nor other byte orders.
             values = np.require(values, values.dtype.newbyteorder("="), ["C", "W"])
         values = torch.as_tensor(np.asarray(values))
+    if values.is_complex():
+        raise ValueError("values must be real numbers, but are complex")
     if not values.is_floating_point():
         values = values.double()
     return values if like is None else values.to(like)

@@ -153,7 +153,8 @@ def mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
     matrix and those of the inputs (Markley et al. 2007, "Averaging quaternions").
     """
     q64 = q.double()
-    return torch.linalg.eigh(q64.mT @ q64).eigenvectors[:, -1].to(q)
+    found = torch.linalg.eigh(q64.mT @ q64).eigenvectors[:, -1]
+    return found.to(q) if q.is_floating_point() else found
 
 
 def continuous(q: Float[Tensor, "*batch time 4"]) -> Float[Tensor, "*batch time 4"]:

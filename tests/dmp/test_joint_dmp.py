@@ -316,6 +316,7 @@ def broken(values, index, value):
         (TIME, POSITION, {"velocity": broken(POSITION, (1, 0), torch.inf)}, "velocity is inf"),
         (TIME, POSITION, {"mask": torch.zeros(20)}, "at least 3 samples, got 0"),
         (TIME, POSITION, {"joint_names": ["a"]}, "1 joint names for 2 coordinates"),
+        (TIME, POSITION, {"joint_names": ["a", "a"]}, "joint names must differ, but are a, a"),
         (
             TIME,
             POSITION[:, [0, 0]] * 0,

@@ -46,6 +46,17 @@ def test_via_points_are_passed_exactly_with_the_velocity_kept():
     torch.testing.assert_close(there.position[:, 1], plain.position[:, 1])
 
 
+def test_a_via_point_may_be_a_velocity_alone():
+    dmp = JointDMP.fit(*arm_motion(n_joints=3))
+    there = dmp.rollout(time=[1.5])
+    wanted = there.velocity + torch.tensor([[0.4, -0.3, NAN]]).double()
+    bent = dmp.condition([1.5], velocity=wanted)
+    velocity = bent.rollout(time=[1.5]).velocity
+    torch.testing.assert_close(velocity[:, :2], wanted[:, :2], rtol=0, atol=1e-9)
+    moved = (bent.rollout(time=DENSE).position - dmp.rollout(time=DENSE).position).abs().amax(0)
+    assert (moved < torch.tensor([0.2, 0.2, 1e-9])).all()
+
+
 def test_no_via_points_leave_the_motion_as_it_is():
     time, position = arm_motion(n_joints=2)
     dmp = JointDMP.fit(time, position, 20)

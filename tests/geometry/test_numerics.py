@@ -166,6 +166,12 @@ def test_settings_are_held_to_their_range(rule, good, bad, words):
             check_settings(SimpleNamespace(x=value), **{rule: ["x"]})
 
 
+def test_complex_values_are_refused():
+    for values in (torch.ones(2) * 1j, np.ones(2) * 1j, [1j]):
+        with pytest.raises(ValueError, match="must be real"), shapes_unchecked():
+            as_tensor(values)
+
+
 @dataclasses.dataclass
 class Settings:
     """Settings without ranges of their own."""

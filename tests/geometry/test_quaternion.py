@@ -6,6 +6,7 @@ import torch
 from sampling import directions, generator, quaternions, rotation_vectors
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
+from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import quaternion
 
@@ -186,6 +187,12 @@ def test_broadcasts():
     assert quaternion.multiply(q, many).shape == (4, 5, 4)
     assert quaternion.rotate(q, directions(5, rng=rng)).shape == (4, 5, 3)
     assert quaternion.rotate(many[0], directions(5, rng=rng)).shape == (5, 3)
+
+
+def test_the_mean_of_whole_numbers_is_no_whole_number():
+    with shapes_unchecked():
+        q = torch.tensor([[1, 0, 0, 0], [1, 1, 0, 0], [1, 0, 1, 0]])
+        assert_close(quaternion.mean(q), quaternion.mean(q.double()))
 
 
 def test_the_mean_is_nearest_to_all_matrices_whatever_the_signs():
