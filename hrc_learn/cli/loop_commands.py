@@ -36,7 +36,6 @@ from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
 from hrc_learn.experiments.real_arm import ArmSite, opened_arm
 from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.hardware import DriverError, ending_at_rest
 from hrc_learn.hardware.ros2_topics import found_description, ros2_origin
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
@@ -223,8 +222,6 @@ class _ServeSettings:
     """fastest: compile the step to machine code; eager: do not compile it."""
     autostart: bool = True
     """Configure and activate the node at once; False: a launch file does this."""
-
-    __post_init__ = check_settings
 
 
 def serve(args: Serve) -> None:

@@ -79,11 +79,10 @@ class ControllerConfig:
     unbounded = "linear_speed", "angular_speed", "vision_rate"
 
     def __post_init__(self):
-        speeds = "linear_speed", "angular_speed"
         approach = "approach_linear_speed", "approach_angular_speed"
         check_settings(
             self,
-            positive=(*speeds, *approach, "vision_rate", "null_damping"),
+            positive=(*self.unbounded, *approach, "null_damping"),
             not_negative=("drift_compensation_rate", "command_delay"),
         )
 

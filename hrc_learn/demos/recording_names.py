@@ -7,14 +7,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.read import naming
 from hrc_learn.demos.read.columns import ColumnSelection, feature_key
 from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.recording_files import UNNAMED, Field, Recording
+from hrc_learn.geometry.numerics import check_settings
 
 Place = tuple[str, int]
 """Field and component."""
@@ -56,9 +55,7 @@ class ImportOptions:
     """Task in words."""
 
     def __post_init__(self) -> None:
-        for name, value in (("duration", self.duration), ("fps", self.fps)):
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"{name} must be positive, got {value}")
+        check_settings(self, positive=("duration", "fps"))
         for name in self.columns:
             if name not in ROLES and name != "action" and not name.startswith("observation."):
                 known = ", ".join([*ROLES, "action"])

@@ -12,28 +12,21 @@ import math
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.numerics import polynomial
+from hrc_learn.geometry.numerics import check_settings, polynomial
 
 CRITICAL = 1e-12
 """Bound on |1 - 4 beta / alpha| below which the damping counts as critical. At smaller
 values, sinh(r s) / r would lose more than six digits to cancellation."""
 ROUNDING = 38.0
 """Decay exponent beyond which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
-DOMAINS = ("time", "phase")
 DEGREE = 3
 """Degree of the splines: the lowest that gives a forcing with continuous second derivative."""
-
-
-def check_positive(name: str, value: float) -> None:
-    """Raise ValueError unless `value` is positive and finite."""
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be positive and finite, got {value}")
 
 
 def check_count(count: int) -> None:
@@ -58,8 +51,7 @@ class SpringDamper:
     def __post_init__(self):
         if math.isnan(self.beta):
             object.__setattr__(self, "beta", self.alpha / 4)
-        for name in ("alpha", "beta"):
-            check_positive(name, getattr(self, name))
+        check_settings(self, positive=("alpha", "beta"))
 
     @property
     def stiffness(self) -> float:
@@ -159,7 +151,7 @@ class ExponentialPhase:
     """alpha_z: the phase falls to exp(-decay) by the end of the motion."""
 
     def __post_init__(self):
-        check_positive("decay", self.decay)
+        check_settings(self, positive=["decay"])
 
     def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Phase z at normalised time `s`."""
@@ -195,7 +187,7 @@ class GaussianBasis:
     """N, the number of basis functions."""
     width: float = 0.6
     """sigma_i relative to the distance between neighbouring centres."""
-    domain: str = "time"
+    domain: Literal["time", "phase"] = "time"
     """Variable of the Gaussians: `"time"` or `"phase"`."""
     phase: ExponentialPhase = ExponentialPhase()
     """Canonical system, whose z fades the forcing term."""
@@ -204,12 +196,8 @@ class GaussianBasis:
     """No knots: smooth everywhere."""
 
     def __post_init__(self):
-        check_positive("width", self.width)
         check_count(self.count)
-        if self.domain not in DOMAINS:
-            raise ValueError(
-                f"unknown domain {self.domain!r}; choose from {', '.join(DOMAINS)}"
-            )
+        check_settings(self, positive=["width"])
 
     @property
     def horizon(self) -> float:
@@ -279,8 +267,8 @@ class PeriodicBasis:
     """The period: a whole number of pieces of the response's table then covers one period."""
 
     def __post_init__(self):
-        check_positive("width", self.width)
         check_count(self.count)
+        check_settings(self, positive=["width"])
 
     @property
     def smooth_interval(self) -> float:

@@ -94,13 +94,11 @@ class MotionHead(nn.Module):
         """
         super().__init__()
         low, high = duration if isinstance(duration, tuple) else (duration, duration)
-        if not (0 < low <= high < math.inf and 0 <= delay < math.inf):
+        if not (columns > 0 and 0 < low <= high < math.inf and 0 <= delay < math.inf):
             raise ValueError(
-                "duration must be positive, with an ordered range, and delay not negative; got "
-                f"{duration} and {delay}"
+                "columns and duration must be positive, with an ordered range, and delay not "
+                f"negative; got {columns}, {duration} and {delay}"
             )
-        if not columns >= 1:
-            raise ValueError(f"columns must be at least 1, got {columns}")
         self.columns = columns
         self.shortest, self.longest, self.latest = low, high, delay
         self.response = response_of(SpringDamper(), GaussianBasis(count=n_basis), 1.0)

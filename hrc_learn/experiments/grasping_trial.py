@@ -18,7 +18,6 @@ from hrc_learn.experiments.simulated_cell import (
     simulated_cell,
 )
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.protocols import Human
 from hrc_learn.sim import CameraKind, Imperfections, ObjectConfig, World, open_camera
 from hrc_learn.sim.imperfections import DrawnImperfections
@@ -61,8 +60,6 @@ class GraspingSceneConfig:
     """Rotation of the camera about its axis since the demonstrations [rad]."""
     random_camera: bool = False
     """Shift and tilt the camera, and rotate it by a random angle instead of `camera_roll`."""
-
-    __post_init__ = check_settings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,7 +23,6 @@ from jaxtyping import Float
 
 from hrc_learn.distributed import ByValue, worker_pool
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim.step_checks import PhysicsError, PhysicsWatch
 from hrc_learn.teleoperation.scenarios import SCENARIOS, ScenarioRun, make_scenario
@@ -79,9 +78,6 @@ class JudgeConfig:
     """Position of the arm's base in an MJCF scene [m]."""
     processes: int = 2
     """Number of processes that judge motions."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, positive=["processes"])
 
     def open(self, robot: ArmChoice, fps: float, widest: float) -> CellJudge | SceneJudge:
         """The judge for an arm.

@@ -100,8 +100,7 @@ class ArmSite:
     effector pauses the task."""
 
     def __post_init__(self) -> None:
-        fraction = "dynamics", "speed"
-        check_settings(self, fraction=fraction, not_negative=["camera_delay"])
+        check_settings(self, fraction=("dynamics", "speed"))
 
     @property
     def chain(self) -> Arm:

@@ -68,7 +68,7 @@ def check_settings(
     values. A dataclass without ranges can use this function as its `__post_init__`.
 
     Args:
-        settings: Object with the settings as attributes.
+        settings: Object with the settings as attributes; None is in every range.
         positive: Names of settings that must be positive.
         not_negative: Names of settings that must be zero or positive.
         below_one: Names of settings that must be in [0, 1).
@@ -86,7 +86,7 @@ def check_settings(
     for names, rule, holds in rules:
         for name in names:
             value = getattr(settings, name)
-            if not holds(value):
+            if value is not None and not holds(value):
                 raise ValueError(f"{name} {rule}, but is {value}")
     for name, known in _choices(type(settings)).items():
         check_choice(name, getattr(settings, name), known)
@@ -95,6 +95,12 @@ def check_settings(
         wrong = [x for x in numbers if isinstance(x, float) and not math.isfinite(x)]
         if wrong and (math.isnan(wrong[0]) or name not in getattr(settings, "unbounded", ())):
             raise ValueError(f"{name} must be finite, but is {value}")
+
+
+def check_positive(settings: object) -> None:
+    """`check_settings` for settings whose numbers are all positive."""
+    numbers = [name for name, value in vars(settings).items() if isinstance(value, float | int)]
+    check_settings(settings, positive=numbers)
 
 
 def check_choice(name: str, value: object, known: Collection[object]) -> None:

@@ -132,7 +132,7 @@ class Ros2Arm(Connected):
         self._width = math.nan if config.gripper else 0.0
         # Time of the newest wrench [s]; its frame, its force [N] and its torque [N m].
         self._felt = -math.inf if config.wrench else math.inf
-        self._wrench, self._refused = ("", np.zeros((2, 3))), ""
+        self._wrench = "", np.zeros((2, 3))
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
         # Times of the last command and of the last change of the goal [s].
@@ -175,11 +175,7 @@ class Ros2Arm(Connected):
             missing = sorted({*self._names, self.config.gripper_joint} - {*self._seen, ""})
             why = f"{', '.join(missing)} are not among {', '.join(self._seen)}"
             why = why if missing else "the wrench or their positions are missing or not finite"
-        topic, longest, why = (
-            self.config.joint_states,
-            self.config.startup,
-            self._refused or why,
-        )
+        topic, longest = self.config.joint_states, self.config.startup
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
 
     def _await_controllers(self) -> None:
@@ -193,13 +189,10 @@ class Ros2Arm(Connected):
                 time.sleep(0.02)
 
     def _on_wrench(self, message: Any) -> None:
-        parts, frame = (message.wrench.force, message.wrench.torque), message.header.frame_id
-        base, known = self.config.base, ("", self.config.base, self.config.wrench_frame)
-        remedy = f"publish it in {base!r}, or set wrench_frame to a frame with the tool's axes"
-        text = f"the wrench on {self.config.wrench} is in frame {frame!r}: {remedy}"
-        self._refused = "" if frame in known else text
+        parts = message.wrench.force, message.wrench.torque
         values = np.array([[part.x, part.y, part.z] for part in parts])
-        if not self._refused and np.isfinite(values).all():
+        frame, known = message.header.frame_id, ("", self.config.base, self.config.wrench_frame)
+        if frame in known and np.isfinite(values).all():
             self._wrench, self._felt = (frame, values), time.monotonic()
 
     def _on_state(self, message: Any) -> None:
@@ -263,12 +256,13 @@ class Ros2Arm(Connected):
             state, offset = self._state, self._offset
         assert state is not None
         config, taken = self.config, state.time + offset
-        wrench = (self._felt, f"wrench on {config.wrench}")
+        frames = " or ".join(filter(None, (config.base, config.wrench_frame)))
+        wrench = (self._felt, f"wrench on {config.wrench} in frame {frames}")
         since, what = min((taken, f"joint state on {config.joint_states}"), wrench)
         if (age := time.monotonic() - since) > config.silence:
-            reason = self._refused or f"the newest {what} is {age:.2f} s old"
             raise ArmFaultError(
-                f"{reason}: the arm is stopped. Check its driver and the network."
+                f"the newest {what} is {age:.2f} s old: the arm is stopped. Check its driver "
+                "and the network."
             )
         return state
 

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import check_settings, everywhere, is_number
+from hrc_learn.geometry.numerics import check_positive, everywhere, is_number
 from hrc_learn.jacobian.estimators import ImageJacobianEstimator, Measurement, evaluate
 from hrc_learn.jacobian.fitting import component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
@@ -87,8 +87,7 @@ class CameraConfig:
     surprises: int = 3
     """Number of consecutive images with such an error that count as a moved camera."""
 
-    def __post_init__(self) -> None:
-        check_settings(self, positive=vars(self))
+    __post_init__ = check_positive
 
 
 @pytree

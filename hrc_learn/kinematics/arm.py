@@ -19,13 +19,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import MeshFile, Pose, quaternion
-from hrc_learn.geometry.numerics import ArrayLike, as_tensor, check_choice
+from hrc_learn.geometry.numerics import ArrayLike, as_tensor
 from hrc_learn.kinematics.capsule_fit import capsule_volume, fit_body
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule, link_capsules
 from hrc_learn.kinematics.description import Shape
 from hrc_learn.kinematics.inverse import (
-    TASK_ROWS,
     TaskSpace,
     best_postures,
     solutions_from,
@@ -162,7 +161,6 @@ class Arm(SerialChain):
         self.description, self.base, self.tip = description, base, tip
         self.shape = shape or ArmShape()
         self.hand_size = hand_size
-        check_choice("task", task, TASK_ROWS)
         self.task: TaskSpace = task
         self._capsules, self._overlapping = capsules, tuple(overlapping)
         self._closed_form = closed_form

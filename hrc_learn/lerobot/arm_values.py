@@ -5,14 +5,13 @@ vector. Names end in `.pos` or `.vel` because lerobot-rollout passes on no other
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import check_choice
 from hrc_learn.kinematics import SerialChain, gripper_down
 from hrc_learn.protocols import ArmState
 
@@ -48,7 +47,6 @@ class ArmValues:
 
     def action_names(self, space: ActionSpace) -> tuple[str, ...]:
         """Names of an action's values, in the order of the action."""
-        check_choice("space", space, get_args(ActionSpace))
         return (*(self.joints if space == "joint" else HAND), GRIPPER)
 
     def action_of(

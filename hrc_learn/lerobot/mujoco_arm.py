@@ -45,9 +45,6 @@ class ImagesConfig:
     height: int = 120
     """Height of the images [px]."""
 
-    def __post_init__(self) -> None:
-        check_settings(self, positive=("width", "height"))
-
 
 @dataclass
 class MovedCameraConfig:
@@ -59,9 +56,6 @@ class MovedCameraConfig:
     """Angle by which the camera is turned [degrees]."""
     seed: int = 0
     """Random seed of the direction of motion and of the axis of rotation."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, not_negative=("distance", "angle", "seed"))
 
 
 @dataclass(kw_only=True)

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Box
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.arm_model import (
     FIRM,
@@ -73,8 +72,6 @@ class CabinetConfig:
     door_reach: float = 0.34
     """Width of the open door [m]; 0: no door."""
 
-    __post_init__ = check_settings
-
     def boxes(self) -> list[Box]:
         """Boards, walls, back and door."""
         x, w = (self.left + self.right) / 2, (self.right - self.left) / 2
@@ -117,9 +114,6 @@ class ObjectConfig:
     """[kg]"""
     marker: Marker = field(default_factory=lambda: Marker(11, 0.030))
     colour: tuple[float, float, float, float] = (0.16, 0.44, 0.70, 1.0)
-
-    def __post_init__(self) -> None:
-        check_settings(self, positive=["mass"])
 
     def scaled(self, size: float) -> "ObjectConfig":
         """The same object of the same density at another size, its marker included."""
@@ -250,9 +244,6 @@ class SceneConfig:
     """Look without markers (see `unmarked`); None: plain colours, and markers."""
     timestep: float = 0.002
     """Physics step [s]."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, positive=["timestep"])
 
     @property
     def marker_ids(self) -> tuple[int, ...]:

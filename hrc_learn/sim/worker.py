@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim.imperfections import Imperfections
@@ -90,9 +89,6 @@ class WorkerConfig:
     """Height of the standing body [m]."""
     floor: float = -0.72
     """Height of the floor [m]; the robot's base is at zero."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, positive=["stature"])
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> WorkerConfig:

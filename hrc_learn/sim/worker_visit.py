@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Box
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
 
 # Half the step of central differences for velocities [s]; they err by 0.1 mm/s at most.
@@ -44,9 +43,6 @@ class HumanSpeeds:
     """Speed of a hand [m/s]."""
     turning: float = 2.5
     """Turning speed about the vertical [rad/s]."""
-
-    def __post_init__(self) -> None:
-        check_settings(self, positive=vars(self))
 
     def drawn(self, rng: np.random.Generator) -> HumanSpeeds:
         """Speeds of one visit: 50 to 95 % of these largest speeds."""

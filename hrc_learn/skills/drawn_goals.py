@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hrc_learn.controller import Goals
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import check_settings
+from hrc_learn.geometry.numerics import check_positive
 from hrc_learn.protocols import DrawnRegion, HumanInput
 from hrc_learn.regions import PositionRegion
 
@@ -41,8 +41,7 @@ class DrawnGoalsConfig:
     """A changed drawing is applied after this time without further changes [s]: a dragged
     pointer changes the drawing 25 times a second, and an applied change has to be checked."""
 
-    def __post_init__(self) -> None:
-        check_settings(self, positive=vars(self))
+    __post_init__ = check_positive
 
 
 class Drawing(NamedTuple):

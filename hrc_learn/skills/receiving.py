@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hrc_learn.dmp import InteractionEstimate, InteractionPrimitive
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import check_settings
+from hrc_learn.geometry.numerics import check_positive
 from hrc_learn.protocols import PersonObservation, PersonTracker
 from hrc_learn.skills.grasping import CLOSED, CLOSING_TIME, OPEN, as_load, holds, move_fingers
 from hrc_learn.skills.placing import GraspObject
@@ -63,8 +63,7 @@ class ReceivingConfig:
 
     unbounded = ("timeout",)
 
-    def __post_init__(self) -> None:
-        check_settings(self, positive=vars(self))
+    __post_init__ = check_positive
 
 
 @dataclass(kw_only=True)

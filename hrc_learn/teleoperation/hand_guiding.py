@@ -19,7 +19,7 @@ from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.controller.null_space_motion import fraction_in_null_space, fraction_kept
 from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import check_settings, null_projection
+from hrc_learn.geometry.numerics import check_positive, null_projection
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import Arm, ArmState, Feedback, Human, HumanInput
 from hrc_learn.regions import PositionRegion
@@ -31,12 +31,6 @@ DEFAULT_MAPPING: ForceMapping = "transpose"
 pseudo-inverse moves the elbow about a third as fast as this force; for 6 to 23 % of the pull
 directions, it moves the elbow against the pull (benchmarks/bench_pull_mapping.py).
 """
-
-
-def check_positive(settings: object) -> None:
-    """`check_settings` with all numbers among the fields positive."""
-    numbers = [name for name, value in vars(settings).items() if isinstance(value, float | int)]
-    check_settings(settings, positive=numbers)
 
 
 @dataclass(frozen=True, kw_only=True)

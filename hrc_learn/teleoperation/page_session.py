@@ -11,6 +11,7 @@ from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.demos.issues import counted
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
+from hrc_learn.geometry.numerics import check_positive
 from hrc_learn.protocols import DrawnRegion, Human, OpenedArm, Request
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
@@ -27,7 +28,6 @@ from hrc_learn.teleoperation.hand_guiding import (
     HandGuidingConfig,
     InputFilter,
     InputFilterConfig,
-    check_positive,
 )
 from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba

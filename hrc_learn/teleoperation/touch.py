@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.geometry.numerics import check_positive
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
-from hrc_learn.teleoperation.hand_guiding import check_positive
 
 Place = Literal["nothing", "elbow", "hand"]
 """Place of a touch; the elbow stands for all links above the wrist."""

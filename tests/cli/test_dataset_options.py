@@ -359,5 +359,5 @@ def test_options_of_an_import_come_before_those_of_the_mapping_file(tmp_path):
     assert (said.time, said.fps, said.task, said.duration) == ("stamp", 20.0, "", 3.0)
     assert said.joint_names == ("x", "y")
     for name in ("fps", "duration"):
-        with pytest.raises(ValueError, match=f"{name} must be positive, got 0"):
+        with pytest.raises(ValueError, match=f"{name} must be positive, but is 0"):
             dataset_commands._import_options(Import(files=(), **{name: 0.0}), mapping)

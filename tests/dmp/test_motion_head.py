@@ -301,8 +301,8 @@ def test_state_survives_a_file(head, tmp_path):
 @pytest.mark.parametrize(
     ("message", "call"),
     [
-        ("columns must be at least 1, got 0", lambda: MotionHead(0)),
-        ("duration must be", lambda: MotionHead(2, duration=(2.0, 1.0))),
+        ("columns and duration must be positive, .*; got 0, 1.0", lambda: MotionHead(0)),
+        ("with an ordered range", lambda: MotionHead(2, duration=(2.0, 1.0))),
         ("amplitude must be one number or 2", lambda: MotionHead(2, amplitude=(1.0, 2.0, 3.0))),
         ("goal_centre must have", lambda: MotionHead(2, goal_centre=(1.0,))),
         ("parameters must have shape", lambda: head_of(3)(torch.zeros(5), [0.0], [0.0] * 3)),

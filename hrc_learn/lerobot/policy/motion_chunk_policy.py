@@ -19,6 +19,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.lerobot.policy.action_encoding import (
     ActionEncoding,
     rotation_triples,
@@ -110,13 +111,10 @@ class MotionChunkConfig(MotionPolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        least = {"n_basis": 1, "hidden_dim": 1, "n_plans": 1, "chunk_size": 4}
-        for name, bound in (least | {"history": 0, "state_noise": 0}).items():
-            value = getattr(self, name)
-            if value is not None and not value >= bound:
-                raise ValueError(f"{name} must be at least {bound}, got {value}")
-        if self.blend_time is not None and not 0 < self.blend_time < torch.inf:
-            raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
+        positive = "n_basis", "hidden_dim", "n_plans", "blend_time"
+        check_settings(self, positive=positive, not_negative=("history", "state_noise"))
+        if self.chunk_size < 4:
+            raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")
 
     @property
     def observation_delta_indices(self) -> list[int] | None:

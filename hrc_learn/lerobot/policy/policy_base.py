@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.demos.read.metadata import flatten_names
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.lerobot.policy.action_encoding import (
     ActionEncoding,
     matched_columns,
@@ -71,7 +70,6 @@ class MotionPolicyConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_settings(self)
         if not 1 <= self.n_action_steps <= self.chunk_size:
             raise ValueError(
                 f"n_action_steps must be 1 to chunk_size ({self.chunk_size}), got "

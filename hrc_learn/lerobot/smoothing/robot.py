@@ -17,7 +17,6 @@ from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.controller.motion_filter import MotionState
-from hrc_learn.geometry.numerics import check_settings
 from hrc_learn.lerobot.smoothing.action_limits import ActionLimits
 
 logger = logging.getLogger(__name__)
@@ -217,10 +216,6 @@ class SmoothRobotConfig(RobotConfig):
     """"wall": a thread sends setpoints in real time. "actions": all setpoints of an action are
     sent at once, for a simulated robot whose time advances with them.
     """
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, positive=["rate"])
 
 
 class SmoothRobot(Robot):
