@@ -8,10 +8,13 @@ import pytest
 import torch
 from commands import done, hrc
 
+from hrc_learn.cli import play_command
+from hrc_learn.cli.arguments import Play
 from hrc_learn.demos import DatasetWriter, open_demos
 from hrc_learn.geometry import minimum_jerk
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.registry import arm
+from hrc_learn.learning.motion_playing import PlayedMotion
 
 MOVES = {
     "panda": [(0.3, 0.1, -0.1, 0.2, 0.1, 0.0, 0.1), (-0.3, 0.2, 0.1, 0.1, 0.0, 0.2, 0.1)],
@@ -138,3 +141,26 @@ def test_shares_of_a_range_are_no_angles(models, tmp_path):
     asked = hrc("play", tmp_path / "model", *words, "--overwrite", "--robot", "panda")
     assert asked.status == 2
     assert "holds joints in fractions of their ranges, which have no known size" in asked.error
+
+
+def test_the_action_of_each_frame_of_a_played_motion_is_the_next_position(tmp_path):
+    """At the last one the arm is to stay."""
+    robot = arm("panda")
+    joints = robot.ready.numpy() + 0.01 * np.arange(5)[:, None]
+    tool = robot.forward(torch.from_numpy(joints))
+    motion = PlayedMotion(
+        time=0.02 * np.arange(5),
+        joints=joints,
+        position=tool.position.numpy(),
+        orientation=tool.orientation.numpy(),
+        planned_duration=0.08,
+        goal_errors={},
+    )
+    args = Play(model=tmp_path / "pour", goal=("0",), out=tmp_path)
+    play_command._write_episode(tmp_path / "episode", args, robot, motion)
+    (demo,) = open_demos(tmp_path / "episode")
+    assert demo.fps == 50
+    assert demo.task == "played pour"
+    np.testing.assert_allclose(demo.joint_position, joints, atol=1e-6)
+    np.testing.assert_allclose(demo.command_position[:-1], joints[1:], atol=1e-6)
+    np.testing.assert_allclose(demo.command_position[-1], joints[-1], atol=1e-6)

@@ -2,7 +2,9 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
+import httpx
 import pytest
 import yaml
 from clean_sets import write_set
@@ -93,3 +95,31 @@ def test_what_is_fetched_is_what_was_pushed_with_card_and_tag(
     status, _, error = hrc(*given)
     assert status == 1
     assert "not uploaded" in error
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_status_says_whether_lerobot_has_uploaded(dataset, monkeypatch, fails):
+    """A stand-in of LeRobot keeps what it is asked for."""
+    calls = []
+
+    class Dataset:
+        def __init__(self, repo, root):
+            calls.append((repo, root))
+
+        def push_to_hub(self, **options):
+            calls.append(options)
+            if fails:
+                raise httpx.ConnectError("no route\nto the Hub")
+
+    monkeypatch.setitem(
+        sys.modules, "lerobot.datasets", SimpleNamespace(LeRobotDataset=Dataset)
+    )
+    given = ("push", dataset, "alice/reach", "--license", "mit", "--tags", "a", "b")
+    status, text, error = hrc(*given, "--no-private")
+    assert calls == [
+        ("alice/reach", dataset),
+        {"tags": ["a", "b"], "license": "mit", "private": False},
+    ]
+    assert status == fails
+    assert ("uploaded to alice/reach" in text) != fails
+    assert ("error: not uploaded" in error and "no route" in error) == fails

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -291,3 +292,24 @@ def test_a_marker_counts_from_a_visibility_of_a_half(step, visible, seen):
         step({TransitionKey.OBSERVATION: {"observation.state": state}})
     assert looks == ([1 / FPS, 2 / FPS, 3 / FPS] if seen else [])
     assert step.transform_features({"a": {}}) == {"a": {}}
+
+
+@pytest.mark.parametrize("corrects", [False, True])
+def test_a_motion_is_warned_about_at_first_and_a_correction_each_time(step, caplog, corrects):
+    """A watch finds it at the second and third call; `reset` begins the next episode."""
+    caplog.set_level(logging.WARNING)
+    found = iter([None, "camera moved by 1", "camera moved by 2", None])
+    step.correct = corrects
+    step._watch = SimpleNamespace(update=lambda *given: next(found), clear=lambda: None)
+    pose, pixels = episode(np.random.default_rng(1), frames=4)
+    rollout(step, pose, pixels)
+    said = [record.getMessage() for record in caplog.records]
+    if corrects:
+        assert [text.split(" since ")[0][-1] for text in said] == ["1", "2"]
+        assert all("its pixels are corrected" in text for text in said)
+    else:
+        (text,) = said
+        assert text.startswith("camera moved by 1 since the demonstrations: move it back")
+    assert step.motion == "camera moved by 2"
+    step.reset()
+    assert (step.motion is None) == (not corrects)
