@@ -13,6 +13,7 @@ from hrc_learn.learning.multiply_motions import (
     Draws,
     MotionSource,
     Segmentation,
+    _stopped,
     find_segments,
 )
 
@@ -251,3 +252,35 @@ def test_demonstrations_with_other_switches_are_refused(demos, tool, objects):
     other = [*demos[:-1], replace(demos[-1], gripper=np.full(END, 0.08))]
     with pytest.raises(ValueError, match="episode 2: 0"):
         find_segments(other, objects, tool)
+
+
+@pytest.mark.parametrize("part", [0.1, 0.25, 0.5, 1.0])
+def test_a_motion_comes_to_rest_smoothly_in_twice_the_time_of_its_last_part(part):
+    """Progress, speed and acceleration are continuous, by derivatives of autograd."""
+    ends = torch.tensor([[1 - part, 1 + part]], dtype=torch.float64)
+
+    def derivatives(s):
+        s = s.clone().requires_grad_()
+        value = _stopped(s, part)
+        speed = torch.autograd.grad(value.sum(), s, create_graph=True)[0]
+        bend = torch.autograd.grad(speed.sum(), s)[0] if speed.requires_grad else 0 * s
+        return value.detach(), speed.detach(), bend.detach()
+
+    near = 1e-6
+    inside = derivatives(ends + near * torch.tensor([[1.0, -1.0]]).double())
+    outside = derivatives(ends - near * torch.tensor([[1.0, -1.0]]).double())
+    expected = torch.tensor([[1 - part, 1.0]]).double()
+    for value, speed, bend in (inside, outside):
+        torch.testing.assert_close(value, expected, rtol=0, atol=2e-6)
+        torch.testing.assert_close(
+            speed, torch.tensor([[1.0, 0.0]]).double(), rtol=0, atol=1e-4
+        )
+        torch.testing.assert_close(bend, 0 * bend, rtol=0, atol=1e-3)
+    s = torch.linspace(0, 1 + part, 301, dtype=torch.float64)[None]
+    value, speed, bend = derivatives(s)
+    before = s <= 1 - part
+    torch.testing.assert_close(value[before], s[before], rtol=0, atol=0)
+    assert (speed >= -1e-12).all()
+    assert (speed <= 1 + 1e-12).all()
+    assert (bend <= 1e-9).all()
+    assert torch.equal(_stopped(s + 2.0, part), torch.ones_like(s))
