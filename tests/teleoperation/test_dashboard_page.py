@@ -2,6 +2,9 @@
 
 import asyncio
 import json
+from io import BytesIO
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -107,3 +110,78 @@ def test_the_viewer_is_that_of_the_installed_rerun(tmp_path, monkeypatch):
         assert name in contents["/viewer/re_viewer.js"].body
     monkeypatch.setattr(dashboard_page, "_fetched_viewer", lambda: 1 / 0)
     assert dashboard_page._viewer_contents() == contents  # is used again
+
+
+class Viewer:
+    """Rerun's program and its clock: answers after a number of attempts, or never."""
+
+    def __init__(self, monkeypatch, answers=3, ends=None):
+        self.asked, self.ended, self.now, self.commands = [], [], 100.0, []
+        self._answers, self._ends = answers, ends
+        module: Any = dashboard_page
+        monkeypatch.setattr(module.subprocess, "Popen", self.start)
+        monkeypatch.setattr(module, "urlopen", self.open)
+        clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep)
+        monkeypatch.setattr(module, "time", clock)
+
+    def start(self, command, **_):
+        self.commands.append(command)
+        return SimpleNamespace(
+            poll=lambda: 1 if self._ends == len(self.asked) else None,
+            kill=lambda: self.ended.append("killed"),
+            wait=lambda: self.ended.append("waited"),
+        )
+
+    def open(self, url, timeout):
+        self.asked.append(url)
+        if len(self.asked) < self._answers:
+            raise ConnectionRefusedError("refused")
+        return BytesIO(url.rsplit("/", 1)[-1].encode())
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+def test_the_viewer_is_asked_until_it_answers_on_a_port_of_its_own(monkeypatch):
+    viewer = Viewer(monkeypatch)
+    files = dashboard_page._fetched_viewer()
+    assert files == {name: name.encode() for name in dashboard_page._VIEWER_FILES}
+    assert viewer.ended == ["killed", "waited"]
+    assert viewer.now == pytest.approx(100.2)
+    (command,) = viewer.commands
+    web, other = (command[command.index(o) + 1] for o in ("--web-viewer-port", "--port"))
+    assert web != other
+    assert {url.rsplit("/", 1)[0] for url in viewer.asked} == {f"http://127.0.0.1:{web}"}
+
+
+def test_a_viewer_that_ends_is_not_waited_for(monkeypatch):
+    viewer = Viewer(monkeypatch, answers=99, ends=2)
+    with pytest.raises(ValueError, match=r"does not start; try `python -m rerun`. refused"):
+        dashboard_page._fetched_viewer()
+    assert len(viewer.asked) == 2
+    assert viewer.ended == ["killed", "waited"]
+
+
+def test_a_viewer_that_does_not_answer_is_given_up_after_its_time(monkeypatch):
+    viewer = Viewer(monkeypatch, answers=10**9)
+    with pytest.raises(ValueError, match="viewer does not start"):
+        dashboard_page._fetched_viewer()
+    assert viewer.now - 100 == pytest.approx(dashboard_page._START, abs=0.15)
+    assert viewer.now - 100 > dashboard_page._START - 1e-6
+    assert viewer.ended == ["killed", "waited"]
+
+
+def test_a_viewer_of_which_a_file_is_missing_is_fetched_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    fetched = []
+    files = {name: name.encode() for name in dashboard_page._VIEWER_FILES}
+    monkeypatch.setattr(dashboard_page, "_fetched_viewer", lambda: fetched.append(1) or files)
+    contents = dashboard_page._viewer_contents()
+    assert {path: content.body for path, content in contents.items()} == {
+        f"/viewer/{name}": body for name, body in files.items()
+    }
+    (folder,) = (tmp_path / "hrc_learn").iterdir()
+    for name in files:
+        (folder / name).unlink()
+        assert dashboard_page._viewer_contents() == contents
+    assert len(fetched) == 1 + len(files)
