@@ -168,8 +168,8 @@ def _solved(
     penalty.
     """
     u, s, vt = np.linalg.svd(design, full_matrices=False)
-    # The factor keeps the divisions below finite for rank-deficient designs.
-    s = np.maximum(s, 1e-12 * s[0])
+    # Directions that no demonstration shows get no offset; the divisions below stay finite.
+    u, s = u * (s > 1e-12 * s[0]), np.maximum(s, 1e-12 * s[0])
     along = u.T @ pixels.ravel()
 
     def too_long(penalty: float) -> bool:

@@ -17,7 +17,7 @@ from hrc_learn.kinematics import gripper_down
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.skills.visual_skill import MarkerAngle, VisualServoSkill
-from hrc_learn.skills.visual_target import LONGEST_OFFSET, VisualTarget
+from hrc_learn.skills.visual_target import LONGEST_OFFSET, VisualTarget, _solved
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OFFSET = np.array([0.012, -0.01, 0.11])
@@ -261,3 +261,40 @@ def test_each_part_of_a_skill_is_written_if_it_was_learned(tmp_path):
         assert [key for key in parts if getattr(loaded, key) is not None] == [name]
     assert VisualServoSkill.load(tmp_path / "approach").approach == approach
     assert VisualServoSkill.load(tmp_path / "angle").angle == angle
+
+
+@pytest.mark.parametrize("size", [1e-4, 10.0])
+@pytest.mark.parametrize("demos", [2, 4, 5, 8])
+def test_the_solution_is_the_shortened_least_squares_one(demos, size):
+    """Against NumPy's least squares; a penalty is a further row for each unknown."""
+    rng = np.random.default_rng(demos)
+    design, pixels = rng.normal(size=(2 * demos, 3)), size * rng.normal(size=(demos, 2))
+    found, error = _solved(design, pixels)
+    plain = np.linalg.lstsq(design, pixels.ravel())[0]
+    if np.linalg.norm(plain) <= LONGEST_OFFSET:
+        assert size < 1.0
+        np.testing.assert_allclose(found, plain, atol=1e-12)
+    else:
+        assert size > 1.0
+        assert np.linalg.norm(found) == pytest.approx(LONGEST_OFFSET, rel=1e-4)
+        # The gradient of the squared error points along the solution: that is a ridge.
+        slope = design.T @ (pixels.ravel() - design @ found)
+        penalty = slope @ found / (found @ found)
+        assert penalty > 0
+        np.testing.assert_allclose(slope, penalty * found, atol=1e-4 * np.linalg.norm(slope))
+    assert np.isnan(error) == (demos < 5)
+    if demos >= 5 and size < 1.0:
+        left_out = []
+        for k in range(demos):
+            rest = np.delete(design, [2 * k, 2 * k + 1], axis=0)
+            refit = np.linalg.lstsq(rest, np.delete(pixels, k, axis=0).ravel())[0]
+            left_out.append(pixels[k] - design[2 * k : 2 * k + 2] @ refit)
+        assert error == pytest.approx(np.sqrt(np.mean(np.sum(np.square(left_out), axis=1))))
+
+
+def test_a_direction_without_information_gets_no_offset():
+    design = np.random.default_rng(0).normal(size=(12, 3)) * [1.0, 1.0, 0.0]
+    found, error = _solved(design, 1e-3 * np.ones((6, 2)))
+    assert np.isfinite(found).all()
+    assert np.isfinite(error)
+    assert found[2] == pytest.approx(0.0, abs=1e-9)

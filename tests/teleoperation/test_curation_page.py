@@ -335,3 +335,29 @@ def test_a_phone_shows_image_and_buttons_at_once(page, tab):
         assert box["x"] + box["width"] <= 390
         assert box["height"] >= 40
     assert tab.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.parametrize(("frames", "kept"), [(1999, 1999), (2000, 2000), (2001, 2000)])
+def test_a_curve_of_two_thousand_frames_is_drawn_as_it_is(frames, kept):
+    """Of a longer one each section keeps its extremes, in the order of time."""
+    from hrc_learn.teleoperation.curation_page import _points
+
+    values = np.sin(np.arange(float(frames)))
+    chosen, points = _points(values)
+    assert len(chosen) <= kept
+    assert len(chosen) > kept - 200
+    np.testing.assert_array_equal(points, values[chosen])
+    assert (np.diff(chosen) > 0).all()
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_spikes_to_either_side_stay_in_a_reduced_curve(sign):
+    from hrc_learn.teleoperation.curation_page import _points
+
+    values = np.random.default_rng(0).uniform(-0.1, 0.1, 50_000)
+    at = np.arange(77, 50_000, 4_999)
+    values[at] = sign * np.arange(1.0, 1.0 + len(at))
+    chosen, points = _points(values)
+    assert set(at) <= set(chosen.tolist())
+    assert sign * points.max() == values.max() * sign
+    assert points.min() == values.min()
