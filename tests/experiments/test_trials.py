@@ -35,7 +35,7 @@ def lines(file):
 
 
 def test_each_seed_is_run_once_and_written(tmp_path):
-    file = tmp_path / "new" / "trials.jsonl"
+    file = tmp_path / "new" / "of today" / "trials.jsonl"
     trials = repeat(square, [4, 2, 4], file, made_by=MADE_BY)
     assert [trial.seed for trial in trials] == [4, 2]
     assert trials[0].values == {"square": 16, "place": "shelf"}

@@ -12,12 +12,15 @@ import torch
 from cakes import KIND, WorkFailedError, cake, contents, fail_to_fill, fill
 
 from hrc_learn import store
+from hrc_learn.demos import DatasetWriter
 from hrc_learn.store import (
     Claim,
     new_file,
     new_folder,
     replacing,
+    write_text,
 )
+from hrc_learn.store._folder import carry_over
 
 
 def test_a_file_appears_only_when_it_is_complete(tmp_path):
@@ -226,3 +229,45 @@ def test_caches_are_where_the_user_keeps_them(tmp_path, monkeypatch, given, plac
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / given) if given else "")
     assert store.cache_home() == tmp_path / place
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_missing_folders_above_are_created(tmp_path, exists):
+    """Of files, folders of results, datasets and copies; folders that exist are used."""
+    above = tmp_path / "two" / "levels"
+    if exists:
+        above.mkdir(parents=True)
+    write_text(above / "text" / "a.txt", "text")
+    write_text(above / "text" / "b.txt", "more")
+    assert (above / "text" / "a.txt").read_text() == "text"
+
+    above = tmp_path / "results" / "of" / "today"
+    if exists:
+        above.mkdir(parents=True)
+    for name in ("first", "second"):
+        with new_folder(above / name, {}) as folder:
+            (folder / "values.json").write_text("{}")
+        assert (above / name / "values.json").is_file()
+
+    root = tmp_path / "sets" / "of" / "alice" / "reach"
+    if exists:
+        root.parent.mkdir(parents=True)
+    with DatasetWriter(root, 10, "any", ["a"]) as writer:
+        writer.start_episode("reach")
+        for k in range(3):
+            writer.add_frame(joint_position=[0.1 * k])
+        writer.save_episode()
+    assert (root / "meta" / "info.json").is_file()
+
+
+def test_entries_are_carried_over_with_the_folders_above_them(tmp_path):
+    source, target = tmp_path / "source", tmp_path / "target"
+    (source / "a" / "b" / "empty").mkdir(parents=True)
+    (source / "a" / "b" / "file").write_text("content")
+    target.mkdir()
+    # Only the innermost entries are named.
+    names = ["a/b/empty/", "a/b/file"]
+    assert carry_over(names, source, target) == {*names}
+    assert (target / "a" / "b" / "file").read_text() == "content"
+    assert (target / "a" / "b" / "empty").is_dir()
+    assert carry_over(names, source, target) >= {"a/b/empty/"}
