@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -16,7 +14,6 @@ OVERHEAD = (0.0, 0.0, 1.0, 0.0)
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class PinholeCamera:
     """Fixed camera that sees a marker on the end effector."""
 

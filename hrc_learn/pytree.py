@@ -1,8 +1,8 @@
-"""Register dataclasses of tensors as PyTorch pytrees, and select elements of their batches."""
+"""Dataclasses of tensors that are PyTorch pytrees, and selection from their batches."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, dataclass_transform
 
 import torch
 from torch import Tensor
@@ -18,7 +18,15 @@ def static(default: Any) -> Any:
     return dataclasses.field(default=default, metadata={"static": True})
 
 
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
+)
 def pytree[T](cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass with keyword arguments, registered as a pytree."""
+    return registered(dataclasses.dataclass(frozen=True, kw_only=True)(cls))
+
+
+def registered[T](cls: type[T]) -> type[T]:
     """Register a dataclass as a pytree: `static` fields are structure, other fields children.
 
     A field that is None has no child, so an optional tensor may be absent. Unlike

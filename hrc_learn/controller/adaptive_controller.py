@@ -103,7 +103,6 @@ class ControllerConfig:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class ControllerState:
     """State of the controller between two steps."""
 

@@ -65,7 +65,6 @@ class ArmLoopConfig(YieldingConfig):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class WatchedPeople:
     """Distances of the arm from people near it, and the speed limits that result."""
 
@@ -84,7 +83,6 @@ class WatchedPeople:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class ArmReading:
     """One reading of the arm and of the people near it.
 
@@ -114,7 +112,6 @@ class ArmReading:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class PathState:
     """Progress along a joint path, and how the last step tracked it."""
 
@@ -198,7 +195,6 @@ class PathState:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class ArmLoopState:
     """State of the loop between two steps."""
 
@@ -221,7 +217,6 @@ class ArmLoopState:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class FollowPath:
     """Request to follow joint paths; the null space yields to a push and returns afterwards."""
 
@@ -231,7 +226,6 @@ class FollowPath:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class TrackPose:
     """Request to track a moving pose of the end effector; the null space yields to a push."""
 
@@ -241,7 +235,6 @@ class TrackPose:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class MoveJoints:
     """Request for a joint velocity."""
 

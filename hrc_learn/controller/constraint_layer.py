@@ -234,7 +234,6 @@ class ConstraintConfig:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class Distances:
     """Distances between pairs of bodies to keep: the arm itself, the scene, a person."""
 
@@ -284,7 +283,6 @@ class Distances:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class ConstraintReport:
     """Effect of the limits on a joint velocity."""
 

@@ -78,7 +78,6 @@ class SafetyConfig:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class SafetyState:
     """State of the filter between two steps."""
 
@@ -103,7 +102,6 @@ class SafetyState:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class SafetyReport:
     """Interventions of the filter in one step."""
 
@@ -142,7 +140,6 @@ _PAPER_IMAGE = (1440, 1080)
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class Goals:
     """Regions that attract the tool, the image feature and the joints.
 
@@ -258,7 +255,6 @@ class Goals:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class Observation:
     """Measurements and requests of one control step."""
 
@@ -325,7 +321,6 @@ class Observation:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class Command:
     """The joint velocity to send, and the terms of the law that led to it."""
 

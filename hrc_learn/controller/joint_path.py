@@ -8,7 +8,6 @@ when the path waits for them, and how they return. All of them are batched and s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -54,7 +53,6 @@ _METRES_PER_RADIAN = 0.1
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class JointPaths:
     """Joint paths, sampled at the control step and padded with their last sample."""
 
@@ -224,7 +222,6 @@ _RETURN_GOALS, _CHECKED = 20, 51
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class DirectReturn:
     """A straight joint motion back to a path that null-space motion cannot reach. The end
     effector leaves its path meanwhile.

@@ -265,7 +265,6 @@ _MAX_DRIFT = 0.005
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class PoseDrift:
     """Deviation of the tool from the motion of its task, and the data of the last step."""
 
@@ -375,7 +374,6 @@ class BlendingConfig:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class BlendingState:
     """State of the blending between Cartesian and vision feedback."""
 

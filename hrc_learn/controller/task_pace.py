@@ -25,7 +25,6 @@ _BINDING, _BLOCKED = 1e-3, 0.01
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class TaskPace:
     """Speed of the task relative to its planned speed, and a clock that runs at this speed."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, final
 
 from jaxtyping import Bool, Float
@@ -16,7 +15,6 @@ from hrc_learn.pytree import pytree
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class WantedVelocity:
     """Observation of a velocity step."""
 

@@ -91,7 +91,6 @@ class CameraConfig:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class CameraState:
     """Hypotheses of the camera, weights of the residual, and the window of key frames."""
 
@@ -144,7 +143,6 @@ class CameraState:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class CameraSpread:
     """Sample cameras that represent the uncertainty of an estimate.
 

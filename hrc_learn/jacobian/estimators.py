@@ -34,7 +34,6 @@ _REST = 1e-12
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class Measurement:
     """Measurement of one control step."""
 
@@ -54,7 +53,6 @@ class Measurement:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class WeightState:
     """Estimator state that consists of the weights only."""
 
@@ -140,7 +138,6 @@ class FixedEstimator(ImageJacobianEstimator):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class KeyFrame:
     """Frame with which later frames are compared."""
 
@@ -167,7 +164,6 @@ class KeyFrame:
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class KeyFrameState(WeightState):
     """Weights, and the key frame with which the next frame is compared."""
 
@@ -188,7 +184,6 @@ class LearningConfig(KeyFrameConfig):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class MotionSample:
     """Motion from the key frame to the present frame; zero without a valid pair."""
 
@@ -481,7 +476,6 @@ class KalmanConfig(LearningConfig):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class KalmanState(KeyFrameState):
     """Mean and covariance of the weights, and the last key frame."""
 

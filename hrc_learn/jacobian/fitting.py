@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_map
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import check_settings
-from hrc_learn.pytree import pytree
+from hrc_learn.pytree import registered
 
 # Least distance of the outer neurons from the middle neuron [m, rad]. Along a component with
 # hardly any demonstrated motion, neurons would otherwise be too close to be distinguished.
@@ -54,7 +54,7 @@ class KeyFrameConfig:
         check_settings(self, positive=("max_step", "rotation_scale"), not_negative=["min_step"])
 
 
-@pytree
+@registered
 @dataclass(frozen=True, eq=False)
 class RegressionStatistics:
     """Sufficient statistics of the linear fit dx = w . phi: sums over pairs of key frames."""
@@ -98,7 +98,7 @@ class RegressionStatistics:
         return max(float(self.energy + change), 0.0)
 
 
-@pytree
+@registered
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
     """Motion from each key frame to the next one; motions beyond `max_step` are left out."""

@@ -40,7 +40,7 @@ from hrc_learn.jacobian.fitting import (
 )
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.perspective import fit_camera, unexplained
-from hrc_learn.pytree import pytree
+from hrc_learn.pytree import registered
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +253,7 @@ def _motions(
     return training.thinned(learning.max_samples), held_out.thinned(learning.max_samples)
 
 
-@pytree
+@registered
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOutSamples:
     """Pairs of key frames; each pair's motion is predicted from other folds of the data."""

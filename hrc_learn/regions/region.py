@@ -57,7 +57,6 @@ _FAR_OUT = 3.0
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class PositionRegion(Region):
     """Box with smooth walls; its potential is zero inside.
 
@@ -153,7 +152,6 @@ class _Cone(Region):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class OrientationRegion(_Cone):
     """All orientations p within an angle of the goal p_g; P is zero inside.
 
@@ -204,7 +202,6 @@ class OrientationRegion(_Cone):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class AxisRegion(_Cone):
     """All orientations whose z axis is within an angle of the goal's z axis; the rotation
     about z is free.
@@ -246,7 +243,6 @@ _SATURATION = 0.5
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class VisionRegion(Region):
     """Ellipse about the target in the image; its potential is minimal at the target.
 
@@ -314,7 +310,6 @@ class VisionRegion(Region):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class JointRegion(Region):
     """Range of the joints; repels each joint from the nearer of its limits.
 
@@ -376,7 +371,6 @@ class JointRegion(Region):
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class PostureRegion(Region):
     """Ball about a posture; attracts the joints, with a pull that saturates with the distance.
 

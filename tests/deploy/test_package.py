@@ -1,5 +1,3 @@
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,6 @@ DOUBLE = torch.float64
 
 
 @pytree
-@dataclass(frozen=True, kw_only=True)
 class Reading:
     """Of every kind that a step has."""
 
