@@ -16,7 +16,7 @@ from hrc_learn.demos.read.naming import (
     without_unit,
 )
 from hrc_learn.demos.read.unit_evidence import Sizes
-from hrc_learn.demos.read.units import decide_units, units_from_episodes
+from hrc_learn.demos.read.units import UnitDecision, decide_units, units_from_episodes
 
 
 @pytest.mark.parametrize(
@@ -393,3 +393,22 @@ def test_poses_of_two_arms_are_one_pose_and_a_note():
     names = [f"{side}_eef_{part}" for side in ("left", "right") for part in "xyz"]
     _, notes = mapped(names, ["a", "b"])
     assert "one pose is read, that of the left arm" in notes
+
+
+@pytest.mark.parametrize(
+    ("units", "unit", "each"),
+    [
+        (("1.1 deg",), "deg", ()),
+        (("-0.5 rad/step",), "rad/step", ()),
+        (("m",), "m", ()),
+        (("1.1 deg", "deg", "-2e-3 deg"), "deg", ()),
+        (("rad", "0.9 deg"), "rad", ("rad", "deg")),
+        (("1 deg/step", "deg"), "deg/step", ("deg/step", "deg")),
+    ],
+)
+def test_a_plain_unit_is_that_without_its_factor(units, unit, each):
+    """Units of the components stay only if they differ."""
+    decision = UnitDecision(
+        role="joint_position", unit=units[0], units=units if len(units) > 1 else ()
+    ).plain
+    assert (decision.unit, decision.units) == (unit, each)

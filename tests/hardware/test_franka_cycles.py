@@ -19,7 +19,7 @@ from hrc_learn.hardware import CollisionConfig, FrankaConfig, Load, franka_loop
 from hrc_learn.hardware.franka_arm import step_of
 from hrc_learn.hardware.franka_memory import Orders, Phase, Shared
 from hrc_learn.hardware.franka_settings import CYCLE, RealtimeError
-from hrc_learn.kinematics import fr3
+from hrc_learn.kinematics import fr3, panda
 
 pytestmark = pytest.mark.simulation
 
@@ -467,3 +467,15 @@ def test_an_arm_of_which_one_joint_moves_does_not_rest(box):
     assert seen["report"].phase == Phase.MOVING
     assert box.calls.count(("motion",)) == 1
     assert not any(end for _, velocity, end in box.answers if np.abs(velocity).max() > 1e-6)
+
+
+@pytest.mark.parametrize("far_end", [None, (0.05, -0.02, 0.2)])
+def test_the_far_end_of_a_load_is_given_to_the_filter_in_the_frame_of_the_tool(far_end):
+    """Configured in the frame of the flange: both describe one point of the gripper."""
+    load = None if far_end is None else Load(far_end=far_end)
+    runner = step_of(panda, FrankaConfig(compiled=False, load=load))()
+    if far_end is None:
+        assert "load" not in runner.observation
+    else:
+        tool = np.append(runner.observation["load"], 1.0)
+        np.testing.assert_allclose((panda.tcp.numpy() @ tool)[:3], far_end, atol=1e-12)
