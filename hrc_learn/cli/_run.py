@@ -23,6 +23,8 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import asdict
 from difflib import get_close_matches
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import TextWrapper
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -166,12 +168,21 @@ def parse[Args](
                 arguments,
                 args=gathered_settings(words),
                 prog=program,
-                description=description or inspect.getdoc(arguments),
+                description=_wrapped(description or inspect.getdoc(arguments) or "") or None,
             )
     except SystemExit:
         if text := said.getvalue():
             print(f"error: {_complaint(text)} (see {program} --help)", file=sys.stderr)
         raise
+
+
+def _wrapped(text: str) -> str:
+    """Paragraphs wrapped for the terminal; tyro would join lines without an indent."""
+    width = get_terminal_size().columns
+    parts = text.split("\n\n")
+    plain = [part[:1].isalpha() and "\n " not in part for part in parts]
+    wrap = TextWrapper(width, subsequent_indent="  ", break_on_hyphens=False).fill
+    return "\n\n".join(wrap(p) if q else p for p, q in zip(parts, plain, strict=True))
 
 
 def gathered_settings(words: Sequence[str]) -> list[str]:

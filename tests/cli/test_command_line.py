@@ -108,6 +108,15 @@ def test_help_lists_every_option(name):
     assert not [option for option in cli.commands()[name] if f"--{option}" not in output]
 
 
+@every_command
+def test_help_fits_a_terminal_of_80_columns(monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "80")
+    _, output, _ = hrc(*name.split(), "--help")
+    # Commands to paste keep their lines.
+    prose = [line for line in output.splitlines() if not line.startswith("    ")]
+    assert not [line for line in prose if len(line) > 80]
+
+
 def test_every_option_is_explained():
     for cls in ast.walk(ast.parse(inspect.getsource(arguments))):
         if isinstance(cls, ast.ClassDef):
