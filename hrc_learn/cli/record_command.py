@@ -72,6 +72,8 @@ def record(args: Record) -> int:
     seed = usual_seed if args.seed is None else args.seed
     if episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {episodes}.")
+    if seed < 0:
+        raise ValueError(f"--seed must not be negative, but is {seed}.")
     refuse_of_others(args, _APPLIES, args.demonstration, "hrc record")
     args = replace(args, episodes=episodes, seed=seed)
     recorders = {

@@ -175,12 +175,13 @@ def run_experiment[Run: ExperimentRun](
         leaves no folder, as its measurements would be invalid.
 
     Raises:
-        ValueError: If the number of trials is negative.
+        ValueError: If the number of trials, or the seed, is negative.
     """
     from rich.console import Console
 
-    if options.trials < 0:
-        raise ValueError(f"--trials must not be negative, but is {options.trials}.")
+    for name in ("trials", "seed"):
+        if (number := getattr(options, name)) < 0:
+            raise ValueError(f"--{name} must not be negative, but is {number}.")
     check_settings(options, positive=["processes"])
     configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
     console, study = Console(), experiment.study()

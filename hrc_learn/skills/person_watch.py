@@ -58,9 +58,9 @@ class PersonWatchConfig:
     cap follows from this assumption."""
 
     def __post_init__(self) -> None:
-        check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
         if math.isnan(self.contact):
             raise ValueError("contact is NaN: give a distance [m]; a negative one turns it off")
+        check_settings(self, positive=("pairs", "fastest"), not_negative=["acceleration"])
 
 
 class PersonWatch:

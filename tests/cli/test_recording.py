@@ -223,6 +223,12 @@ def test_the_expert_records_what_lerobot_would(monkeypatch, tmp_path, capsys, sc
     assert (config.marker, config.hand) == (marker, marker)
 
 
+def test_a_negative_seed_is_refused_by_its_name(tmp_path):
+    args = Record(demonstration="placing", out=tmp_path / "set", seed=-1)
+    with pytest.raises(ValueError, match="--seed must not be negative, but is -1"):
+        record_command.record(args)
+
+
 def test_the_expert_overwrites_nothing(tmp_path):
     with pytest.raises(FileExistsError, match="give another --out"):
         record_command.record(Record(demonstration="expert", out=tmp_path))

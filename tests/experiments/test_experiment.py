@@ -201,6 +201,8 @@ def test_negative_numbers_of_trials_are_refused_before_anything_runs(tmp_path):
     options = RunOptions(out=tmp_path / "run")
     with pytest.raises(ValueError, match="--trials must not be negative, but is -1"):
         run_experiment(ThrowExperiment(), replace(options, trials=-1))
+    with pytest.raises(ValueError, match="--seed must not be negative, but is -1"):
+        run_experiment(ThrowExperiment(), replace(options, seed=-1))
     with pytest.raises(ValueError, match="processes must be positive, but is 0"):
         run_experiment(ThrowExperiment(), replace(options, trials=1, processes=0))
     assert not list(tmp_path.iterdir())

@@ -360,7 +360,7 @@ def test_an_arm_at_rest_teaches_nothing_even_if_every_frame_is_compared(kind):
         (BroydenConfig, {"weight_bound": 0.0}, "weight_bound must be positive"),
         (CompositeConfig, {"prediction_gain": 2.0}, "prediction_gain must be below 2"),
         (CompositeConfig, {"noise_floor": -1e-3}, "noise_floor must not be negative"),
-        (KalmanConfig, {"bias_std": np.nan}, "bias_std must not be negative"),
+        (KalmanConfig, {"bias_std": np.nan}, "bias_std must be finite"),
         (KalmanConfig, {"pixel_noise": 0.0}, "pixel_noise must be positive"),
         (KalmanConfig, {"max_step": 0.0}, "max_step must be positive"),
     ],

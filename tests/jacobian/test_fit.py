@@ -277,7 +277,7 @@ def test_twist_counts_rotation_in_the_base_frame():
     ("kind", "settings", "message"),
     [
         (ImageJacobianFitConfig, {"pixel_noise": 0.0}, "pixel_noise must be positive"),
-        (ImageJacobianFitConfig, {"weight_std": math.nan}, "weight_std must be positive"),
+        (ImageJacobianFitConfig, {"weight_std": math.nan}, "weight_std must be finite"),
         (ImageJacobianFitConfig, {"min_step": -1.0}, "min_step must not be negative"),
         (KalmanConfig, {"pixel_noise": 0.0}, "pixel_noise must be positive"),
         (KalmanConfig, {"max_step": 0.0}, "max_step must be positive"),

@@ -75,7 +75,7 @@ def test_every_nth_control_step_is_a_frame(world, every, duration, settle, steps
 
 
 def test_a_frame_every_zero_steps_is_refused():
-    with pytest.raises(ValueError, match="at least 1, but is 0"):
+    with pytest.raises(ValueError, match="record_every must be positive, but is 0"):
         DemonstrationConfig(duration=1.0, record_every=0)
     assert DemonstrationConfig(duration=1.0, record_every=1).fps == pytest.approx(100.0)
 
