@@ -150,9 +150,12 @@ def test_two_images_in_a_row_make_a_hand_over_certain_and_twice_its_duration_is_
         def observe(self, times, *others):
             observed.append(times[-1])
             sure = certain[min(len(observed), len(certain)) - 1]
-            handed = [float(sure == (kind == "hand over")) for kind in self.kinds]
+            # A probability that equals the required one is not above it.
+            handed = 1.0 if sure else ReceivingConfig().certainty
+            each = [handed if kind == "hand over" else 1 - handed for kind in self.kinds]
             estimate = model.observe(times, *others)
-            return replace(estimate, probability=torch.tensor(handed), duration=duration)
+            probability = torch.tensor(each, dtype=torch.float64)
+            return replace(estimate, probability=probability, duration=duration)
 
     class Wandering(Cell):
         """A hand that never rests."""
