@@ -13,7 +13,9 @@ from hrc_learn.demos.image_features import extract_features as extract_features
 from hrc_learn.demos.images import ImageReader as ImageReader
 from hrc_learn.demos.images import load_images as load_images
 from hrc_learn.demos.issues import DatasetError as DatasetError
+from hrc_learn.demos.issues import Issue as Issue
 from hrc_learn.demos.issues import UnitsWarning as UnitsWarning
+from hrc_learn.demos.issues import ValidationReport as ValidationReport
 from hrc_learn.demos.quality.check import check_dataset as check_dataset
 from hrc_learn.demos.quality.merging import merge_datasets as merge_datasets
 from hrc_learn.demos.quality.ranking import rank_episodes as rank_episodes

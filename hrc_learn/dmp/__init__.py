@@ -7,6 +7,7 @@ from hrc_learn.dmp.dynamics import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.dynamics import PeriodicBasis as PeriodicBasis
 from hrc_learn.dmp.dynamics import SplineBasis as SplineBasis
 from hrc_learn.dmp.dynamics import SpringDamper as SpringDamper
+from hrc_learn.dmp.exported_dmp import ExportedDMP as ExportedDMP
 from hrc_learn.dmp.exported_dmp import export_dmp as export_dmp
 from hrc_learn.dmp.exported_dmp import load_stepper as load_stepper
 from hrc_learn.dmp.framed_dmp import FramedDMP as FramedDMP
@@ -21,10 +22,13 @@ from hrc_learn.dmp.joint_dmp import select_basis_count as select_basis_count
 from hrc_learn.dmp.learned_motion import LearnedMotion as LearnedMotion
 from hrc_learn.dmp.learned_motion import learn as learn
 from hrc_learn.dmp.mixture_dmp import MixtureDMP as MixtureDMP
+from hrc_learn.dmp.motion_head import MotionDistribution as MotionDistribution
 from hrc_learn.dmp.motion_head import MotionHead as MotionHead
+from hrc_learn.dmp.motion_primitive import MotionPrimitive as MotionPrimitive
 from hrc_learn.dmp.motion_primitive import stack as stack
 from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP as MovingGoalDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP as OrientationDMP
+from hrc_learn.dmp.orientation_dmp import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.pose_dmp import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose_dmp import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP as ProbabilisticDMP
@@ -34,6 +38,8 @@ from hrc_learn.dmp.response import response_of as response_of
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_orientation as fit_rhythmic_orientation
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_pose as fit_rhythmic_pose
+from hrc_learn.dmp.samples import FitReport as FitReport
 from hrc_learn.dmp.solvers import fit_ridge as fit_ridge
 from hrc_learn.dmp.stepper import Stepper as Stepper
 from hrc_learn.dmp.trajectory import ContinuedTrajectory as ContinuedTrajectory
+from hrc_learn.dmp.trajectory import Trajectory as Trajectory

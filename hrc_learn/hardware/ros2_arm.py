@@ -97,21 +97,15 @@ class Ros2Arm(Connected):
         ignored: Number of joint states with all joints that were reordered, or lacked a finite
             position of a joint.
         received: Arrival time of the newest joint state, by this machine's monotonic clock [s].
+        answer: Called after each new joint state, in the thread that has received it.
     """
 
-    def __init__(
-        self,
-        chain: SerialChain,
-        config: Ros2Config | None = None,
-        answer: Callable[[], None] = lambda: None,
-    ):
+    def __init__(self, chain: SerialChain, config: Ros2Config | None = None):
         """Wait for joint states and controllers.
 
         Args:
             chain: Kinematics and limits of the arm.
             config: Topics and settings.
-            answer: Called after each new joint state once the arm is connected, in the thread
-                that has received the state.
 
         Raises:
             ModuleNotFoundError: ROS 2 is not installed.
@@ -119,7 +113,7 @@ class Ros2Arm(Connected):
         """
         self.config = config = config or Ros2Config()
         self._chain, self._names, self.ignored = chain, chain.joint_names, 0
-        self._answer = lambda: None
+        self.answer: Callable[[], None] = lambda: None
         self.session = Ros2Session("hrc_arm")
         from geometry_msgs.msg import WrenchStamped
         from sensor_msgs.msg import JointState
@@ -164,7 +158,6 @@ class Ros2Arm(Connected):
             raise
         self._dog.start()
         atexit.register(self.close)
-        self._answer = answer
 
     def _await_state(self) -> None:
         with self._changed:
@@ -244,7 +237,7 @@ class Ros2Arm(Connected):
         if config.interface == "position" and self._velocity.any():
             with self._lock:
                 self._send(self._velocity, state)
-        self._answer()
+        self.answer()
 
     def read(self) -> ArmState:
         """Return the newest state; `time` is the stamp of its message [s].

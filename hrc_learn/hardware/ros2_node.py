@@ -171,7 +171,8 @@ class ControllerNode:
 
             self._detector = MarkerDetector([marker])
         self._runner.step()  # the first step is slower than all others
-        self._arm = Ros2Arm(self._chain, self._config, self._answer)
+        self._arm = Ros2Arm(self._chain, self._config)
+        self._arm.answer = self._answer
 
     def activate(self) -> None:
         """Hold the tool where it is, and follow goals from now on.

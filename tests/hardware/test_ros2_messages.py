@@ -345,9 +345,8 @@ def test_a_clock_that_drifts_does_not_make_states_old(graph, drift):
 
 def test_each_newer_state_is_answered_in_the_thread_that_receives_it(graph):
     answered = []
-    config = Ros2Config(interface="position")
-    arm = Ros2Arm(panda.chain, config, lambda: answered.append(arm.read().time))
-    assert answered == []  # the arm was not connected yet when its first state came
+    arm = position_arm(graph)
+    arm.answer = lambda: answered.append(arm.read().time)
     for at in (10.1, 10.05, 10.1, 10.2):  # the second is reordered, and the third came before
         graph.state(at, READY)
     assert answered == [10.1, 10.2]

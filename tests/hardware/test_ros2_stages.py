@@ -80,12 +80,8 @@ def arm(graph):
 
 @pytest.fixture
 def node(graph, arm, monkeypatch):
-    def connect(chain, config, answer):
-        arm.answer = answer
-        return arm
-
     monkeypatch.setattr(ros2_node, "Ros2Session", lambda name, make: graph)
-    monkeypatch.setattr(ros2_node, "Ros2Arm", connect)
+    monkeypatch.setattr(ros2_node, "Ros2Arm", lambda chain, config: arm)
     monkeypatch.setattr(ros2_node, "time", graph)
     runners, controllers = [], []
 
