@@ -1,6 +1,7 @@
 """A camera that was moved is found again online; truth and images are OpenCV's."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -535,3 +536,26 @@ def test_of_a_batch_only_those_that_see_the_marker_and_are_not_surprised_learn(n
     assert changed.tolist() == [True, False, False]
     assert after.surprises.tolist() == [0, 0, 1]
     assert_close(after.position[1:], state.position[1:], rtol=0, atol=0)
+
+
+@pytest.mark.simulation
+def test_a_frame_beyond_three_times_the_median_error_counts_by_its_excess_squared(network):
+    """Errors of 1, 2, 2, 3 and 12 px, on either side: the last is twice beyond 6 px."""
+    estimator = CameraEstimator(network, CameraConfig(frames=6, pixel_noise=0.5))
+    there = Pose(
+        torch.tensor([0.25, 0.5, 0.2]).double().expand(6, 3),
+        torch.tensor([0.0, 1.0, 0.0, 0.0]).double().expand(6, 4),
+    )
+    state = SimpleNamespace(
+        best=network.camera,
+        position=there.position,
+        orientation=there.orientation,
+        known=torch.tensor([False, True, True, True, True, True]),
+    )
+    off = torch.tensor([50.0, 1.0, -2.0, 2.0, -3.0, 12.0]).double()[:, None]
+    aside = off * torch.tensor([0.6, 0.8]).double()
+    pixel = marker_pixels(network.camera, there)[0] + aside
+    with shapes_unchecked():
+        found = estimator._information(state, pixel, torch.zeros(6, 6).double())
+    # The inverse of 0.5 px squared; unknown frames count nothing.
+    assert_close(found, torch.diag(torch.tensor([1e-6, 4, 4, 4, 4, 1]).double()))
