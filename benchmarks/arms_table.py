@@ -38,7 +38,7 @@ from hrc_learn.kinematics import (
     solve_inverse,
 )
 from hrc_learn.kinematics.capsule_fit import shape_points
-from hrc_learn.kinematics.registry import maker_of
+from hrc_learn.kinematics.registry import _sources
 from hrc_learn.sim.workplace import Workplace
 
 # pyright: reportAttributeAccessIssue=false
@@ -105,7 +105,7 @@ def main(args: Args) -> None:
         measured = _measured(described, args)
         figures |= {f"{name}_{key}": value for key, value in measured.items()}
         rows.append(
-            f"| {name} | {maker_of(name)} | {measured['joints']:.0f} "
+            f"| {name} | {_sources()[name]['maker']} | {measured['joints']:.0f} "
             f"| {measured['reach_m']:.2f} "
             f"| {_differences(measured)} "
             f"| {100 * measured['inverse_found']:.1f} "

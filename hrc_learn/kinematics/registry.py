@@ -60,11 +60,6 @@ def registered_arms() -> tuple[str, ...]:
     return (*_OWN, *sorted(_sources().keys() - _OWN.keys()))
 
 
-def maker_of(name: str) -> str:
-    """Manufacturer of a registered arm."""
-    return _sources()[name]["maker"]
-
-
 def arm_of_robot(robot_type: str | None) -> Arm | None:
     """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
 

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -46,8 +46,47 @@ _APART = 5e-3
 # distance up to which it has not begun to move [m].
 _MOVED, _STILL = 1e-2, 1e-3
 
+
 type Place = tuple[str, int]
 """Place of one number in a frame: name of a feature, and index within this feature."""
+
+
+class _Lead(NamedTuple):
+    """Lead of commands over measured positions.
+
+    An arm lags behind its commands by some frames, and deviates from them by an offset that is
+    linear in its position, within the range of the demonstrations.
+    """
+
+    frames: int = 1
+    slope: Float[np.ndarray, "n n"] | float = 0.0
+    """Change of the offset with the position."""
+    offset: tuple[Any, Any, Any] = (0.0, 0.0, 0.0)
+    """Offset at the origin, smallest and largest offset."""
+
+    @classmethod
+    def fit(cls, shown: Sequence[Any], most: float) -> Self:
+        """Least-squares fit to measured and commanded positions of demonstrations.
+
+        Args:
+            shown: Measured and commanded positions of each demonstration, (T, n).
+            most: Largest number of frames.
+        """
+        found: list[tuple[float, int, Self]] = []
+        for frames in range(1 + round(min(most, min(len(q) for q, _ in shown) / 2))):
+            ahead = np.concatenate([cls(frames).commands(q) for q, _ in shown])
+            x = ahead - ahead.mean(0)
+            y = np.concatenate([c for _, c in shown]) - ahead
+            # Directions with little variation (3 % of the largest) do not change the offset.
+            slope = np.linalg.lstsq(x, y - y.mean(0), 0.03)[0]
+            lead = cls(frames, slope, ((y - ahead @ slope).mean(0), y.min(0), y.max(0)))
+            found.append((float((y - x @ slope).var(0).sum()), abs(frames - 1), lead))
+        return min(found, key=lambda each: each[:2])[2]
+
+    def commands(self, reached: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
+        """Commands that lead to measured positions."""
+        ahead = reached[(np.arange(len(reached)) + self.frames).clip(max=len(reached) - 1)]
+        return ahead + np.clip(self.offset[0] + np.dot(ahead, self.slope), *self.offset[1:])
 
 
 class MultipliedColumns:
@@ -96,8 +135,7 @@ class MultipliedColumns:
             self._places[f"object {name}"] = places
             first = np.stack([self._first(places, main) for main in range(len(source))])
             self.objects[name] = pose_of(torch.from_numpy(first))
-        # The commanded tool pose of a frame is the tool pose of the next frame, as LeRobot's
-        # robots expect.
+        # A commanded tool pose leads the tool pose of the next frame as demonstrated.
         shown = {
             self._old[k].component(i): (r, n)
             for r in _TOOL
@@ -106,6 +144,7 @@ class MultipliedColumns:
         self._actions = [named for named in self._named if named[0].startswith("action")]
         self._next = [(key, i, *shown[name]) for key, i, name in self._actions if name in shown]
         self._refuse_changes()
+        self._lead = self._find_lead()
         self._tool = self._recorded_tool()
         names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
         if not self._same:
@@ -143,6 +182,15 @@ class MultipliedColumns:
             if role == "position" and np.median(np.abs(apart)) > span / 2:
                 text = "holds changes, not commanded poses: hrc multiply needs absolute actions"
                 raise ValueError(f"{key} ({self._old[key].component(i)}) {text}")
+
+    def _find_lead(self) -> _Lead:
+        """Lead of commanded tool positions; that of another arm is the next frame."""
+        sent = {n: (key, i) for key, i, role, n in self._next if role == "position"}
+        if not self._same or len(sent) < 3:
+            return _Lead()
+        places = self._places["position"], [sent[n] for n in range(3)]
+        pairs = [[np.array([p[k][:, i] for k, i in x]).T for x in places] for p in self._frames]
+        return _Lead.fit(pairs, self._source.fps)
 
     def _object_columns(self, given: Mapping[str, str]) -> dict[str, list[Place]]:
         """Places of the numbers of each object's pose, by name of the object."""
@@ -278,7 +326,8 @@ class MultipliedColumns:
             for (key, i), column in zip(self._places[role], columns.T, strict=True):
                 made[key][:, i] = column
         for key, i, role, number in self._next:
-            made[key][:, i] = np.append(new[role][1:, number], new[role][-1, number])
+            lead = self._lead if role == "position" else _Lead(self._lead.frames)
+            made[key][:, i] = lead.commands(new[role])[:, number]
         rates = [np.gradient(q, 1 / self._source.fps, axis=0) for q in (joints, sent)]
         moved = dict(zip(_JOINTS, (joints, rates[0], sent, rates[1]), strict=True))
         moved = {r: self._on_disk(r, x) for r, x in moved.items() if r in self._places}

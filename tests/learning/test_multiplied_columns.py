@@ -319,6 +319,57 @@ def box_path(tool):
     return np.stack(path)
 
 
+@pytest.fixture(scope="module")
+def leads(tmp_path_factory):
+    """Columns of demonstrations whose arm lags three frames behind commands, and sags."""
+    folder = tmp_path_factory.mktemp("leads") / "demos"
+    features = {"action.tool": TOOL}
+    with DatasetWriter(folder, FPS, "panda", panda.joint_names, features) as writer:
+        for episode in range(2):
+            q = joints(episode)
+            tool = panda.forward(torch.from_numpy(q))
+            vector = quaternion.log(quaternion.continuous(tool.orientation)).numpy()
+            place = np.concatenate([tool.position.numpy(), vector], axis=1)
+            writer.start_episode("go")
+            for k in range(FRAMES):
+                writer.add_frame(
+                    joint_position=q[k],
+                    command_position=ahead(q)[k],
+                    position=place[k, :3],
+                    orientation=tool.orientation[k].numpy(),
+                    **{"action.tool": ahead(place)[k] + RAISED},
+                )
+            writer.save_episode()
+    source = open_demos(folder)
+    return MultipliedColumns(source, arm_of_dataset(source), panda, {})
+
+
+RAISED = np.array([0.0, 0.0, 0.005, 0.0, 0.0, 0.0])
+
+
+def ahead(x, frames=3):
+    return x[np.arange(frames, len(x) + frames).clip(max=len(x) - 1)]
+
+
+def test_commands_lead_new_motions_as_the_demonstrated_ones(leads):
+    own = leads
+    slow = np.stack(
+        [np.interp(np.arange(0, FRAMES - 0.6, 0.5), np.arange(FRAMES), x) for x in joints(0).T],
+        axis=1,
+    )
+    phase = np.arange(len(slow)) / 2
+    made = own.values(0, phase, slow, slow, None, {})
+    tool = panda.forward(torch.from_numpy(slow))
+    np.testing.assert_allclose(
+        made["action.tool"][:, :3], ahead(tool.position.numpy()) + RAISED[:3], atol=1e-4
+    )
+    turns = [Rotation.from_rotvec(v) for v in made["action.tool"][:, 3:]]
+    for k in (0, 10, len(turns) - 1):
+        there = tool.orientation[min(k + 3, len(slow) - 1)].numpy()
+        apart = turns[k] * Rotation.from_quat(there, scalar_first=True).inv()
+        assert apart.magnitude() < 1e-5
+
+
 def test_an_object_moves_with_the_tool_where_the_demonstrated_one_did(carried):
     shown = box_path(panda.forward(torch.from_numpy(joints(0))))
     scene = {"box": shown[0], "other": BLOCK, "goal": BLOCK}
