@@ -215,13 +215,13 @@ def test_the_safety_filter_allows_for_the_driver_of_the_arm(monkeypatch, arm):
     access = SimpleNamespace(delay=0.02, dynamics=0.4, open=lambda world: ("opened", world))
     monkeypatch.setattr(loop_commands, "access_by", lambda driver, robot: access)
     world: Any = SimpleNamespace(arm=SimpleNamespace(robot="arm"))
-    for real in (True,) if arm in ("lerobot", "ros2") else (False, True):
+    for real in {"sim": [False], "franky": [False, True]}.get(arm, [True]):
         args: Any = SimpleNamespace(arm=arm, ip="10.0.0.1", drives_real_arm=lambda r=real: r)
         safety = SafetyConfig(delay=0.03, braking=0.5)
         site = ArmSite(dynamics=0.2)
         connect, allowed = loop_commands._access(args, site, world, safety)
         if real:
-            expected = replace(site, driver=arm if arm != "sim" else "sim", ip="10.0.0.1")
+            expected = replace(site, driver=arm, ip="10.0.0.1")
             assert allowed == expected.cell_config().safety
             assert connect.args == (expected, world, "arm")
         else:

@@ -177,9 +177,9 @@ def test_what_cannot_be_repaired_is_named_or_left_out(tmp_path, damage, options,
 
 def test_only_a_rate_above_zero_can_be_resampled_to():
     for fps in (0, np.inf):
-        with pytest.raises(ValueError, match=f"fps must be positive, got {fps}"):
+        with pytest.raises(ValueError, match=f"fps must be positive.*, got {fps}"):
             RepairOptions(fps=fps)
-        with pytest.raises(ValueError, match=f"fps must be positive, got {fps}"):
+        with pytest.raises(ValueError, match=f"fps must be positive.*, got {fps}"):
             regular_grid(1.0, fps)
 
 

@@ -151,7 +151,7 @@ def test_what_is_not_connected_says_so(tmp_path):
         ({"shelf": "attic"}, "no shelf 'attic'"),
         ({"pixels": True}, "object in the gripper"),
         ({"fps": 1.0}, "fps must be"),
-        ({"imperfections": float("nan")}, "imperfections must not be negative"),
+        ({"imperfections": float("nan")}, "imperfections must be finite"),
         ({"episode_time": -1.0}, "episode_time must not be negative"),
     ],
 )
