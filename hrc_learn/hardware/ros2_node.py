@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,8 +172,8 @@ class ControllerNode:
 
             self._detector = MarkerDetector([marker])
         self._runner.step()  # the first step is slower than all others
-        self._arm = Ros2Arm(self._chain, self._config)
-        self._arm.answer = self._answer
+        self._arm = arm = Ros2Arm(self._chain, self._config)
+        arm.answer = partial(self._answer, arm)
 
     def activate(self) -> None:
         """Hold the tool where it is, and follow goals from now on.
@@ -192,7 +193,7 @@ class ControllerNode:
         self._runner.start(state.joint_position, state.joint_velocity)
         self._heard, self._last, self.stopped = time.monotonic(), 0.0, ""
         self._inactive.clear()
-        self._thread = threading.Thread(target=self._watch, name="watch", daemon=True)
+        self._thread = threading.Thread(target=self._watch, args=[self._arm], daemon=True)
         self._thread.start()
 
     def deactivate(self) -> None:
@@ -214,10 +215,8 @@ class ControllerNode:
 
     shutdown = cleanup
 
-    def _watch(self) -> None:
+    def _watch(self, arm: Ros2Arm) -> None:
         """Stop when joint states or heartbeats stay away, until deactivated."""
-        arm = self._arm
-        assert arm is not None
         while not self._inactive.wait(self._config.silence / 4):
             with self._stopping_faults():
                 arm.read()
@@ -242,15 +241,13 @@ class ControllerNode:
         if limit and silent > limit:
             raise ArmFaultError(f"no heartbeat for {silent:.2f} s: send ~/heartbeat")
 
-    def _answer(self) -> None:
+    def _answer(self, arm: Ros2Arm) -> None:
         """Answer a joint state with a command, in the thread that has received it."""
         with self._stopping_faults(), self._seeing, torch.inference_mode():
             if self._inactive.is_set():
                 return
             self._check_heartbeat()
-            arm, values, now = self._arm, self._runner.observation, time.monotonic()
-            assert arm is not None
-            state = arm.read()
+            state, values, now = arm.read(), self._runner.observation, time.monotonic()
             if self._last:
                 step = max(state.time - self._last, 1e-3)
                 values["dt"][...] = min(step, self._config.silence)

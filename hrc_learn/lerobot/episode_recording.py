@@ -16,6 +16,8 @@ from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
 
+from hrc_learn.demos.read.contract import Sidecar
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, dump_json
 from hrc_learn.lerobot.arm_robot import ArmRobot
 from hrc_learn.lerobot.arm_teleoperators import ArmExpert, ArmExpertConfig
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
@@ -56,6 +58,7 @@ def new_dataset(folder: Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
             yield dataset
         finally:
             dataset.finalize()
+        dump_json(new / SIDECAR_PATH, Sidecar(units={"joint_position": "rad"}))
 
 
 def add_frame(

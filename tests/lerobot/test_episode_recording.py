@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import pytest
 from unchecked import shapes_unchecked
 
+from hrc_learn.demos.read.contract import read_sidecar
 from hrc_learn.lerobot import episode_recording
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 from hrc_learn.lerobot.policy.policy_base import read_episodes
@@ -58,6 +59,7 @@ def test_what_fails_is_shown_again_from_the_next_seed(tmp_path, outcomes):
     episodes = read_episodes(folder, ["action", "observation.state"])
     assert [len(episode["action"]) for episode in episodes] == [5, 5]
     assert all(episode["observation.state"].shape == (5, 8) for episode in episodes)
+    assert read_sidecar(folder).units == {"joint_position": "rad"}
 
 
 def test_more_failures_than_successes_are_too_many(tmp_path, outcomes):
