@@ -456,6 +456,9 @@ def test_units_of_components_that_differ():
         ((0.049, 0.06, 0.08, 0.1, 0.195), "%"),
         ((0.04, 0.06, 0.08, 0.1, 0.195), "deg"),
         ((0.049, 0.06, 0.08, 0.1, 0.21), "deg"),
+        # Ranges that differ by a hundredth may be one range, measured with noise.
+        ((0.1, 0.1, 0.1, 0.1, 0.1012), "%"),
+        ((0.1, 0.1, 0.1, 0.1, 0.1008), "deg"),
     ],
 )
 def test_steps_count_as_fractions_of_a_range_only_if_all_ranges_are_a_joints(step, unit):

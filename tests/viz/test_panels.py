@@ -153,3 +153,14 @@ def test_each_hindrance_has_its_own_row():
         drawn = np.isfinite(reasons.values[:, k])
         np.testing.assert_array_equal(drawn, run.hindered[name])
         assert (reasons.values[drawn, k] == k + 1).all()
+
+
+def test_rows_have_space_above_and_below():
+    run = sample_run(safety=dict.fromkeys(("one", "two", "three"), np.ones(STEPS)))
+    plots = [plot for tab in run_tabs(run) for plot in tab.plots if plot.rows]
+    assert {len(plot.curves[0].names): plot.range for plot in plots}[3] == (0.0, 4.0)
+    assert all(plot.range == (0.0, len(plot.curves[0].names) + 1.0) for plot in plots)
+
+
+def test_the_many_plots_of_person_and_worker_stand_in_two_columns():
+    assert {tab.title: tab.columns for tab in run_tabs(sample_run())}["Person and worker"] == 2
