@@ -201,7 +201,7 @@ def read_stamps(
     step = float(np.median(steps)) if len(steps) else 1.0
     sizes = {unit: unit_factor("time", unit) for unit in ("s", "ms", "us", "ns")}
     found = [u for u, size in sizes.items() if _EPOCH[0] < time[0] * size < _EPOCH[1]]
-    counts = not found and bool((steps == 1).all())
+    counts = not found and step == 1 and not (steps % 1).any()  # frames may be missing
     if counts and rate:
         return time / rate
     found = found or [u for u, size in sizes.items() if STEPS[0] <= step * size <= STEPS[1]]

@@ -125,6 +125,16 @@ def test_bounds_that_exclude_each_other_are_exceeded_alike():
     torch.testing.assert_close(task + result, task.new_tensor([0.8, 0.8, 0, 0, 0, 0, 0]))
 
 
+def test_joints_that_the_null_space_hardly_moves_do_not_count():
+    """Joint 3 exceeds its limit, too, but the null space moves it by a billionth."""
+    J = torch.eye(7, dtype=torch.float64)[1:]
+    J[0, 0], J[1, 0] = 1.0, 1e-9  # the null space is along (1, -1, -1e-9, 0, ...)
+    task = torch.tensor([0.6, 0, 0.51, 0, 0, 0, 0], dtype=torch.float64)
+    upper = torch.full((7,), 0.5, dtype=torch.float64)
+    result = null_space_giving_way(J, task, torch.zeros_like(task), -upper, upper)
+    torch.testing.assert_close(task + result, task.new_tensor([0.5, 0.1, 0.51, 0, 0, 0, 0]))
+
+
 def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
     q, task = panda.ready, torch.zeros(7, dtype=torch.float64)
     null = self_motion(q, 0.5)

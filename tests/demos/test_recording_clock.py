@@ -63,6 +63,8 @@ STEADY = np.arange(50) / 25
         ("t", np.arange(9) * 0.7, "", np.arange(9) * 0.7e-3),
         ("t", np.arange(9) / 1501 * 1e3, "", None),
         ("t", np.arange(9) * 1.0, "", "a count of frames"),
+        ("t", [0.0, 1, 2, 4, 5, 6], "", "a count of frames"),  # one frame is missing
+        ("t", [0.0, 1, 2, 3, 4.5], "", np.array([0.0, 1, 2, 3, 4.5]) * 1e-3),
         ("t", np.arange(9) * 2.0, "", np.arange(9) * 2e-3),
         ("t", np.arange(9) * 0.6, "", None),
         ("t", 1.7e9 + np.arange(9), "", 1.7e9 + np.arange(9)),  # one a second, no count
@@ -83,6 +85,9 @@ def test_a_count_of_frames_and_stamps_in_doubt_follow_the_callers_rate_and_unit(
     counted = recording(q=q, t=q + 1)
     found = clock(counted, meaning(time="t", **JOINTS), fps=20)
     np.testing.assert_allclose(found.time, (q + 1) / 20)
+    gap = np.where(q < 5, q, q + 2)
+    found = clock(recording(q=q, t=gap), meaning(time="t", **JOINTS), fps=20)
+    np.testing.assert_allclose(found.time, gap / 20)
     # A camera's own stamps, one second apart, follow the unit that is given for the state's.
     slow = {"force": [1, 2], "force_t": [0, 1]}
     one = recording(q=STEADY, t=STEADY, **slow, clocks={"force": "force_t"})
