@@ -85,6 +85,7 @@ def test_rotation_vectors_are_told_by_their_names(names, triples):
         (None, None, [0, 1]),
         # A rotation vector that is measured in part is none.
         (["wx", "wy", "wz", "x"], ["x", "wx", "wy"], [-1, -1, -1, 0]),
+        (["wx", "wy", "wz"], ["wy", "wx", "wz"], [1, 0, 2]),
     ],
 )
 def test_actions_are_measured_where_the_state_has_their_names(actions, states, columns):
