@@ -134,7 +134,7 @@ def float_array(values: object) -> Float64[np.ndarray, "..."]:
     """Array, list or tensor (on any device, with or without gradient) as a float64 array."""
     if isinstance(values, Tensor):
         values = values.detach().cpu().numpy()
-    if np.iscomplexobj(values):
+    if np.iscomplexobj(np.asarray(values)):
         raise ValueError("values must be real numbers, but are complex")
     return np.asarray(values, dtype=np.float64)
 
