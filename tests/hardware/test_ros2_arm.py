@@ -156,10 +156,11 @@ def test_an_old_state_stops_the_arm_until_new_ones_come(arm_of_messages):
 
 
 LOOP = """
-import sys, time
+import signal, time
 import numpy as np
 from hrc_learn.hardware import Ros2Arm, Ros2Config
 from hrc_learn.kinematics import panda
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored if the tests run under nohup
 with Ros2Arm(panda.chain, Ros2Config()) as arm:
     print("ready", flush=True)
     while True:
