@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller.constraint_layer import constrained_velocity
-from hrc_learn.dmp import JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
+from hrc_learn.dmp import JointDMP, MotionHead, ProbabilisticDMP
 from hrc_learn.dmp.learned_motion import choose
 from hrc_learn.jacobian import RBFCenters, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, panda, separation, solve_inverse
@@ -112,14 +112,6 @@ def distribution(device: str):
     return middle.position(time), drawn.shape, log_prob
 
 
-def mixture(device: str):
-    time, position = demonstrations(device)
-    dmps = JointDMP.fit(time, position, 8, scaling="none")
-    modes = MixtureDMP.fit(dmps, n_modes=2, slack=0.1)
-    seen = modes.condition([1.0], position[:1, 50], noise=0.1)
-    return modes.probability.sort().values, seen.probability.sort().values
-
-
 def contexts(device: str):
     time, position = demonstrations(device)
     context = position[:, -1]
@@ -140,7 +132,6 @@ def contexts(device: str):
         constraint_layer,
         motion_head,
         distribution,
-        mixture,
         contexts,
     ],
 )

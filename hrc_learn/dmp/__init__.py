@@ -21,7 +21,6 @@ from hrc_learn.dmp.joint_dmp import fit_shared as fit_shared
 from hrc_learn.dmp.joint_dmp import select_basis_count as select_basis_count
 from hrc_learn.dmp.learned_motion import LearnedMotion as LearnedMotion
 from hrc_learn.dmp.learned_motion import learn as learn
-from hrc_learn.dmp.mixture_dmp import MixtureDMP as MixtureDMP
 from hrc_learn.dmp.motion_head import MotionDistribution as MotionDistribution
 from hrc_learn.dmp.motion_head import MotionHead as MotionHead
 from hrc_learn.dmp.motion_primitive import MotionPrimitive as MotionPrimitive

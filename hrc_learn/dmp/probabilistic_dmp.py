@@ -41,8 +41,7 @@ KINDS: dict[str, type[MotionPrimitive]] = {
 """Kinds of primitive by their names in files."""
 
 PATH_TIMES = 30
-"""Number of times at which paths are compared; routes do not part and rejoin between two of
-them."""
+"""Number of times at which paths are compared."""
 FEWEST, SINGULAR = 4, 1e-6
 """`FEWEST`: smallest number of primitives from which the dependence of paths on start and goal
 is estimated. `SINGULAR`: relative singular value below which the ends count as constant."""
@@ -167,8 +166,28 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         batch = primitives.motion.weights.shape[:-2]
         if batch.numel() < 2:
             raise ValueError("a distribution needs a batch of at least 2 primitives")
-        one_mode = torch.ones(batch.numel(), 1).double().to(primitives.motion.start.device)
-        return gaussians_of_modes(primitives, one_mode, slack)[0]
+        _linear_coordinates(primitives.motion)  # before orientations are fitted again
+        primitives = with_common_reference(primitives)
+        motion, reference = primitives.motion, common_reference(primitives)
+        x = _linear_coordinates(motion).flatten(0, -3)
+        lasting = motion.duration.detach().double().flatten().log()
+        mean, logarithm = x.mean(0), lasting.mean()
+        # The mean costs a degree of freedom.
+        scale = (len(x) - 1) ** -0.5
+        spread, timing = scale * (x - mean).flatten(1).mT, scale * (lasting - logarithm)
+        middle = mean_primitive(primitives).motion
+        if slack:
+            free = _free_forcing(middle, slack)
+            spread = torch.cat([spread, free], dim=1)
+            timing = torch.nn.functional.pad(timing, (0, free.shape[1]))
+        middle = middle.with_coordinates(mean, logarithm.exp())
+        return cls(
+            primitive=primitives.with_motion(middle, reference),
+            mean=mean,
+            spread=spread,
+            timing=timing,
+            dependence=_dependence_on_ends(motion, x),
+        )
 
     @classmethod
     def around(cls, primitive: P, slack: float = 1.0) -> "ProbabilisticDMP[P]":
@@ -437,52 +456,6 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         spread = self.spread.view(*self.mean.shape, -1)
         root = torch.einsum("tm,dmr->tdr", rows, spread)
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
-
-
-def gaussians_of_modes[P: MotionPrimitive](
-    primitives: P, responsibilities: Float[Tensor, "n K"], slack: float
-) -> list[ProbabilisticDMP[P]]:
-    """Gaussian of each mode of a batch of primitives and of their durations.
-
-    All modes have the same covariance around their means, because one mode has too few
-    demonstrations to estimate it.
-
-    Args:
-        primitives: Primitives of one motion, fitted with `scaling="none"`.
-        responsibilities: Probability of each mode for each primitive; rows sum to one.
-        slack: Freedom beyond the variation of the demonstrations, as in `around`.
-
-    Raises:
-        ValueError: A scaling other than `"none"`.
-    """
-    _linear_coordinates(primitives.motion)
-    primitives, r = with_common_reference(primitives), responsibilities
-    motion, n = primitives.motion, len(r)
-    x = _linear_coordinates(motion).flatten(0, -3)
-    lasting = motion.duration.detach().double().flatten().log()
-    fraction = r / r.sum(0)
-    means, logarithms = torch.einsum("nk,ndm->kdm", fraction, x), fraction.mT @ lasting
-    # Primitives are weighted by their responsibilities. Each mean costs a degree of freedom.
-    weight = (r / max(n - r.shape[1], 1)).sqrt()
-    spread = ((x[:, None] - means) * weight[..., None, None]).flatten(2).flatten(0, 1).mT
-    timing = ((lasting[:, None] - logarithms) * weight).flatten()
-    middle = mean_primitive(primitives).motion
-    if slack:
-        free = _free_forcing(middle, slack)
-        spread = torch.cat([spread, free], dim=1)
-        timing = torch.nn.functional.pad(timing, (0, free.shape[1]))
-    reference = common_reference(primitives)
-    dependence = _dependence_on_ends(motion, x)
-    return [
-        ProbabilisticDMP(
-            primitive=primitives.with_motion(middle.with_coordinates(mean, tau), reference),
-            mean=mean,
-            spread=spread,
-            timing=timing,
-            dependence=dependence,
-        )
-        for mean, tau in zip(means, logarithms.exp(), strict=True)
-    ]
 
 
 def gaussian(
