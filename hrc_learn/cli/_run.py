@@ -309,9 +309,10 @@ def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings
     if "help" in texts:
         print("\n".join(_listed("", default)))
         sys.exit(0)
+    given: dict[str, Any] = {}
     for text in texts:
-        default = updated(default, _parsed(text), "--config ")
-    return default
+        given = _merged(given, _parsed(text))
+    return updated(default, given, "--config ")
 
 
 def _parsed(text: str) -> dict[str, Any]:

@@ -38,12 +38,20 @@ def test_a_setting_of_a_device_does_not_take_the_next_option_for_its_value(more)
 
 
 @dataclass(frozen=True, kw_only=True)
+class Place:
+    x: float = 0.0
+    y: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Inner:
     speed: float = 1.0
     count: int = 3
     path: Path | None = None
     names: tuple[str, ...] = ()
     table: dict[str, dict] = field(default_factory=dict)
+    places: dict[str, Place] = field(default_factory=dict)
+    extra: Place | None = None
 
     def __post_init__(self):
         if self.speed < 0:
@@ -68,6 +76,9 @@ class Outer:
         (['site.names=["a", "b"]'], Outer(site=Inner(names=("a", "b")))),
         (["site.table.a.x=1", "site.table.a.y=2", "site.table.b.x=3"],
          Outer(site=Inner(table={"a": {"x": 1, "y": 2}, "b": {"x": 3}}))),
+        (["site.places.a.x=1", "site.places.a.y=2", "site.places.b.y=3", "site.places.a.x=4"],
+         Outer(site=Inner(places={"a": Place(x=4.0, y=2.0), "b": Place(y=3.0)}))),
+        (["site.extra.x=1", "site.extra.y=2"], Outer(site=Inner(extra=Place(x=1.0, y=2.0)))),
     ],
 )  # fmt: skip
 def test_the_last_value_of_a_setting_counts(texts, expected):
@@ -78,7 +89,7 @@ def test_the_last_value_of_a_setting_counts(texts, expected):
     ("text", "message"),
     [
         ("site.sped=2", "--config site.sped: no such setting; did you mean speed?"),
-        ("site.zzz=2", "there are speed, count, path, names, table"),
+        ("site.zzz=2", "there are speed, count, path, names, table, places, extra"),
         ("site.count=x", "--config site.count must be int, got 'x'"),
         ("site.speed=-1", "speed must not be negative"),
         ("a\nb=2", "not NAME=VALUE"),
@@ -97,7 +108,7 @@ def test_help_lists_every_setting(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "site.speed = 1.0"
     assert lines[-1] == "shown = False"
-    assert len(lines) == 6
+    assert len(lines) == 8
 
 
 def test_settings_from_a_file(tmp_path):
