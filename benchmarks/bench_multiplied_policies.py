@@ -1,12 +1,11 @@
 """Policies learned from demonstrations that `hrc multiply` made of five, in MetaWorld.
 
 A policy learns from five demonstrations of the scripted expert (few), from these five
-multiplied without physics (multiplied), from the actions of the multiplied ones as MetaWorld
-carries them out, without the failures (replayed), or from a hundred demonstrations (many), for
-the same CPU time. It starts where no demonstration does, and MetaWorld decides. The user of
-`hrc multiply` states where objects and goals may be: where MetaWorld puts them. Every finished
-run is a line of `--runs`; runs that are there already are not repeated. Needs
-tools/make_environments.sh.
+multiplied without physics (multiplied), from these five multiplied and judged by MetaWorld
+(judged), or from a hundred demonstrations (many), for the same CPU time. It starts where no
+demonstration does, and MetaWorld decides. The user of `hrc multiply` states where objects and
+goals may be: where MetaWorld puts them. Every finished run is a line of `--runs`; runs that are
+there already are not repeated. Needs tools/make_environments.sh.
 
     .venv-environments/bin/python benchmarks/bench_multiplied_policies.py
 """
@@ -25,15 +24,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import bench_multiply_public as public
 import pyarrow.parquet as pq
 import torch
 from bench_environments import environments, successes
-from bench_multiply_public import APART, STILL, placed, record
 from bench_policies import ACTION, ENVIRONMENT, STATE, Episode, learn
 from public_tasks.known import TASKS
 from public_tasks.metaworld import MetaWorld
-from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
@@ -42,8 +39,8 @@ from hrc_learn import cli
 from hrc_learn.cli.arguments import Multiply
 from hrc_learn.cli.multiply_command import multiply
 
-SETS = ("few", "multiplied", "replayed", "many")
-SIZES = {"few": "few", "multiplied": "episodes", "replayed": "episodes", "many": "many"}
+SETS = ("few", "multiplied", "judged", "many")
+SIZES = {"few": "few", "multiplied": "episodes", "judged": "episodes", "many": "many"}
 TOGETHER = 10
 """Environments that run side by side."""
 LONGEST = 500
@@ -142,37 +139,21 @@ def episodes(name: str, chosen: str, args: Args) -> list[Episode]:
     task = "".join(f"{word}-" for word in name.split("-")[1:]) + "v3"
     shown = folder / f"demonstrations_{args.many}"
     if not shown.exists():
-        record(MetaWorld(task), task, shown, args.many)
+        public.record(MetaWorld(task), task, shown, args.many)
     if SIZES[chosen] != "episodes":
         return read(shown)[: args.few if chosen == "few" else args.many]
     options = [f"multiply.demonstrations={[*range(args.few)]}", *ranges(task), *args.config]
-    label = "_".join(["multiplied", *args.config]).replace("/", "")
+    judge = ""
+    if chosen == "judged":
+        judge = f"{public.__file__}:{task.removesuffix('-v3').replace('-', '_')}"
+    label = "_".join([chosen, *args.config]).replace("/", "")
     made = folder / f"{label}_{args.few}_{args.episodes}"
-    command = Multiply(dataset=shown, episodes=args.episodes, out=made, config=tuple(options))
+    command = Multiply(
+        dataset=shown, episodes=args.episodes, out=made, judge=judge, config=tuple(options)
+    )
     if not made.exists() and multiply(command):
         raise SystemExit(1)
-    return read(made) if chosen == "multiplied" else replayed(MetaWorld(task), read(made))
-
-
-def replayed(task: MetaWorld, made: list[Episode]) -> list[Episode]:
-    """What MetaWorld shows while it carries out actions, of the episodes that succeed."""
-    kept = []
-    for episode in made:
-        scene = episode[ENVIRONMENT][0].numpy()
-        # MetaWorld has no such scenes.
-        if np.linalg.norm(scene[:2] - scene[-3:-1]) < APART:
-            continue
-        seen, frames, left = placed(task, np.concatenate([scene[:3], scene[-3:]])), [], None
-        for action in episode[ACTION].numpy():
-            frames.append((seen[AGENT_POS], seen[ENVIRONMENT_STATE], action))
-            seen, done = task.step(action)
-            left = STILL if done and left is None else left if left is None else left - 1
-            if left == 0:
-                break
-        if left is not None:
-            columns = [torch.from_numpy(np.stack(x)).float() for x in zip(*frames, strict=True)]
-            kept.append(dict(zip((STATE, ENVIRONMENT, ACTION), columns, strict=True)))
-    return kept
+    return read(made)
 
 
 def ranges(task: str) -> Iterator[str]:

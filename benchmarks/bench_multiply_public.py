@@ -15,8 +15,9 @@ the hand. Needs tools/make_environments.sh.
 import json
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -122,31 +123,59 @@ def record(task: MetaWorld, name: str, folder: Path, count: int) -> None:
 
 def demonstrated(task: MetaWorld, seed: int) -> list[dict[str, Any]] | None:
     """Frames of one episode of the expert; None: it fails."""
-    data = task._env.data
     seen, frames, left = task.begin(seed), [], None
     task.expert.begin()
     while left != 0:
         if len(frames) == task.longest:
             return None
         action = task.expert.act(seen)
-        joints = [float(data.joint(joint).qpos[0]) for joint in JOINTS]
-        hand, opening = seen[AGENT_POS][:3], seen[AGENT_POS][3]
-        frames.append(
-            {
-                "observation.state": np.array([*joints, *hand, opening], np.float32),
-                "observation.environment_state": scene_of(seen),
-                "action": action.astype(np.float32),
-            }
-        )
+        frames.append({**shown(task, seen), "action": action.astype(np.float32)})
         seen, done = task.step(action)
         left = STILL if done and left is None else left if left is None else left - 1
     return frames
 
 
-def scene_of(seen: Observation) -> np.ndarray:
-    """Pose of the object, scalar first, and the position of the goal."""
+def shown(task: MetaWorld, seen: Observation) -> Observation:
+    """Observations of the dataset: joints, hand and gripper; object (scalar first) and goal."""
+    joints = [float(task._env.data.joint(joint).qpos[0]) for joint in JOINTS]
     things = seen[ENVIRONMENT_STATE]
-    return np.concatenate([things[:3], things[[6, 3, 4, 5]], things[-3:]]).astype(np.float32)
+    return {
+        "observation.state": np.array([*joints, *seen[AGENT_POS]], np.float32),
+        "observation.environment_state": things[[0, 1, 2, 6, 3, 4, 5, -3, -2, -1]],
+    }
+
+
+class Judge:
+    """A task of MetaWorld for `hrc multiply --judge`.
+
+    An episode ends some frames after its first success, as the demonstrations do.
+    """
+
+    metadata: ClassVar = {"render_fps": FPS}
+
+    def __init__(self, name: str):
+        self._task, self._left = MetaWorld(name), STILL
+
+    def reset(self, *, seed: int, options: dict[str, Any]) -> tuple[Observation, dict]:
+        """Begin with object and goal in their places; everything else is always the same."""
+        self._left = STILL
+        scene = np.concatenate([options["objects"][name][:3] for name in ("object", "goal")])
+        if np.linalg.norm(scene[:2] - scene[3:5]) < APART:
+            return {}, {"failure": "MetaWorld puts no object so near to the goal"}
+        return shown(self._task, placed(self._task, scene)), {}
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict]:
+        """Execute an action."""
+        seen, done = self._task.step(action)
+        done = done or self._left < STILL
+        self._left -= done
+        return shown(self._task, seen), float(done), self._left < 0, False, {"success": done}
+
+
+pick_place = partial(Judge, "pick-place-v3")
+push = partial(Judge, "push-v3")
+coffee_push = partial(Judge, "coffee-push-v3")
+shelf_place = partial(Judge, "shelf-place-v3")
 
 
 def actions_of(folder: Path) -> dict[int, np.ndarray]:
@@ -205,7 +234,9 @@ def placed(task: MetaWorld, scene: np.ndarray) -> Observation:
     """First observation of an episode with object and goal at given positions [m]."""
     env = task._env
     # An object that lies on the table has the height that MetaWorld gives it.
-    env._last_rand_vec = np.array([*scene[:2], 0.02, *scene[3:]])
+    space = env._random_reset_space
+    height = (space.low[2] + space.high[2]) / 2
+    env._last_rand_vec = np.array([*scene[:2], height, *scene[3:]])
     env._freeze_rand_vec = True
     return _observation(env.reset()[0])
 

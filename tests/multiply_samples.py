@@ -65,16 +65,25 @@ def demonstrations(blocks: list[Pose] = BLOCKS) -> list[Demonstration]:
     return demos
 
 
-def write_dataset(folder, robot_type: str = "panda") -> None:
-    """The demonstrations as a dataset, with the pose of the block and a column of its own."""
+def write_dataset(folder, robot_type: str = "panda", *, gripper: bool = False) -> None:
+    """The demonstrations as a dataset, with the pose of the block and a column of its own.
+
+    Args:
+        folder: Folder of the dataset.
+        robot_type: LeRobot's name of the robot.
+        gripper: True if the opening of the gripper is commanded, too.
+    """
     names = tuple(f"block.{axis}" for axis in ("x", "y", "z", "wx", "wy", "wz"))
     features = {"observation.block": names, "observation.mood": ("mood",)}
+    if gripper:
+        features["action.gripper"] = ("gripper.pos",)
     with DatasetWriter(folder, FPS, robot_type, panda.joint_names, features) as writer:
         for demo, at in zip(demonstrations(), BLOCKS, strict=True):
             writer.start_episode(demo.task)
             tool = panda.forward(torch.from_numpy(demo.joint_position))
             held = tool @ tool[GRASP + 2].inverse() @ at
             for k in range(END):
+                commanded = {"action.gripper": demo.gripper[[k]]} if gripper else {}
                 writer.add_frame(
                     joint_position=demo.joint_position[k],
                     gripper=demo.gripper[k],
@@ -83,5 +92,6 @@ def write_dataset(folder, robot_type: str = "panda") -> None:
                         "observation.block": (at if k < GRASP + 2 else held[k]).vector(),
                         "observation.mood": [k / END],
                     },
+                    **commanded,
                 )
             writer.save_episode()

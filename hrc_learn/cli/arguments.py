@@ -696,6 +696,9 @@ class Multiply(OnDataset):
     """Folder of the new dataset, which must not exist. Default: DATASET_multiplied."""
     robot: str = ""
     """Arm of the new motions, by name or file. Default: that of the dataset."""
+    judge: str = ""
+    """Simulator that decides on success: grasping, placing, an MJCF file, or a Python function
+    that makes an environment of gymnasium, as FILE.py:FUNCTION or MODULE:FUNCTION."""
     config: tuple[str, ...] = ()
     """Settings of scenes, variation and judge as NAME=VALUE or TOML files, such as
     objects.object.yaw=[-0.5,0.5] or judge.scene=none. `--config help` lists them."""

@@ -3,7 +3,7 @@
 import itertools
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -129,6 +129,8 @@ class Multiplication:
     """One run of `hrc multiply`: dataset, arm, judge, segments and fitted motions."""
 
     def __init__(self, args: Multiply, settings: Settings):
+        if args.judge:
+            settings = replace(settings, judge=replace(settings.judge, scene=args.judge))
         self.args, self.settings, self.config = args, settings, settings.multiply
         self.source = open_demos(args.dataset, self.config.demonstrations or None)
         self.demos = [*self.source]
@@ -220,11 +222,16 @@ class Multiplication:
 
     def _attempts(
         self, attempts: range, judge: Judge | None
-    ) -> Iterator[tuple[int, tuple[dict, str, dict[str, Any]] | str]]:
+    ) -> Iterator[tuple[int, tuple[Mapping, str, dict[str, Any]] | str]]:
         """Columns, task and origin of each episode, or the reason why a motion failed."""
         draws = self.draw(attempts)
         made = self.motions.motions(draws)
         trials = [self.trial(draws, motion, k) for k, motion in enumerate(made)]
+        if self.judge.is_environment:
+            trials = [
+                replace(t, seed=n, columns=self._values(m, self._planned(m, t)))
+                for n, m, t in zip(attempts, made, trials, strict=True)
+            ]
         good = [(m, t) for m, t in zip(made, trials, strict=True) if not m.reason]
         replays = judge([t for _, t in good]) if judge else (self._planned(*x) for x in good)
         for k, attempt in enumerate(attempts):
@@ -232,7 +239,7 @@ class Multiplication:
             if replay is None or replay.failure:
                 yield attempt, made[k].reason if replay is None else replay.failure
                 continue
-            main, demo = made[k].source, self.demos[made[k].source]
+            demo = self.demos[made[k].source]
             origin = {
                 "attempt": attempt,
                 "episode": demo.episode,
@@ -242,10 +249,7 @@ class Multiplication:
                 "seed": self.config.seed,
                 "judged_by": self.judged_by,
             }
-            phase = made[k].phase.numpy()
-            values = self.columns.values(
-                main, phase, replay.joints, replay.sent, replay.gripper, replay.objects
-            )
+            values = replay.columns or self._values(made[k], replay)
             yield attempt, (values, demo.task, origin)
 
     def draw(self, attempts: range) -> motions.Draws:
@@ -287,6 +291,11 @@ class Multiplication:
                 for name, pose in draws.scene.items()
             },
         )
+
+    def _values(self, made: motions.NewMotion, x: Replay) -> dict[str, np.ndarray]:
+        """Columns of an episode."""
+        phase = made.phase.numpy()
+        return self.columns.values(made.source, phase, x.joints, x.sent, x.gripper, x.objects)
 
     def _planned(self, made: motions.NewMotion, trial: Trial) -> Replay:
         """Motion as planned; objects move with the tool where they did in the demonstration."""

@@ -1,19 +1,22 @@
-"""Judges that replay motions of an arm in physics: in the work cell, or in any MuJoCo scene.
+"""Judges that replay motions of an arm: in the work cell, a MuJoCo scene, or an environment.
 
 A judge puts the objects in their places, lets the arm follow joint positions at the frame rate,
 and checks for success at the end: by MuJoCo's contacts in the work cell, by a Python function
-in other scenes.
+in other scenes. An environment of gymnasium executes the actions of the new episode instead,
+and its observations are written.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import mujoco
@@ -30,6 +33,12 @@ from hrc_learn.teleoperation.scenarios import SCENARIOS, ScenarioRun, make_scena
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
+# Names of LeRobot's environments for features of its datasets.
+_NAMES = {
+    "agent_pos": "observation.state",
+    "environment_state": "observation.environment_state",
+}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
@@ -41,6 +50,10 @@ class Trial:
     """Commanded opening of the gripper, in the unit of the dataset."""
     objects: Mapping[str, Float[np.ndarray, "7"]]
     """Pose of each object at the start: position [m] and quaternion (w, x, y, z)."""
+    columns: Mapping[str, Float[np.ndarray, "T _components"]] = field(default_factory=dict)
+    """Planned columns of the episode by feature, for an environment."""
+    seed: int = 0
+    """Seed of the environment."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,12 +64,14 @@ class Replay:
     """Measured joint positions [rad]."""
     sent: Float[np.ndarray, "T joints"]
     """Commanded joint positions, to be reached when the next frame is due [rad]."""
-    gripper: Float[np.ndarray, " T"] | None
+    gripper: Float[np.ndarray, " T"] | None = None
     """Measured opening; None: as planned."""
-    objects: Mapping[str, Float[np.ndarray, "T 7"]]
+    objects: Mapping[str, Float[np.ndarray, "T 7"]] = field(default_factory=dict)
     """Pose of each object."""
     failure: str = ""
     """Reason of a failure, empty after a success."""
+    columns: Mapping[str, Float[np.ndarray, "_T _components"]] = field(default_factory=dict)
+    """All columns of the episode, if an environment executed it; else empty."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,14 +79,15 @@ class JudgeConfig:
     """Physics in which motions are judged."""
 
     scene: str = ""
-    """Scene: "grasping" or "placing" in hrc_learn's work cell, or an MJCF file with position
-    actuators on the arm's joints; "none": no physics. Default: the work cell if the
-    demonstrations come from it."""
+    """Scene: "grasping" or "placing" in hrc_learn's work cell; an MJCF file with position
+    actuators on the arm's joints; an environment in Python as FILE.py:FUNCTION or
+    MODULE:FUNCTION; "none": no physics. Default: the work cell if the demonstrations come
+    from it."""
     shelf: str = "middle"
     """Shelf for placing."""
     success: str = ""
-    """Success function for an MJCF scene, as MODULE:FUNCTION. It takes model and data at the
-    end of a motion and returns True after a success."""
+    """Success function for an MJCF scene, as FILE.py:FUNCTION or MODULE:FUNCTION. It takes
+    model and data at the end of a motion and returns True after a success."""
     gripper: tuple[str, ...] = ()
     """Actuators of the gripper in an MJCF scene. Default: all that move no arm joint."""
     base: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -79,7 +95,12 @@ class JudgeConfig:
     processes: int = 2
     """Number of processes that judge motions."""
 
-    def open(self, robot: ArmChoice, fps: float, widest: float) -> CellJudge | SceneJudge:
+    @property
+    def is_environment(self) -> bool:
+        """True if a Python function makes an environment."""
+        return ":" in self.scene and not Path(self.scene).exists()
+
+    def open(self, robot: ArmChoice, fps: float, widest: float) -> AnyJudge:
         """The judge for an arm.
 
         Args:
@@ -93,6 +114,8 @@ class JudgeConfig:
         """
         if self.scene in SCENARIOS:
             return CellJudge(self, robot, fps)
+        if self.is_environment:
+            return EnvironmentJudge(self.scene, fps)
         return SceneJudge(self, robot, fps, widest)
 
 
@@ -144,12 +167,12 @@ class SceneJudge:
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float, widest: float):
         """Read the scene."""
         if not Path(config.scene).is_file():
-            known = f"there are {', '.join(SCENARIOS)}, or an MJCF file"
+            known = f"there are {', '.join(SCENARIOS)}, an MJCF file, or FILE.py:FUNCTION"
             raise FileNotFoundError(f"no scene {config.scene!r}: {known}")
         self.model = model = mujoco.MjModel.from_xml_path(config.scene)
         self.data, self._config = mujoco.MjData(model), config
         self._watch = PhysicsWatch(model, self.data)
-        self.succeeded, self._widest = _function(config.success), widest or 1.0
+        self.succeeded, self._widest = _function("success", config.success), widest or 1.0
         self._steps = max(1, round(1 / fps / model.opt.timestep))
         known = {model.joint(i).name: i for i in range(model.njnt)}
         # Joint that each actuator moves; tendons and sites are numbered separately.
@@ -218,6 +241,75 @@ class SceneJudge:
             self.model.body_pos[body.id], self.model.body_quat[body.id] = pose[:3], pose[3:]
 
 
+class EnvironmentJudge:
+    """An environment of gymnasium that executes the actions of new episodes.
+
+    `reset(seed=..., options=...)` puts the objects in their places: `options["objects"]` has
+    the pose of each object by name (x, y, z [m] and quaternion w, x, y, z),
+    `options["joint_position"]` the first joint positions [rad]. Observations are a dictionary
+    of the dataset's features, or of LeRobot's `agent_pos` and `environment_state`. `step` takes
+    the feature `action`, or a dictionary if there are several actions. The last step decides:
+    `info["is_success"]` or `info["success"]`, and `info["failure"]`, a reason in words, which
+    may also reject the scene in `reset`.
+    """
+
+    def __init__(self, function: str, fps: float):
+        """Make the environment.
+
+        Args:
+            function: Function without arguments, as FILE.py:FUNCTION or MODULE:FUNCTION.
+            fps: Frames per second of the dataset.
+        """
+        self._name, self._env = function, _function("scene", function)()
+        for method in ("reset", "step"):
+            if not callable(getattr(self._env, method, None)):
+                kind = type(self._env).__name__
+                raise ValueError(f"{function} makes a {kind} without the method {method}")
+        own = (getattr(self._env, "metadata", None) or {}).get("render_fps") or fps
+        if round(own) != round(fps):
+            text = f"actions per second (metadata['render_fps']), but the dataset has {fps:g}"
+            raise ValueError(f"{function} takes {own:g} {text}: choose a dataset of its rate")
+
+    def replay(self, trial: Trial) -> Replay:
+        """Execute the actions of a planned episode.
+
+        Raises:
+            ValueError: An observation of the dataset is missing or has another size, or the
+                environment does not report success.
+        """
+        scene = {"objects": dict(trial.objects), "joint_position": trial.joints[0]}
+        seen, info = self._env.reset(seed=trial.seed, options=scene)
+        rows, ended = [], bool(info.get("failure"))
+        while not ended and len(rows) < len(trial.joints):
+            row = {key: x[len(rows)] for key, x in trial.columns.items()}
+            rows.append(row | self._observed(seen, row))
+            sent = {key: np.float32(x) for key, x in row.items() if key.startswith("action")}
+            action = sent["action"] if [*sent] == ["action"] else sent
+            seen, _, *ends, info = self._env.step(action)
+            ended = any(ends)
+        columns = {key: np.array([row[key] for row in rows]) for key in trial.columns}
+        failure, done = info.get("failure"), info.get("is_success", info.get("success"))
+        if not failure and done is None:
+            text = "step returns neither info['is_success'] nor info['success']"
+            raise ValueError(f"{self._name}: {text}")
+        failure = failure or ("" if done else f"{self._name} reported no success")
+        if not all(np.isfinite(x).all() for x in columns.values()):
+            failure = f"{self._name} returned numbers that are not finite"
+        return Replay(joints=trial.joints, sent=trial.joints, failure=failure, columns=columns)
+
+    def _observed(self, seen: Any, planned: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Observations of one frame by feature of the dataset."""
+        found = seen if isinstance(seen, Mapping) else {"observation.state": seen}
+        named = {_NAMES.get(key, key): np.ravel(x) for key, x in found.items()}
+        wanted = {key: x.size for key, x in planned.items() if key.startswith("observation")}
+        sizes = {key: x.size for key, x in named.items()}
+        for key, width in wanted.items():
+            if sizes.get(key) != width:
+                text = f"returns {sizes}, but {key} has {width} numbers in the dataset"
+                raise ValueError(f"{self._name} {text}")
+        return {key: named[key].astype(float) for key in wanted}
+
+
 def replay(judge: CellJudge | SceneJudge, trial: Trial) -> Replay:
     """Carry out a motion in simulation."""
     judge.begin(trial)
@@ -239,24 +331,39 @@ def replay(judge: CellJudge | SceneJudge, trial: Trial) -> Replay:
     )
 
 
-def _function(text: str) -> Callable[[Any, Any], bool]:
-    """Function named as MODULE:FUNCTION, from the current folder or an installed package.
+def _function(option: str, text: str) -> Callable[..., Any]:
+    """Function named as FILE.py:FUNCTION, or as MODULE:FUNCTION.
+
+    Modules are imported from the current folder or from an installed package.
 
     Raises:
         ValueError: There is no such function.
     """
-    sys.path.insert(0, str(Path.cwd()))
+    place, _, name = text.rpartition(":")
+    is_file = place.endswith(".py")
+    sys.path.insert(0, str(Path(place).resolve().parent if is_file else Path.cwd()))
     try:
-        return pkgutil.resolve_name(text)
-    except (ImportError, AttributeError, ValueError) as error:
+        return getattr(_module(place), name) if is_file else pkgutil.resolve_name(text)
+    except (ImportError, AttributeError, ValueError, OSError) as error:
         raise ValueError(
-            f"judge.success={text!r} is not a MODULE:FUNCTION that can be imported ({error})"
+            f"judge.{option}={text!r} is not a MODULE:FUNCTION or FILE.py:FUNCTION: {error}"
         ) from None
     finally:
         sys.path.pop(0)
 
 
-_JUDGE: list[CellJudge | SceneJudge] = []
+def _module(file: str) -> ModuleType:
+    """Module of a file with any name, which may be that of an installed package."""
+    spec = importlib.util.spec_from_file_location(file, file)
+    assert spec is not None
+    assert spec.loader is not None
+    made = sys.modules[file] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
+
+
+type AnyJudge = CellJudge | SceneJudge | EnvironmentJudge
+_JUDGE: list[AnyJudge] = []
 """Judge of this process."""
 
 
@@ -266,7 +373,8 @@ def _begin(config: JudgeConfig, robot: ArmChoice, fps: float, widest: float) -> 
 
 
 def _replay(trial: Trial) -> Replay:
-    return replay(_JUDGE[0], trial)
+    (judge,) = _JUDGE
+    return judge.replay(trial) if isinstance(judge, EnvironmentJudge) else replay(judge, trial)
 
 
 type Judge = Callable[[Sequence[Trial]], Iterator[Replay]]

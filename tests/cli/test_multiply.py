@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import panda_environment
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -90,6 +91,31 @@ def test_it_goes_on_where_it_was_killed(dataset, tmp_path, monkeypatch):
     assert origins(broken) == origins(whole)
     for one, two in zip(load_demos(broken), load_demos(whole), strict=True):
         assert np.array_equal(one.joint_position, two.joint_position)
+
+
+def test_an_environment_shows_what_it_did_with_the_actions(tmp_path):
+    """A simulator of the user decides; its observations and executed actions are written."""
+    demos, out = tmp_path / "three", tmp_path / "out"
+    write_dataset(demos, gripper=True)
+    judge = f"{panda_environment.__file__}:Taking"
+    settings = ("--config", "judge.processes=1", "objects.block.z=[0.05,0.05]")
+    done = multiplied(demos, out, "--judge", judge, *settings, episodes=3)
+    assert done.status == 0, done.error
+    assert f"judged by physics: {judge}" in done.output
+    assert not check_dataset(out).errors
+    env = panda_environment.Taking()
+    for demo, origin in zip(load_demos(out), origins(out), strict=True):
+        assert origin["judged_by"] == f"physics: {judge}"
+        pose, q = np.array(origin["scene"]["block"]), demo.joint_position
+        seen = env.reset(seed=0, options={"objects": {"block": pose}, "joint_position": q[0]})
+        for k in range(len(demo)):
+            np.testing.assert_allclose(q[k], seen[0]["agent_pos"][:7], atol=1e-3)
+            shown = demo.extra["observation.block"][k]
+            np.testing.assert_allclose(shown, seen[0]["observation.block"], atol=2e-3)
+            opening = demo.extra["action.gripper"][k]
+            seen = env.step({"action": demo.command_position[k], "action.gripper": opening})
+        assert seen[-1]["is_success"]
+        assert (demo.extra["observation.mood"] == 0.5).all()
 
 
 def test_another_arm_gets_its_own_joints(dataset, tmp_path):

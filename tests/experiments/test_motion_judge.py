@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from multiply_samples import END, block, demonstrations
+from panda_environment import panda_and_block
 
 from hrc_learn.experiments.motion_judge import JudgeConfig, Trial, judging
-from hrc_learn.kinematics import ArmChoice, panda
-from hrc_learn.sim.arm_model import ArmModelConfig, add_arm
+from hrc_learn.kinematics import ArmChoice
 
 PLACE = block(0.45, 0.10, 0.0)
 
@@ -23,23 +23,7 @@ def block_is_lifted(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A Panda beside a block, as a file that any program can read."""
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio, spec.option.noslip_iterations = 10, 3
-    add_arm(spec, ArmModelConfig(robot=panda))
-    for actuator in list(spec.actuators):
-        if actuator.name.endswith("_velocity"):
-            spec.delete(actuator)
-        elif actuator.name.endswith("_position"):
-            actuator.set_to_position(kp=3000.0, kv=100.0)
-    size = (0.3, 0.4, 0.01)
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    spec.worldbody.add_geom(type=box, size=size, pos=(0.5, 0.0, -0.01))
-    body = spec.worldbody.add_body(name="block", pos=(0.45, 0.10, 0.025))
-    body.add_freejoint()
-    body.add_geom(type=box, size=(0.03, 0.03, 0.05), mass=0.1, friction=(1.5, 0.02, 0.001))
+    spec = panda_and_block()
     spec.compile()
     file = tmp_path_factory.mktemp("scene") / "scene.xml"
     file.write_text(spec.to_xml(), encoding="utf-8")
