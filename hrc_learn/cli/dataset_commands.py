@@ -117,7 +117,7 @@ def check(args: Check) -> int:
         ValueError: An option names something that does not exist, no columns could be read for
             the contract, or there is no marker for `--camera`. The findings are written first.
     """
-    if not args.dataset.is_dir():  # not an error in the data
+    if not args.dataset.is_dir() or not any(args.dataset.iterdir()):  # not an error in the data
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
     robot = ArmChoice(args.robot).arm() if args.robot else None
     with Console().status(f"Checking {args.dataset}"):
@@ -300,8 +300,11 @@ def push(args: Push) -> int:
     """Check the dataset, and have LeRobot upload it with a card and a tag.
 
     Raises:
-        ValueError: The dataset has errors.
+        ValueError: The dataset has errors, or the Hub does not accept the name `args.repo`.
     """
+    from huggingface_hub.utils import validate_repo_id
+
+    validate_repo_id(args.repo)
     with Console().status(f"Checking {args.dataset}"):
         report = check_dataset(args.dataset)
     if report.errors and not args.unsound:

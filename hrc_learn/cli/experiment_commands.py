@@ -78,21 +78,20 @@ def run(args: Run) -> int:
             "hrc run does not support --arm lerobot: use hrc page to guide the arm, or hrc "
             "play for the motion of a model."
         )
+    options = RunOptions(
+        out=folder,
+        seed=args.seed,
+        trials=args.trials,
+        serve=args.serve,
+        overwrite=args.overwrite,
+        json=args.json,
+    )
     experiment = _experiment(args, _models(args))
     settings = with_settings(args.config, _Settings(experiment=experiment))
     if is_real:
         task = task_of(settings.experiment, args.shelf[0])
         return _run_on_arm(args, folder, settings.site, *task)
-    options = RunOptions(
-        out=folder,
-        seed=args.seed,
-        trials=args.trials,
-        processes=settings.processes,
-        serve=args.serve,
-        film=settings.film,
-        overwrite=args.overwrite,
-        json=args.json,
-    )
+    options = replace(options, processes=settings.processes, film=settings.film)
     return run_experiment(settings.experiment, options, command=command_line())
 
 

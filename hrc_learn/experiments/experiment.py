@@ -159,6 +159,17 @@ class RunOptions:
     json: Path | None = None
     """File for the measured values."""
 
+    def __post_init__(self) -> None:
+        """Refuse wrong numbers.
+
+        Raises:
+            ValueError: If the number of trials, or the seed, is negative.
+        """
+        for name in ("trials", "seed"):
+            if (number := getattr(self, name)) < 0:
+                raise ValueError(f"--{name} must not be negative, but is {number}.")
+        check_settings(self, positive=["processes"])
+
 
 def run_experiment[Run: ExperimentRun](
     experiment: Experiment[Run], options: RunOptions, *, command: str = ""
@@ -173,16 +184,9 @@ def run_experiment[Run: ExperimentRun](
     Returns:
         Exit status: 0, or 1 if the run failed or a bound was missed. A run whose physics failed
         leaves no folder, as its measurements would be invalid.
-
-    Raises:
-        ValueError: If the number of trials, or the seed, is negative.
     """
     from rich.console import Console
 
-    for name in ("trials", "seed"):
-        if (number := getattr(options, name)) < 0:
-            raise ValueError(f"--{name} must not be negative, but is {number}.")
-    check_settings(options, positive=["processes"])
     configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
     console, study = Console(), experiment.study()
     observer = Observer(tell=console.print)

@@ -192,9 +192,11 @@ def test_check_names_the_place_of_an_error(tmp_path):
 
 
 def test_check_of_nothing(tmp_path):
-    status, _, error = hrc("check", tmp_path / "none")
-    assert (status, error.count("\n")) == (2, 1)
-    assert "there is no dataset" in error
+    (tmp_path / "empty").mkdir()
+    for name in ("none", "empty"):
+        status, _, error = hrc("check", tmp_path / name)
+        assert (status, error.count("\n")) == (2, 1)
+        assert "there is no dataset" in error
 
 
 def test_findings_are_written_for_other_programs(recording, tmp_path):

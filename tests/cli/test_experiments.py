@@ -151,6 +151,14 @@ def test_options_of_other_experiments_and_bad_values_are_refused(ran, given, mes
     assert ran == []
 
 
+def test_wrong_numbers_are_refused_before_models_are_learned(ran, monkeypatch):
+    learned = []
+    monkeypatch.setattr(experiment_commands, "_models", learned.append)
+    with pytest.raises(ValueError, match="--trials must not be negative, but is -1"):
+        experiment_commands.run(Run(experiment="placing", trials=-1))
+    assert learned == []
+
+
 def test_existing_results_are_not_overwritten_unasked(ran, tmp_path):
     (tmp_path / "there").mkdir()
     with pytest.raises(FileExistsError):

@@ -59,6 +59,14 @@ def test_a_trial_run_sends_nothing(hub, dataset, tmp_path):
     assert not hub.requests
 
 
+@pytest.mark.parametrize("repo", ["a/b/c", "alice/reach/", "alice/-reach", "alice reach"])
+def test_a_name_that_the_hub_refuses_is_refused_at_once(hub, dataset, repo):
+    status, _, error = hrc("push", dataset, repo, "--dry-run")
+    assert (status, error.count("\n")) == (2, 1)
+    assert repo in error
+    assert not hub.requests
+
+
 def test_without_lerobot_the_command_names_the_extra(dataset, monkeypatch):
     monkeypatch.setitem(sys.modules, "lerobot.datasets", None)
     status, _, error = hrc("push", dataset, "alice/reach")

@@ -132,6 +132,14 @@ def test_one_dataset_is_nothing_to_merge(tmp_path):
         merge_datasets([tmp_path / "a"], tmp_path / "new")
 
 
+def test_a_dataset_is_not_merged_with_itself(tmp_path):
+    write(tmp_path / "a", [joint_path(60)])
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    with pytest.raises(ValueError, match="given twice"):
+        merge_datasets([tmp_path / "a", tmp_path / "link"], tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
 def test_other_robots_and_columns_without_names_are_noted(tmp_path):
     write(tmp_path / "a", [joint_path(60)])
     write(tmp_path / "b", [joint_path(60)], None)

@@ -60,10 +60,12 @@ def merge_datasets(
         DatasetError: A dataset cannot be read, or its rate, a component, a unit or the size of
             its images does not fit the first one.
         FileExistsError: `out` exists.
-        ValueError: Fewer than two datasets are given.
+        ValueError: Fewer than two datasets are given, or one is given twice.
     """
     if len(paths) < 2:
         raise ValueError("give two datasets or more to merge")
+    if len({Path(path).resolve() for path in paths}) < len(paths):
+        raise ValueError("a dataset is given twice: its episodes would be doubled")
     report = MergeReport(path=Path(out))
     opened = [open_dataset(path) for path in paths]
     rate = opened[0].folder.fps if fps is None else float(fps)
