@@ -65,6 +65,26 @@ def test_an_encoder_froze_that_stays_long_and_longer_than_usual(
     )
 
 
+def test_objects_may_rest_longer_than_usual_but_joints_may_not(tmp_path):
+    def episode(frames):
+        x = np.stack([ramp(), loop(), 1 - ramp()], axis=1)
+        x[:frames] = x[frames - 1]
+        return {STATE: x, "observation.environment_state": x}
+
+    issues = found(tmp_path / "set", [*map(episode, [1, 1, 1, 1, 30])], "the encoder froze?")
+    assert [issue.key for issue in issues] == [STATE] * 3
+
+
+@pytest.mark.parametrize("names", [["cube.qx", "cube.qy", "cube.qz"], ["qx", "qy", "qz"]])
+def test_quaternions_of_objects_have_no_sign(tmp_path, names):
+    joints = [*(three(0.2 + ramp(), i) for i in range(ODD)), three(-0.2 - ramp(), ODD)]
+    episodes = [{**q, "observation.environment_state": q[STATE]} for q in joints]
+    columns = {STATE: JOINTS, "observation.environment_state": names}
+    write_folder(tmp_path / "set", episodes, columns)
+    signs = [i for i in check_dataset(tmp_path / "set").errors if "opposite" in i.message]
+    assert [issue.key for issue in signs] == [STATE]
+
+
 def three(second, noise=0):
     """Three joints, the second one given."""
     frames = len(second)

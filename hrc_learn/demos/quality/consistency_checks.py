@@ -99,6 +99,8 @@ def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
 
 def holds(feature: FeatureProfiles) -> Iterator[Issue]:
     """Report components that froze in one episode, but hardly ever rest in the others."""
+    if feature.key == "observation.environment_state":
+        return  # objects rest until something touches them
     held, frames = feature.stack("held"), feature.lengths
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
@@ -256,7 +258,8 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
 
     These are quaternions, and rotation vectors near half a turn in any episode.
     """
-    meanings = map(meaning_of_component, feature.names)
+    # The meaning of `object.qy`, a name that is not of the arm, is that of `qy`.
+    meanings = [meaning_of_component(name.rpartition(".")[2]) for name in feature.names]
     roles = np.array([meaning.role if meaning else "" for meaning in meanings])
     vectors = roles == "rotation_vector"
     middles = np.linalg.norm(feature.stack("levels")[:, 2] * vectors, axis=1)
