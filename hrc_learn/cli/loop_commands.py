@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 
-from hrc_learn.cli._run import configuration, with_settings, write_values
+from hrc_learn.cli._run import with_settings, write_values
 from hrc_learn.cli.arguments import Serve, ServePage, WithDriver, refuse_given
 from hrc_learn.controller import (
     GRIPPER_DOWN,
@@ -135,11 +135,7 @@ def page(args: ServePage) -> None:
         robot_type=robot.name,
         joint_names=robot.chain.joint_names,
         features=FEATURES,
-        frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
-        details={
-            "demonstrated by": "a person at the page",
-            "recorded with": configuration(args),
-        },
+        frames=robot.frame_names,
     )
     recorder = DemonstrationRecorder(writer, lambda: page.task, chain=robot.chain)
     targets = place_targets(workplace)

@@ -143,8 +143,7 @@ def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -
         fps=round(1 / DT),
         robot_type=robot.name,
         joint_names=robot.chain.joint_names,
-        frames={"base": f"{robot.name} base", "ee": f"{robot.name} tool centre point"},
-        details={"played by": "hrc play", "model": str(args.model.resolve())},
+        frames=robot.frame_names,
     ) as writer:
         writer.start_episode(f"played {args.model.name}")
         columns = motion.joints, motion.position, motion.orientation, following

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from rich.progress import Progress, track
 
-from hrc_learn.cli._run import configuration, with_settings, write_values
+from hrc_learn.cli._run import with_settings, write_values
 from hrc_learn.cli.arguments import Record, refuse_of_others
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
@@ -180,8 +180,7 @@ def _write(
             joint_names=robot.chain.joint_names,
             features=features,
             cameras=cameras,
-            frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
-            details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
+            frames=robot.frame_names,
         ) as writer,
     ):
         for _ in track(
@@ -266,8 +265,7 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
         robot_type=str(site.device.get("type", robot.name)),
         joint_names=names,
         features={"action": (*(f"{name}.pos" for name in names), GRIPPER)},
-        frames={"base": f"{robot.name} base", "ee": f"{robot.name} tool centre point"},
-        details={"demonstrated by": "a leader arm", "recorded with": configuration(args)},
+        frames=robot.frame_names,
     )
     with (
         writer,

@@ -179,6 +179,11 @@ class Arm(SerialChain):
         return len(self.joint_names)
 
     @property
+    def frame_names(self) -> dict[str, str]:
+        """Names of the frames of a recording's poses: "base", and "ee", the end effector."""
+        return {"base": f"{self.name} base", "ee": f"{self.name} tool centre point"}
+
+    @property
     def is_franka(self) -> bool:
         """True for Franka's arms, which have a closed-form inverse."""
         return self._closed_form is not None

@@ -62,3 +62,11 @@ def test_the_inverse_of_a_path_does_not_jump(name):
     q = robot.inverse(path)
     assert_close(robot.forward(q).position, path.position, rtol=0, atol=1e-4)
     assert float(q.diff(dim=0).abs().max()) < 0.1  # [rad], for steps of 5 mm
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5e"])
+def test_frames_are_named_after_the_arm(name):
+    assert arm(name).frame_names == {
+        "base": f"{name} base",
+        "ee": f"{name} tool centre point",
+    }
