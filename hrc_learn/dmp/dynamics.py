@@ -10,7 +10,6 @@ system. The weights describe how a motion deviates from this trajectory.
 
 import math
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from types import ModuleType
 from typing import Any, ClassVar, Literal
 
@@ -18,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.numerics import check_settings, polynomial
+from hrc_learn.geometry.numerics import cached_tensors, check_settings, polynomial
 
 CRITICAL = 1e-12
 """Bound on |1 - 4 beta / alpha| below which the damping counts as critical. At smaller
@@ -108,16 +107,13 @@ class SpringDamper:
 
 
 # A control loop uses few step lengths, each of which needs one 2x2 matrix.
-@lru_cache(maxsize=64)
+@cached_tensors(maxsize=64)
 def _cached_propagator(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
     """`SpringDamper.propagator` of a number (float64)."""
     C, S = spring.modes(s, math)
     lean = S * spring.alpha / 2
-    # Tensors made in inference mode cannot take part in a backward pass later.
-    with torch.inference_mode(False):
-        return torch.tensor(
-            [[C + lean, S], [-spring.stiffness * S, C - lean]], dtype=torch.float64
-        )
+    rows = [[C + lean, S], [-spring.stiffness * S, C - lean]]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def approach_curve(s: Float[Tensor, "*batch"], fraction: float, order: int) -> Tensor:

@@ -28,6 +28,7 @@ from hrc_learn.dmp.dynamics import (
     basis_config,
     restored_basis,
 )
+from hrc_learn.geometry.numerics import lasting
 
 GAUSS_POINTS = 12
 """Points of Gauss-Legendre quadrature on a piece; no basis function changes much on a piece."""
@@ -190,8 +191,7 @@ class Response:
         """The parts as JSON text, for `named_response`."""
         self.size = basis.count + 3
         """M, the number of coordinates: N weights, start velocity, start, goal."""
-        # Tensors made in inference mode cannot take part in a backward pass later.
-        with torch.inference_mode(False):
+        with lasting():
             self.forced = self._integrate()
         """States (y, y') caused by unit weights alone, (2, N). They start from rest at the goal
         at s = 0; for a periodic basis, they are on the limit cycle."""

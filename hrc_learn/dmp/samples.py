@@ -10,7 +10,7 @@ deviation of the noise, whether it comes from encoders, a tracker or a trembling
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial, reduce
+from functools import cached_property, partial, reduce
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._arguments import Mask, Points, Times, to_tensor
 from hrc_learn.dmp.dynamics import DEGREE, cubic_spline
+from hrc_learn.geometry.numerics import cached_tensors
 
 MINIMUM_SAMPLES = 3
 """Start, goal and one sample between them; two leave nothing to fit."""
@@ -472,7 +473,7 @@ class _Spline:
 
 
 # Demonstrations on one grid use one spline.
-@lru_cache(maxsize=16)
+@cached_tensors(maxsize=16)
 def _spline(timestamps: bytes, device: torch.device) -> _Spline:
     s = torch.frombuffer(bytearray(timestamps), dtype=torch.float64).to(device)
     knots = max(4, min(MAXIMUM_KNOTS, len(s) // 2))

@@ -6,7 +6,6 @@ with different times by batched normal equations.
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +15,7 @@ from hrc_learn.dmp.dynamics import balanced_units
 from hrc_learn.dmp.ragged_times import LONG, blocks, motion
 from hrc_learn.dmp.response import Response
 from hrc_learn.dmp.samples import Samples
+from hrc_learn.geometry.numerics import cached_tensors
 
 REGULARIZATION = 1e-7
 """Default ridge of a fit: far above rounding, far below what a sensor resolves."""
@@ -157,7 +157,7 @@ def solve_normal(
     return (mixing[:n, :n] @ z).mT, square.clamp(min=0), undetermined
 
 
-@lru_cache(maxsize=16)
+@cached_tensors(maxsize=16)
 def _orthonormal_columns(
     response: Response, n: int, device: torch.device
 ) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"]]:
@@ -221,7 +221,7 @@ def differentiate(
 
 
 # Demonstrations on one grid use one operator, so 16 grids serve as many datasets.
-@lru_cache(maxsize=16)
+@cached_tensors(maxsize=16)
 def _trajectory_operator(
     response: Response,
     timestamps: bytes,
@@ -247,7 +247,7 @@ def _trajectory_operator(
     return from_samples, K @ velocity
 
 
-@lru_cache(maxsize=16)
+@cached_tensors(maxsize=16)
 def _force_operator(
     response: Response,
     timestamps: bytes,

@@ -8,7 +8,6 @@ the end exactly. `MotionPrimitive.condition` does this for values of any kind.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +16,7 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import full_precision, readable
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
+from hrc_learn.geometry.numerics import cached_tensors
 
 SAMPLES_PER_FUNCTION = 8
 """Times per basis function at which curve and motion are compared. More are not needed: basis
@@ -219,7 +219,7 @@ class _CurveFollower:
 
 
 # A decomposition of 8 N x 3 rows each; a task has few windows.
-@lru_cache(maxsize=16)
+@cached_tensors(maxsize=16)
 def _curve_follower(response: Response, window: tuple[float, float]) -> _CurveFollower:
     N, (first, last) = response.basis.count, window
     grid = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)

@@ -9,14 +9,16 @@ argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
 import math
-from collections.abc import Collection, Iterable, Sequence
-from functools import cache
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, lru_cache, wraps
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Sequence | float
@@ -214,6 +216,39 @@ def minimum_jerk[T: (float, Tensor)](x: T) -> tuple[T, T]:
     return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2
 
 
+@contextmanager
+def lasting() -> Iterator[None]:
+    """Context in which to make tensors that are kept and that every later call can use.
+
+    Autograd refuses tensors made in inference mode, and the stand-ins of a tracer end with its
+    trace.
+    """
+    with torch.inference_mode(False), _disable_current_modes():
+        yield
+
+
+def cached_tensors[**P, R](maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """`functools.lru_cache` for functions that make `lasting` tensors.
+
+    Dynamo does not use the cache: it traces the function.
+
+    Args:
+        maxsize: Number of results that are kept.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        kept = lru_cache(maxsize)(lasting()(function))
+
+        @wraps(function)
+        def called(*args: P.args, **kwargs: P.kwargs) -> R:
+            made = function if torch.compiler.is_dynamo_compiling() else kept
+            return made(*args, **kwargs)
+
+        return called
+
+    return decorate
+
+
 class Constant:
     """A fixed tensor, cached for each dtype and device that it is used with.
 
@@ -236,8 +271,7 @@ class Constant:
         key = (dtype, x.device)
         tensor = self._ready.get(key)
         if tensor is None:
-            # Autograd cannot use inference tensors, so none may enter the cache.
-            with torch.inference_mode(False):
+            with lasting():
                 tensor = self._value.to(device=x.device, dtype=dtype)
             if _outlives_the_call(tensor):
                 self._ready[key] = tensor

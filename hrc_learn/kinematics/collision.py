@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import combinations
 from typing import Any, final
 
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.geometry import Capsule
-from hrc_learn.geometry.numerics import Constant, safe_norm
+from hrc_learn.geometry.numerics import Constant, cached_tensors, safe_norm
 from hrc_learn.kinematics.chain import SerialChain
 
 # Search for the point of a segment nearest to a box: in each round, 31 points select one of 32
@@ -428,11 +428,10 @@ def separation(
     )
 
 
-@cache
+@cached_tensors(maxsize=64)
 def _moved(links: tuple[int, ...], joints: int) -> Bool[Tensor, "links joints"]:
     """Mask of the joints that move a link: all joints up to the link's own number."""
-    with torch.inference_mode(False):
-        return torch.arange(joints) < torch.tensor(links)[:, None]
+    return torch.arange(joints) < torch.tensor(links)[:, None]
 
 
 def _between(segment: Tensor, fraction: Tensor) -> Tensor:

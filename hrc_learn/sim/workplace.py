@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import Constant
+from hrc_learn.geometry.numerics import Constant, lasting
 from hrc_learn.kinematics import Arm, UnreachableError, coarse_orientation, gripper_down
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.layout_quality import (
@@ -232,8 +232,7 @@ class Workplace:
     def _furniture(self) -> Constant:
         """Centre and half edges of the furniture's boxes [m]."""
         boxes = [(*box.centre, *box.half_size) for box in self.scene.boxes()]
-        # The cached tensor must work with autograd as well.
-        with torch.inference_mode(False):
+        with lasting():
             return Constant(torch.tensor(boxes, dtype=torch.float64))
 
     def random_object_pose(
