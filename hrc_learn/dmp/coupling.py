@@ -78,8 +78,8 @@ def steering(
     v = velocity[..., None, :].expand(towards.shape)
     normal = torch.linalg.cross(towards, v)
     sine, cosine = normal.norm(dim=-1, keepdim=True), (towards * v).sum(-1, keepdim=True)
-    # Straight ahead there is no axis: zero divided by a tiny number stays zero.
-    axis = normal / sine.clamp_min(torch.finfo(sine.dtype).tiny)
+    # Straight ahead and behind there is no axis: the term is zero.
+    axis = normal / torch.where(sine > 0, sine, 1.0)
     angle = torch.atan2(sine, cosine)
     term = gain * torch.linalg.cross(axis, v) * angle * torch.exp(-sharpness * angle)
     if reach is not None:

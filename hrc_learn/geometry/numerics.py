@@ -256,7 +256,8 @@ class Constant:
     """
 
     def __init__(self, value: Tensor):
-        self._value = value
+        with lasting():
+            self._value = value.clone()  # a tensor made in inference mode becomes a usual one
         self._ready: dict[tuple[torch.dtype, torch.device], Tensor] = {}
 
     def __getstate__(self) -> dict[str, object]:

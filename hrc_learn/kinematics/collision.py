@@ -10,6 +10,7 @@ with v the velocity of the person's nearest point.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -220,7 +221,9 @@ def nearest_on_segments(
     start, along = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
     other, across = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
     offset = start - other
-    tiny = torch.finfo(first.dtype).tiny  # segments of length zero are points
+    # Segments of length zero are points. The root is the least divisor with a finite square,
+    # which the derivative contains.
+    tiny = math.sqrt(torch.finfo(first.dtype).tiny)
     a, e = ((v * v).sum(-1).clamp(min=tiny) for v in (along, across))
     b, c, f = (along * across).sum(-1), (along * offset).sum(-1), (across * offset).sum(-1)
     determinant = (a * e - b * b).clamp(min=0)

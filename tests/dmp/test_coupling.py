@@ -110,6 +110,17 @@ def test_steering_is_finite_at_rest_and_straight_ahead():
 
 
 @pytest.mark.gradients
+@pytest.mark.parametrize("speed", [-1.0, 0.0, 1.0])
+def test_steering_has_a_finite_gradient_where_it_has_no_axis(speed):
+    velocity = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    obstacles = torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    term = steering(torch.zeros(3, dtype=torch.float64), velocity, obstacles)
+    assert (term == 0).all()
+    for gradient in torch.autograd.grad(term.sum(), (velocity, obstacles)):
+        assert (gradient.abs() < 1e-3).all()
+
+
+@pytest.mark.gradients
 def test_repulsion_is_the_gradient_of_its_potential():
     rng = torch.Generator().manual_seed(0)
     position = torch.rand(100, 3, generator=rng, dtype=torch.float64).requires_grad_()

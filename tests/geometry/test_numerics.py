@@ -141,6 +141,14 @@ def test_a_value_first_met_in_a_control_loop_serves_autograd_later():
     assert x.grad.tolist() == [4.0, 6.0]
 
 
+def test_a_constant_made_in_inference_mode_serves_autograd_later():
+    with torch.inference_mode():
+        constant = Constant(torch.tensor([2.0, 3.0], dtype=torch.float64))
+    x = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad((constant.like(x) * x * x).sum(), x)
+    assert gradient.tolist() == [4.0, 6.0]
+
+
 def test_it_is_converted_once():
     constant = Constant(torch.ones(3, dtype=torch.float64))
     x = torch.zeros(1)
