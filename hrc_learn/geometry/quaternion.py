@@ -147,13 +147,18 @@ def slerp(
 
 
 def mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
-    """Mean rotation; the signs of the quaternions do not matter.
+    """Mean rotation, differentiable once; the signs of the quaternions do not matter.
 
     It minimises the sum of squared Frobenius norms of the differences between its rotation
     matrix and those of the inputs (Markley et al. 2007, "Averaging quaternions").
     """
     q64 = q.double()
-    found = torch.linalg.eigh(q64.mT @ q64).eigenvectors[:, -1]
+    A = q64.mT @ q64
+    values, vectors = torch.linalg.eigh(A.detach())
+    others, found = vectors[:, :-1], vectors[:, -1]
+    # Zero, but with the derivative of the eigenvector; that of `eigh` needs four different
+    # eigenvalues, which equal quaternions do not have.
+    found = found + others @ ((others.mT @ A @ found) / (values[-1] - values[:-1]))
     return found.to(q) if q.is_floating_point() else found
 
 

@@ -189,6 +189,19 @@ def test_broadcasts():
     assert quaternion.rotate(many[0], directions(5, rng=rng)).shape == (5, 3)
 
 
+@pytest.mark.gradients
+def test_the_mean_has_a_derivative_even_of_equal_quaternions():
+    one = quaternion.exp(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64))
+    jacobian = torch.func.jacrev(quaternion.mean)(one.repeat(4, 1))
+    tangent = torch.eye(4, dtype=torch.float64) - torch.outer(one, one)
+    sign = torch.sign(quaternion.mean(one.repeat(4, 1)) @ one)
+    assert_close(jacobian, (sign * tangent / 4).unsqueeze(1).expand(4, 4, 4))
+    spread = quaternion.exp(
+        0.4 * torch.randn(5, 3, generator=generator(2), dtype=torch.float64)
+    )
+    assert torch.autograd.gradcheck(quaternion.mean, spread.requires_grad_())
+
+
 def test_the_mean_of_whole_numbers_is_no_whole_number():
     with shapes_unchecked():
         q = torch.tensor([[1, 0, 0, 0], [1, 1, 0, 0], [1, 0, 1, 0]])
