@@ -14,6 +14,8 @@ from torch import Tensor
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor
 
+_WHOLE = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -30,10 +32,12 @@ class Pose:
     """Unit quaternion (w, x, y, z); either sign."""
 
     def __post_init__(self):
-        # NumPy arrays and lists become tensors; placeholders of tracers pass unchanged.
+        # NumPy arrays, lists and whole numbers become tensors of floats. Placeholders of
+        # tracers and masks of a pytree pass unchanged.
         for name in ("position", "orientation"):
             value = getattr(self, name)
-            if isinstance(value, (np.ndarray, list, tuple)):  # torch 2.15 can trace this
+            whole = isinstance(value, Tensor) and value.dtype in _WHOLE
+            if whole or isinstance(value, (np.ndarray, list, tuple)):  # torch 2.15 traces this
                 object.__setattr__(self, name, as_tensor(value))
 
     @staticmethod

@@ -3,6 +3,7 @@ import pytest
 import torch
 from sampling import generator, quaternions, rotation_vectors
 from torch.testing import assert_close
+from torch.utils._pytree import tree_map
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
@@ -63,6 +64,15 @@ def test_lists_of_points_have_the_dtype_of_the_pose(dtype):
     expected = torch.tensor([[0.5, 2.0, 3.0]], dtype=dtype)
     assert_close(pose.apply([[0.5, -2.0, 3.0]]), expected)
     assert_close(pose.apply(np.array([[0.5, -2.0, 3.0]])), expected)
+
+
+def test_whole_numbers_become_floats():
+    with shapes_unchecked():
+        pose = Pose(torch.tensor([1, 2, 3]), torch.tensor([1, 0, 0, 0], dtype=torch.int32))
+        masks = tree_map(torch.isfinite, pose)
+    assert pose.position.dtype == pose.orientation.dtype == torch.float64
+    assert pose.apply([0.0, 0.0, 1.0]).tolist() == [1.0, 2.0, 4.0]
+    assert masks.position.dtype == torch.bool
 
 
 def test_goes_through_vmap_as_a_value():
