@@ -161,7 +161,8 @@ class Multiplication:
             file = Path(self.config.segments)
             self.segmentation = read_json(file, motions.Segmentation, "correct it")
         else:
-            self.segmentation = motions.find_segments(self.demos, objects, tool)
+            begun = self.columns.departures()
+            self.segmentation = motions.find_segments(self.demos, objects, tool, begun)
         if not same:
             moved = _between_cells(taught.arm, self)
             tool, objects = [*map(moved, tool)], {n: moved(p) for n, p in objects.items()}

@@ -262,6 +262,15 @@ class MultipliedColumns:
             made.append(at if smooth else column[np.rint(phase).astype(int)])
         return np.stack(made, axis=1)
 
+    def departures(self) -> list[list[int]]:
+        """Frames at which objects begin to move, by demonstration."""
+        places = [self._places[f"object {name}"][:3] for name in self.objects]
+        paths = [
+            [np.stack([shown[key][:, i] for key, i in at], axis=1) for at in places]
+            for shown in self._frames
+        ]
+        return [[_departure(torch.from_numpy(path)) for path in each] for each in paths]
+
     def object_paths(
         self, made: NewMotion, scene: Mapping[str, Float[np.ndarray, "7"]]
     ) -> dict[str, Float[np.ndarray, "T 7"]]:
@@ -376,7 +385,13 @@ def _departure(position: Float[torch.Tensor, "T 3"]) -> int:
     """Last frame before an object begins to move; the last of all if it does not move."""
     away = (position - position[0]).norm(dim=-1)
     moved = int((away > _MOVED).int().argmax())
-    return int((away[:moved] <= _STILL).nonzero().max()) if moved else len(away) - 1
+    if not moved:
+        return len(away) - 1
+    # In simulation, an object first settles: it then rests near its median position.
+    before = position[:moved]
+    settled = (before - before.median(0).values).norm(dim=-1) <= _STILL
+    still = settled if 2 * int(settled.sum()) > moved else away[:moved] <= _STILL
+    return int(still.nonzero().max())
 
 
 def pose_of(values: Float[torch.Tensor, "*batch numbers"]) -> Pose:

@@ -103,14 +103,21 @@ class Segmentation:
 
 
 def find_segments(
-    demos: Sequence[Demonstration], objects: Mapping[str, Pose], tool: Sequence[Pose]
+    demos: Sequence[Demonstration],
+    objects: Mapping[str, Pose],
+    tool: Sequence[Pose],
+    departures: Sequence[Sequence[int]] = (),
 ) -> Segmentation:
     """Cut demonstrations where the gripper begins to switch, and choose the frames.
+
+    An object that begins to move after a switch shows that the switch was a grasp. The arm may
+    still approach the object while the gripper closes, so the cut is where the object moves.
 
     Args:
         demos: Demonstrations of one task.
         objects: Poses of each object at the start of each demonstration, (n).
         tool: Poses of the tool along each demonstration.
+        departures: Frames at which objects begin to move, by demonstration.
 
     Raises:
         ValueError: A demonstration is too short, or they differ in the number of gripper
@@ -119,7 +126,7 @@ def find_segments(
     openings = [demo.gripper for demo in demos if demo.gripper is not None] or [np.zeros(1)]
     low, high = min(x.min() for x in openings), max(x.max() for x in openings)
     cuts: dict[int, tuple[int, ...]] = {}
-    for demo in demos:
+    for demo, begun in zip(demos, departures or [()] * len(demos), strict=True):
         last, kept = len(demo) - 1, [0]
         if last < _SHORTEST:
             raise ValueError(
@@ -127,6 +134,11 @@ def find_segments(
                 f"{_SHORTEST + 1} or more: leave it out (multiply.demonstrations)"
             )
         switches = [] if demo.gripper is None else _switches(demo.gripper, low, high)
+        ends = [end - _SHORTEST for end in (*switches[1:], last)]
+        for k, end in enumerate(ends[: len(switches)]):
+            switches[k] = min(
+                (at for at in begun if switches[k] < at <= end), default=switches[k]
+            )
         for cut in (*switches, last):
             if cut - kept[-1] >= _SHORTEST:
                 kept.append(cut)

@@ -253,6 +253,27 @@ def test_cuts_are_six_frames_apart_and_end_with_the_demonstration():
         assert len(found.frames) == len(cuts) - 1
 
 
+@pytest.mark.parametrize(
+    ("departures", "cuts"),
+    [
+        ([], (0, 10, 25, 49)),
+        ([14], (0, 14, 25, 49)),
+        ([17, 14, 30, 49], (0, 14, 30, 49)),  # the first object that moves after each switch
+        ([19], (0, 19, 25, 49)),
+        ([20], (0, 10, 25, 49)),  # too near to the next switch
+        ([10], (0, 10, 25, 49)),
+        ([4, 44], (0, 10, 25, 49)),  # before all switches, and too near to the end
+    ],
+)
+def test_a_grasp_ends_where_its_object_begins_to_move(departures, cuts):
+    """The hand may still approach the object while the gripper closes."""
+    objects, gripper = {"cup": places(0, 1)}, np.ones(50)
+    gripper[11:26] = 0.0
+    tool = [poses(np.zeros((50, 3)), Rotation.from_rotvec(np.zeros((50, 3))))]
+    found = find_segments([demo(gripper)], objects, tool, [departures])
+    assert found.cuts == {0: cuts}
+
+
 def test_segments_are_listed_with_their_times():
     demos = [demo(np.ones(40), 3), demo(np.ones(50), 5)]
     cuts = {3: (0, 20, 39), 5: (0, 10, 49)}

@@ -12,7 +12,7 @@ from hrc_learn.demos import DatasetWriter, open_demos
 from hrc_learn.demos.dataset_views import arm_of_dataset
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import arm, panda
-from hrc_learn.learning.multiply_dataset import MultipliedColumns, pose_of
+from hrc_learn.learning.multiply_dataset import MultipliedColumns, _departure, pose_of
 from hrc_learn.learning.multiply_motions import NewMotion
 
 pytestmark = pytest.mark.simulation
@@ -383,6 +383,24 @@ def test_an_object_moves_with_the_tool_where_the_demonstrated_one_did(carried):
     np.testing.assert_allclose(made["box"], shown, atol=2e-3)
     np.testing.assert_allclose(made["other"], still(BLOCK), atol=1e-6)
     np.testing.assert_array_equal(made["goal"], still(BLOCK))
+
+
+def test_departures_are_the_last_frames_at_rest(carried):
+    """Of the box, which is carried, and of another object, which stays."""
+    assert carried.departures() == [[FIRST, FRAMES - 1]]
+
+
+def test_an_object_that_settles_first_departs_later():
+    """As in simulations that drop an object by a few millimetres at the start."""
+    height = np.full(40, 0.1)
+    height[:3] = [0.104, 0.103, 0.1015]
+    height[25:] += 0.002 * np.arange(1, 16)
+    path = torch.from_numpy(np.stack([np.zeros(40), np.zeros(40), height], axis=1))
+    assert _departure(path) == 24
+    # An object that moves slowly from the start departs from its first position.
+    drift = torch.zeros(40, 3).double()
+    drift[:, 0] = 0.02 * torch.linspace(0, 1, 40) ** 2
+    assert _departure(drift) == int((drift[:, 0] <= 1e-3).nonzero().max())
 
 
 def test_an_object_moves_with_the_tool_elsewhere_and_more_slowly(carried):
