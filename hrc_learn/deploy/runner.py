@@ -228,12 +228,12 @@ class Rate:
             Lateness of the first due tick [s]; more than a period if ticks are missed.
         """
         # Ticks count from the start, not from the last return, so delays do not add up.
-        rest = self._next - self._clock()
-        if rest > _SPIN:
-            self._sleep(rest - _SPIN)
-        while (now := self._clock()) < self._next:
-            pass
-        late = now - self._next
+        longest = self._period
+        while (rest := self._next - self._clock()) > 0:
+            if rest > _SPIN:
+                self._sleep(min(rest - _SPIN, longest))
+            longest = _SPIN  # from now on, the clock advances in steps, as an arm's does
+        late = -rest
         skipped = int(late / self._period)
         self.ticks += 1
         self.missed += skipped

@@ -72,6 +72,25 @@ def test_lateness_and_missed_ticks_are_those_of_an_independent_log(clock, rate, 
     assert rate.latest == max(lateness)
 
 
+@pytest.mark.parametrize("step", [0.0025, 0.004, 0.01])
+def test_a_clock_that_advances_in_steps_is_asked_now_and_then(clock, step):
+    """As the time of an arm's newest state, which another process is asked for."""
+    asked = []
+
+    def stepped() -> float:
+        asked.append(clock())
+        return 5.0 + step * int((asked[-1] - 5.0) / step)
+
+    rate = Rate(0.01, clock=stepped, sleep=clock.sleep)
+    for k in range(1, 101):
+        rate.wait()
+        # The first state at or after the tick is met within a fifth of a millisecond.
+        due = 5.0 + step * -(-10 * k // (1000 * step))
+        assert due <= asked[-1] < due + 3e-4
+    assert (rate.ticks, rate.missed) == (100, 0)
+    assert len(asked) < 101 * 60
+
+
 def test_a_period_of_nothing_is_refused():
     with pytest.raises(ValueError, match="period must be positive, but is 0"):
         Rate(0.0)
