@@ -174,10 +174,11 @@ class LatencyConfig:
         check_settings(self, not_negative=["delay"], below_one=["frame_loss"])
 
 
-# `_SAME_IMAGE`: two images whose times differ by less are the same image [s]: the age of an
-# image comes from another clock. `_REMEMBERED`: time for which joint positions are stored,
-# longer than the delay of any camera [s].
-_SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
+# `_SAME_IMAGE`: two images whose times differ by less are the same image [s]. The age of an
+# image comes from another clock, and the arm's time advances in steps of up to 8 ms (125 Hz).
+# `_REMEMBERED`: time for which joint positions are stored, longer than the delay of any camera
+# [s].
+_SAME_IMAGE, _REMEMBERED = 8.5e-3, 1.0
 
 
 class DelayedDetection:

@@ -42,6 +42,35 @@ def test_images_arrive_at_once_unless_told():
     np.testing.assert_allclose(np.diff(taken), PERIOD)
 
 
+class Clocked:
+    """A camera whose images have an age."""
+
+    age = 0.0
+
+    def read(self):
+        return np.zeros((8, 8, 3), np.uint8)
+
+
+@pytest.mark.parametrize("state", [0.001, 0.004, 0.008])
+def test_an_image_that_is_read_again_counts_once_by_any_clock_of_the_arm(state):
+    """The arm's time is that of its newest state; the age is measured after the image."""
+    rng = np.random.default_rng(0)
+    camera = Clocked()
+    sensor = feature_sensor(camera, None, 0, [])
+    detection = DelayedDetection(sensor, LatencyConfig(), 0.01, rng)
+    exposed, taken = PERIOD * np.arange(200), set()
+    for now in np.arange(1.0, 7.0, 0.01):
+        newest = exposed[exposed <= now].max()
+        camera.age = now - newest
+        time = now - rng.uniform(0.0, state)
+        detection.detect(time, panda.ready)
+        taken |= {one.time for one in iter(lambda t=time: detection.newest(t), None)}
+    shown = exposed[(exposed >= 1.0 - 1e-9) & (exposed < 7.0 - 1e-9)]
+    assert len(taken) == len(shown)
+    # The first reading of an image decides.
+    np.testing.assert_allclose(sorted(taken), shown, atol=state)
+
+
 @pytest.mark.parametrize("delay", [0.05, 0.1])
 def test_late_images_keep_the_time_at_which_they_were_taken(delay):
     taken, arrived = arrivals(LatencyConfig(delay=delay)).T
