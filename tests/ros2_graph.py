@@ -16,6 +16,7 @@ class Graph:
 
     Attributes:
         listeners: Subscriptions that its publishers count.
+        clocks: Publishers of a simulated clock.
         greeting: Joint states that come as soon as it listens.
         qualities: Quality of service of each topic that it takes or sends.
         kinds: Names of the messages that it sends, by topic.
@@ -26,6 +27,7 @@ class Graph:
         self.takers, self.sent, self.closed = {}, [], False
         self.now, self.listeners, self.greeting = 50.0, 1, [(10.0, READY)]
         self.node, self.trips, self.parameters, self.log = self, [], {}, []
+        self.clocks = 0
         self.forms, self.qualities, self.kinds, self.sleeps = {}, {}, {}, []
 
     def create_subscription(self, kind, topic, take, quality):
@@ -41,6 +43,9 @@ class Graph:
             publish=lambda message: self.sent.append((topic, message)),
             get_subscription_count=lambda: self.listeners,
         )
+
+    def count_publishers(self, topic):
+        return self.clocks if topic == "/clock" else 1
 
     def get_clock(self):
         message = SimpleNamespace(to_msg=lambda: stamp(self.now))

@@ -32,7 +32,8 @@ _CLOCK_RESET = 1.0
 smaller step, the message was only reordered, unless no newer message comes for `silence`."""
 _DRIFT = 5e-4
 """Fastest drift of the robot's clock against this machine's [s/s]: NTP slews a clock by 500 ppm
-at most. A difference that grows faster is a delay of the messages."""
+at most. A difference that grows faster is a delay of the messages, unless the clock is that of
+a simulator (topic /clock), which may be slower than real time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +135,7 @@ class Ros2Arm(Connected):
         # `_brake` [s].
         self._commanded_at, self._moved_at = -math.inf, 0.0
         self._hold = self._brake = 0.0
-        self._closed = False
+        self._closed, self._drift = False, _DRIFT
         node, kind, self._numbers = self.session.node, config.interface, Float64MultiArray
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
         self._hand, once = None, quality(reliable=True)
@@ -149,6 +150,8 @@ class Ros2Arm(Connected):
         try:
             self._await_state()
             self._await_controllers()
+            # 1: a clock of any speed, even one that stands still.
+            self._drift = 1.0 if node.count_publishers("/clock") else _DRIFT
             if kind == "velocity":
                 longest = 1.5 * config.timeout
                 heard = self._commands.get_subscription_count()
@@ -230,7 +233,7 @@ class Ros2Arm(Connected):
         )
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
-            drifted = self._offset + _DRIFT * (now - self.received)
+            drifted = self._offset + self._drift * (now - self.received)
             self._offset = now - stamp if last is None else min(drifted, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()
@@ -336,9 +339,8 @@ class Ros2Arm(Connected):
     def stop(self) -> None:
         """Bring the arm to rest, by zero velocities or by holding the last position."""
         with self._lock:
-            state = self._state
-            if state is not None:
-                self._send(np.zeros(len(self._names)), state)
+            if self._state is not None:
+                self._send(np.zeros(len(self._names)), self._state)
 
     def recover(self) -> None:
         """Continue from where the arm is, once joint states come again.

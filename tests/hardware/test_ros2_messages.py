@@ -331,6 +331,21 @@ def test_a_clock_that_steps_back_by_less_than_a_second_is_followed(graph):
         arm.read()
 
 
+@pytest.mark.parametrize("speed", [1.0, 0.5, 0.02])
+def test_states_of_a_slow_simulator_count_as_old_only_if_none_come(graph, speed):
+    graph.clocks = 1
+    arm = position_arm(graph)
+    for k in range(1, 200):
+        graph.now += 0.02
+        graph.state(10.0 + 0.02 * speed * k, READY)
+        arm.read()
+    graph.now += 0.19
+    arm.read()
+    graph.now += 0.02
+    with pytest.raises(ArmFaultError, match=r"is 0\.21 s old"):
+        arm.read()
+
+
 @pytest.mark.parametrize("drift", [-3e-4, 3e-4])
 def test_a_clock_that_drifts_does_not_make_states_old(graph, drift):
     arm = position_arm(graph)
