@@ -144,7 +144,7 @@ class MultipliedColumns:
         self._actions = [named for named in self._named if named[0].startswith("action")]
         self._next = [(key, i, *shown[name]) for key, i, name in self._actions if name in shown]
         self._refuse_changes()
-        self._lead = self._find_lead()
+        self._lead, self._lag = self._find_lead(), self._gripper_lag()
         self._tool = self._recorded_tool()
         names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
         if not self._same:
@@ -191,6 +191,28 @@ class MultipliedColumns:
         places = self._places["position"], [sent[n] for n in range(3)]
         pairs = [[np.array([p[k][:, i] for k, i in x]).T for x in places] for p in self._frames]
         return _Lead.fit(pairs, self._source.fps)
+
+    @property
+    def _gripper_commands(self) -> list[Place]:
+        return [(key, i) for key, i, name in self._actions if "gripper" in name.lower()]
+
+    def _gripper_lag(self) -> int:
+        """Frames by which the gripper's opening lags behind its command."""
+        sent, read = self._gripper_commands[:1], self._places.get("gripper", ())[:1]
+        pairs = [[p[k][:, i] for k, i in (*sent, *read)] for p in self._frames]
+        if len(pairs[0]) < 2:
+            return 0
+        scores, opening = [], np.concatenate([m for _, m in pairs])
+        for lag in range(1 + min(round(self._source.fps), *(len(c) // 2 for c, _ in pairs))):
+            c = np.concatenate([c[(np.arange(len(c)) - lag).clip(min=0)] for c, _ in pairs])
+            scores.append(abs(np.cov(c, opening)[0, 1]) / max(float(c.std()), 1e-9))
+        return int(np.argmax(scores))
+
+    def _gripper_phase(self, phase: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+        """Fractional frames of gripper commands: a slower motion does not slow the gripper."""
+        later = np.arange(len(phase)) + self._lag
+        beyond = (later - len(phase) + 1).clip(min=0)
+        return (phase[later - beyond] + beyond - self._lag).clip(min=phase[0])
 
     def _object_columns(self, given: Mapping[str, str]) -> dict[str, list[Place]]:
         """Places of the numbers of each object's pose, by name of the object."""
@@ -246,8 +268,9 @@ class MultipliedColumns:
             main: Index of the demonstration.
             phase: Fractional frames of the demonstration.
         """
-        commands = [(key, i) for key, i, name in self._actions if "gripper" in name.lower()]
-        for key, i in [*commands, *self._places.get("gripper", ())]:
+        for key, i in self._gripper_commands:
+            return self._along(main, key, self._gripper_phase(phase))[:, i]
+        for key, i in self._places.get("gripper", ()):
             return self._along(main, key, phase)[:, i]
         return np.zeros(len(phase))
 
@@ -321,6 +344,8 @@ class MultipliedColumns:
         place = tool.position + quaternion.rotate(tool.orientation, self._tool)
         tool = Pose(place, tool.orientation)
         made = {key: self._along(main, key, phase) for key in self._old}
+        for key, i in self._gripper_commands:
+            made[key][:, i] = self._along(main, key, self._gripper_phase(phase))[:, i]
         new = {role: self._pose_columns(role, tool, main) for role in _TOOL}
         if gripper is not None:
             new["gripper"] = gripper[:, None]

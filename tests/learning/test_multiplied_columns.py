@@ -420,3 +420,32 @@ def test_an_object_moves_with_the_tool_elsewhere_and_more_slowly(carried):
     np.testing.assert_array_equal(made[: 2 * FIRST - 2], [first] * (2 * FIRST - 2))
     assert np.ptp(made[2 * LAST + 2 :], axis=0).max() == 0
     assert np.ptp(made[:, :3], axis=0).max() > 0.01
+
+
+@pytest.fixture(scope="module")
+def grips(tmp_path_factory):
+    """Columns of a demonstration whose gripper follows its command after three frames."""
+    folder = tmp_path_factory.mktemp("grips") / "demos"
+    features = {"action.hand": ("gripper.pos",)}
+    command = np.isin(np.arange(FRAMES), range(8, 22)).astype(float)
+    with DatasetWriter(folder, FPS, "panda", panda.joint_names, features) as writer:
+        writer.start_episode("grip")
+        for k, q in enumerate(joints(0)):
+            hand = {"action.hand": command[[k]]}
+            writer.add_frame(joint_position=q, gripper=command[max(k - 3, 0)], **hand)
+        writer.save_episode()
+    source = open_demos(folder)
+    return MultipliedColumns(source, arm_of_dataset(source), panda, {})
+
+
+@pytest.mark.parametrize(
+    ("step", "closes", "opens"), [(1.0, 8, 22), (0.5, 18, 45), (2.0, 3, 11)]
+)
+def test_the_gripper_keeps_its_own_speed(grips, step, closes, opens):
+    """In a slower motion, it closes as long before the frame in which it is to be closed."""
+    phase = np.arange(0, FRAMES - 0.9, step)
+    q = np.stack([np.interp(phase, np.arange(FRAMES), x) for x in joints(0).T], axis=1)
+    made = grips.values(0, phase, q, q, None, {})["action.hand"][:, 0]
+    (changed,) = np.diff(made).nonzero()
+    assert [*(changed + 1)] == [closes, opens]
+    np.testing.assert_array_equal(grips.gripper(0, phase), made)
