@@ -135,7 +135,7 @@ class Ros2Arm(Connected):
         # `_brake` [s].
         self._commanded_at, self._moved_at = -math.inf, 0.0
         self._hold = self._brake = 0.0
-        self._closed, self._drift = False, _DRIFT
+        self._closed = False
         node, kind, self._numbers = self.session.node, config.interface, Float64MultiArray
         form = JointTrajectory if kind == "trajectory" else Float64MultiArray
         self._hand, once = None, quality(reliable=True)
@@ -150,8 +150,6 @@ class Ros2Arm(Connected):
         try:
             self._await_state()
             self._await_controllers()
-            # 1: a clock of any speed, even one that stands still.
-            self._drift = 1.0 if node.count_publishers("/clock") else _DRIFT
             if kind == "velocity":
                 longest = 1.5 * config.timeout
                 heard = self._commands.get_subscription_count()
@@ -233,7 +231,9 @@ class Ros2Arm(Connected):
         )
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
-            drifted = self._offset + self._drift * (now - self.received)
+            # 1: a clock of any speed, even one that stands still.
+            drift = 1.0 if self.session.node.count_publishers("/clock") else _DRIFT
+            drifted = self._offset + drift * (now - self.received)
             self._offset = now - stamp if last is None else min(drifted, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()

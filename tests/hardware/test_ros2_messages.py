@@ -333,8 +333,8 @@ def test_a_clock_that_steps_back_by_less_than_a_second_is_followed(graph):
 
 @pytest.mark.parametrize("speed", [1.0, 0.5, 0.02])
 def test_states_of_a_slow_simulator_count_as_old_only_if_none_come(graph, speed):
-    graph.clocks = 1
     arm = position_arm(graph)
+    graph.clocks = 1  # discovered later than the states
     for k in range(1, 200):
         graph.now += 0.02
         graph.state(10.0 + 0.02 * speed * k, READY)
