@@ -5,15 +5,17 @@ python benchmarks/ros2_robot.py --interface trajectory
 
 from __future__ import annotations
 
+import math
 import random
 import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
+import torch
 
 from hrc_learn import cli
 from hrc_learn.cli import write_values
@@ -28,6 +30,17 @@ _BEHIND = 0.5
 """Largest delay that is caught up on a busy machine [s]."""
 _GAIN = 20.0
 """Gain of the position controller [1/s]."""
+_UNANSWERED = 0.01
+"""Time without a command before the robot waits for the next one [s]: the loop's period."""
+_SLOWER = 2
+"""Joint states for each wrench and for each message of a simulated clock."""
+
+
+def stamp_at(seconds: float) -> Any:
+    """Time stamp of a message at a time [s]."""
+    from rclpy.time import Time
+
+    return Time(seconds=seconds).to_msg()
 
 
 class Ros2Robot:
@@ -42,6 +55,8 @@ class Ros2Robot:
         commands: Number of commands received.
         state: Newest reading. Use it instead of the world's own while the world is stepped.
         late: Delay of the last step behind real time [s].
+        now: Time stamp of the last step [s].
+        held: Total of the waits for commands [s].
     """
 
     def __init__(
@@ -50,6 +65,7 @@ class Ros2Robot:
         config: Ros2Config | None = None,
         rate: float = 500.0,
         hostile: float = 0.0,
+        waits: float = 0.0,
     ):
         """Publish joint states.
 
@@ -59,18 +75,26 @@ class Ros2Robot:
             rate: Joint states a second.
             hostile: Fraction of states and of commands that are lost, and as many that come
                 50 ms late, after newer ones.
+            waits: Longest wait for the next command [s], once the first has come; shorter than
+                the driver's `silence`. Positive: the robot's clock stands still meanwhile, and
+                is published as simulators do, so that a busy machine changes nothing.
         """
+        from geometry_msgs.msg import WrenchStamped
+        from rosgraph_msgs.msg import Clock
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
         from trajectory_msgs.msg import JointTrajectory
 
         self.world, self._config = world, config or Ros2Config()
         self._rate, self.violations, self.commands = rate, 0, 0
+        self._sensed, self._waits = 0, waits
         self._silent, self._hostile, self._chance = False, hostile, random.Random(0)
         self._late: list[tuple[float, Any]] = []
-        self.late, self.state = 0.0, world.arm.read()
+        self.late, self.now, self.state = 0.0, time.time(), world.arm.read()
+        self.held = 0.0
+        self._heard, self._answered = threading.Event(), math.inf
         self._chain = world.arm.robot.chain
-        self._velocity = np.zeros(len(self._chain.joint_names))
+        self._velocity = self._sent = np.zeros(len(self._chain.joint_names))
         self._path: tuple[np.ndarray, np.ndarray] | None = None
         self.session, self._ended = Ros2Session("hrc_robot"), threading.Event()
         node, config = self.session.node, self._config
@@ -78,6 +102,9 @@ class Ros2Robot:
         self._states = node.create_publisher(
             JointState, config.joint_states, quality(reliable=True)
         )
+        if config.wrench:
+            self._wrenches = node.create_publisher(WrenchStamped, config.wrench, reliable)
+        self._clocks = node.create_publisher(Clock, "/clock", reliable) if waits else None
         trajectory = config.interface == "trajectory"
         form = JointTrajectory if trajectory else Float64MultiArray
         take = self._on_trajectory if trajectory else self._on_values
@@ -98,6 +125,7 @@ class Ros2Robot:
         if not late and self._meets_trouble(lambda: self._on_values(message, True)):
             return
         self.commands += 1
+        self._heard.set()
         values = np.array(message.data)
         if self._config.interface == "velocity":
             self._velocity = values
@@ -113,11 +141,12 @@ class Ros2Robot:
 
     def _on_trajectory(self, message: Any) -> None:
         self.commands += 1
+        self._heard.set()
         order = [message.joint_names.index(name) for name in self._chain.joint_names]
         times = [
             p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points
         ]
-        begin = stamp_of(message) or time.time()
+        begin = stamp_of(message) or self.now
         positions = np.array([p.positions for p in message.points])[:, order]
         self._path = (begin + np.array(times), positions)
 
@@ -130,22 +159,37 @@ class Ros2Robot:
         self._silent = False
 
     def _run(self) -> None:
-        due = time.monotonic()
+        due, period = time.monotonic(), 1 / self._rate
         while not self._ended.is_set():
-            due = max(due + 1 / self._rate, time.monotonic() - _BEHIND)
             self.late = time.monotonic() - due
+            # A clock that waits is that of the world.
+            self.now = self.now + period if self._waits else time.time()
             self._step()
+            self.held += self._wait_for_command()
+            due = max(due + period, time.monotonic() - _BEHIND)
             time.sleep(max(0.0, due - time.monotonic()))
+
+    def _wait_for_command(self) -> float:
+        """Let the clock stand still until the loop has answered; returns for how long [s]."""
+        begun = time.monotonic()
+        if self._waits and self.now - self._answered > _UNANSWERED:
+            self._heard.wait(self._waits)
+        if self._heard.is_set():
+            self._answered = self.now
+            self._heard.clear()
+        return time.monotonic() - begun
 
     def _step(self) -> None:
         arm, limits = self.world.arm, self._chain.limits
         path, velocity = self._path, self._velocity
         if path is not None:
             q = arm.read().joint_position
-            ahead = [np.interp(time.time(), path[0], column) for column in path[1].T]
+            ahead = [np.interp(self.now, path[0], column) for column in path[1].T]
             fastest = limits.velocity.numpy()
             velocity = np.clip(_GAIN * (np.array(ahead) - q), -fastest, fastest)
-        arm.command(velocity)
+        if velocity is not self._sent:  # the arm delays each command by a time of its own
+            arm.command(velocity)
+        self._sent = velocity
         self.world.advance(1 / self._rate)
         self.state = state = arm.read()
         fast = np.abs(state.joint_velocity) > 1.02 * limits.velocity.numpy()
@@ -160,6 +204,7 @@ class Ros2Robot:
             self._publish(state)
 
     def _publish(self, state: ArmState) -> None:
+        from rosgraph_msgs.msg import Clock
         from sensor_msgs.msg import JointState
 
         hand, config = [], self._config
@@ -171,9 +216,29 @@ class Ros2Robot:
             position=[*state.joint_position.tolist(), *hand],
             velocity=[*state.joint_velocity.tolist(), *(0.0 for _ in hand)],
         )
-        message.header.stamp = self.session.node.get_clock().now().to_msg()
+        message.header.stamp = stamp_at(self.now)
+        self._sensed = (self._sensed + 1) % _SLOWER
+        if self._config.wrench and not self._sensed:
+            self._publish_wrench(state)
+        if self._clocks is not None and not self._sensed:
+            self._clocks.publish(Clock(clock=message.header.stamp))
         if not self._meets_trouble(lambda: self._states.publish(message)):
             self._states.publish(message)
+
+    def _publish_wrench(self, state: ArmState) -> None:
+        """Publish the wrench at the tool that best explains the external torques."""
+        from geometry_msgs.msg import WrenchStamped
+
+        assert state.external_torque is not None, "the arm estimates no torques"
+        _, J = self._chain.transform_and_jacobian(torch.from_numpy(state.joint_position))
+        wrench = np.linalg.lstsq(J.mT.numpy(), state.external_torque, rcond=None)[0].tolist()
+        message = WrenchStamped()
+        message.header.frame_id = self._config.base
+        message.header.stamp = stamp_at(self.now)
+        for part, values in zip(("force", "torque"), (wrench[:3], wrench[3:]), strict=True):
+            for axis, value in zip("xyz", values, strict=True):
+                setattr(getattr(message.wrench, part), axis, value)
+        self._wrenches.publish(message)
 
     def close(self) -> None:
         """Stop publishing."""
@@ -181,7 +246,7 @@ class Ros2Robot:
         self._thread.join(2.0)
         self.session.close()
 
-    def __enter__(self) -> Ros2Robot:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
