@@ -71,6 +71,18 @@ def test_an_image_that_is_read_again_counts_once_by_any_clock_of_the_arm(state):
     np.testing.assert_allclose(sorted(taken), shown, atol=state)
 
 
+def test_all_images_of_a_fast_camera_count():
+    camera = Clocked()
+    sensor = feature_sensor(camera, None, 0, [])
+    detection = DelayedDetection(sensor, LatencyConfig(), 0.004, np.random.default_rng(0))
+    exposed, taken = np.arange(120) / 120, set()
+    for now in np.arange(0.0, 1.0, 0.004):
+        camera.age = now - exposed[exposed <= now].max()
+        detection.detect(now, panda.ready)
+        taken |= {one.time for one in iter(lambda t=now: detection.newest(t), None)}
+    np.testing.assert_allclose(sorted(taken), exposed, atol=1e-9)
+
+
 @pytest.mark.parametrize("delay", [0.05, 0.1])
 def test_late_images_keep_the_time_at_which_they_were_taken(delay):
     taken, arrived = arrivals(LatencyConfig(delay=delay)).T
