@@ -431,8 +431,11 @@ def grips(tmp_path_factory):
     with DatasetWriter(folder, FPS, "panda", panda.joint_names, features) as writer:
         writer.start_episode("grip")
         for k, q in enumerate(joints(0)):
-            hand = {"action.hand": command[[k]]}
-            writer.add_frame(joint_position=q, gripper=command[max(k - 3, 0)], **hand)
+            writer.add_frame(
+                joint_position=q,
+                gripper=command[max(k - 3, 0)],
+                **{"action.hand": command[[k]].tolist()},
+            )
         writer.save_episode()
     source = open_demos(folder)
     return MultipliedColumns(source, arm_of_dataset(source), panda, {})
