@@ -403,11 +403,10 @@ class AdaptiveController(nn.Module):
         )
 
     def _motion(
-        self, state: ControllerState, given: _Given, task_level: Tensor, s: Tensor
+        self, state: ControllerState, given: _Given, task_level: Tensor, descent: Tensor
     ) -> _Motion:
         """Joint velocity of the law, with drift compensation under a null-space input."""
         observation, goals, _, q, pose, J = given
-        descent = s
         rate, damping = self.config.drift_compensation_rate, self.config.null_damping
         d = null_space_input(
             observation.nullspace_input, observation.distances, self.config.way_making, damping
@@ -457,8 +456,9 @@ class AdaptiveController(nn.Module):
         # Constraints resolve conflicts between task and null space themselves.
         yields = config.yields_to_limits and config.safety.constraints is None
         if yields:
-            task = law.saturate_in_null_space(task, J_task, rows, *bounds)
-            task = law.scale_task(task, J, *bounds, self.caps[0])
+            asked, task = task, law.saturate_in_null_space(task, J_task, rows, *bounds)
+            if task is not asked:  # a limit acts, or Python must not branch
+                task = law.scale_task(task, J, *bounds, self.caps[0])
         if posture is not None:
             approach = law.approach_velocity(posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
@@ -482,11 +482,10 @@ class AdaptiveController(nn.Module):
         """
         if motion.pose_drift is None:
             return replace(before, active=torch.zeros_like(before.active))
-        J = motion.jacobian
-        planned = law.planned_motion(motion.task_twist, motion.twist, J, joint_velocity, dt)
+        done = torch.linalg.vecdot(motion.jacobian, joint_velocity.unsqueeze(-2))
+        planned = law.planned_motion(motion.task_twist, motion.twist, done, dt)
         # An arm that only brakes does not drift.
-        braking = safety.dt.unsqueeze(-1) * torch.linalg.vecdot(J, joint_velocity.unsqueeze(-2))
-        planned = torch.where(sound.unsqueeze(-1), planned, braking)
+        planned = torch.where(sound.unsqueeze(-1), planned, safety.dt.unsqueeze(-1) * done)
         return replace(motion.pose_drift, planned=planned)
 
     def _basis(self, goals: Goals, pose: Pose, J: Tensor) -> Tensor | None:

@@ -131,9 +131,9 @@ class LimitBarrier(nn.Module):
             dt: Step [s], one for all arms or one for each.
         """
         eps = torch.finfo(self.velocity.dtype).eps
-        rounding = _ROUNDING * eps * self.velocity / dt
-        acceleration = (1 - 4 * eps) * self.acceleration - 2 * rounding
-        jerk = (1 - 4 * eps) * self.jerk - 4 * rounding / dt
+        rounding = self.velocity * (_ROUNDING * eps / dt)
+        acceleration = torch.sub((1 - 4 * eps) * self.acceleration, rounding, alpha=2)
+        jerk = torch.sub((1 - 4 * eps) * self.jerk, rounding / dt, alpha=4)
         return acceleration.clamp(min=0), jerk.clamp(min=0)
 
     def velocity_bounds(
@@ -141,15 +141,11 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
         delta = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
-        # h(|delta|) with the sign of delta. A joint past its wall returns at the speed at which
-        # it may approach the wall from the same distance inside. |delta| keeps the root real.
-        square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.abs())
-        speed = torch.copysign(square.sqrt() - self.knee, delta)
-        # v_hat = v + A^2/(2 j) at a = 0; outside, a joint may rest.
-        speed = (speed - self.reserve).clamp(min=0)
+        # v_hat = v + A^2/(2 j) at a = 0. Past its wall a joint may rest, as at the wall.
+        square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.clamp(min=0))
+        speed = (square.sqrt() - self.knee - self.reserve).clamp(min=0)
         most = (1 - 2 * _ROUNDING * torch.finfo(self.velocity.dtype).eps) * self.velocity
-        bounds = speed.clamp(-most, most) * -self.sides
-        lower, upper = bounds.unbind(-2)
+        lower, upper = (torch.minimum(speed, most) * -self.sides).unbind(-2)
         return lower, upper
 
     def acceleration_bounds(
@@ -183,6 +179,7 @@ class LimitBarrier(nn.Module):
         velocity: Float[Tensor, "*batch n"],
         bounds: tuple[Tensor, Tensor],
         dt: float | Float[Tensor, "*#batch 1"],
+        usable: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "*batch n"]:
         """The acceleration nearest to `wanted` that keeps the limits now and later [rad/s^2].
 
@@ -192,23 +189,11 @@ class LimitBarrier(nn.Module):
             velocity: Velocity of the last step [rad/s].
             bounds: `velocity_bounds` now.
             dt: Step [s], one for all arms or one for each.
+            usable: The limits `usable(dt)`, if they are at hand.
         """
-        # Clamp to the reachable range last, because outside the set the barrier may require an
-        # acceleration beyond it.
+        A, jerk = self.usable(dt) if usable is None else usable
         inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
-        return inside.clamp(*self._reachable_acceleration(last, dt))
-
-    def _reachable_acceleration(
-        self, last: Tensor, dt: float | Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Lowest and highest acceleration of the next step within the jerk limit [rad/s^2]."""
-        acceleration, jerk = self.usable(dt)
-        reach = jerk * dt
-        lowest = torch.maximum(last - reach, -acceleration)
-        highest = torch.minimum(last + reach, acceleration)
-        # At the start, the acceleration may be so far outside its limit that the jerk limit
-        # does not permit a return in one step.
-        return torch.minimum(lowest, last + reach), torch.maximum(highest, last - reach)
+        return _reachable(inside, last, A, jerk * dt)
 
     def reachable_velocity(
         self,
@@ -228,11 +213,21 @@ class LimitBarrier(nn.Module):
             bounds: `velocity_bounds` now.
             dt: Step [s], one for all arms or one for each.
         """
-        A, _ = self.usable(dt)
-        allowed = self.acceleration_bounds(velocity, bounds, dt)
-        reachable = self._reachable_acceleration(acceleration, dt)
-        lowest, highest = (a.clamp(*allowed).clamp(*reachable) for a in (-A, A))
+        A, jerk = self.usable(dt)
+        allowed, reach = self.acceleration_bounds(velocity, bounds, dt), jerk * dt
+        ends = (-A).clamp(*allowed), A.clamp(*allowed)
+        lowest, highest = (_reachable(a, acceleration, A, reach) for a in ends)
         return velocity + dt * lowest, velocity + dt * highest
+
+
+def _reachable(wanted: Tensor, last: Tensor, limit: Tensor, reach: Tensor) -> Tensor:
+    """The acceleration within its limit and within reach of the last one [rad/s^2].
+
+    The reach, which the jerk limit sets, comes last: outside the set the barrier may require an
+    acceleration beyond it, and at the start the acceleration may be so far outside its limit
+    that one step does not return it.
+    """
+    return wanted.clamp(-limit, limit).clamp(last - reach, last + reach)
 
 
 # Velocity that ramps of the acceleration may add during gentle braking, as a fraction of the
@@ -330,13 +325,13 @@ class SpeedBarrier(nn.Module):
         """
         T = self.braking_time(velocity)
         x, towards = velocity.abs(), torch.sign(velocity) * acceleration
-        braking = x / T
+        braking, twice_jerk = x / T, 2 * self.jerk
         # Deviation from y v: a joint is faster while its acceleration ramps down, and slower if
         # it brakes harder. A joint that cannot end the braking before zero velocity reverses.
         # Then |a| > |v|/T, as T > max(A_i/j_i)/(2 kappa).
         hard = towards.clamp(max=0) ** 2
-        ramp = torch.where(hard > 2 * self.jerk * x, hard, (towards + braking) ** 2)
-        excess = ramp / (2 * self.jerk)
+        ramp = torch.where(hard > twice_jerk * x, hard, (towards + braking) ** 2)
+        excess = ramp / twice_jerk
         rho = (self.decay * T).clamp(min=1)
         excess = excess + (1 - (1 + rho.log()) / rho) * x
         fastest = x + excess
@@ -355,8 +350,8 @@ class SpeedBarrier(nn.Module):
 
     def _turning(self, R: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Sum over i, j of R_max(i,j) x_i y_j, computed from partial sums up to each joint."""
-        up_to_x, up_to_y = ((v.unsqueeze(-2) * self.distal.mT).sum(-1) for v in (x, y))
-        return torch.linalg.vecdot(R, (x * up_to_y + y * up_to_x - x * y).unsqueeze(-2))
+        up_to_x, up_to_y = x.cumsum(-1), y.cumsum(-1)
+        return torch.linalg.vecdot(R, (x * up_to_y + y * (up_to_x - x)).unsqueeze(-2))
 
 
 def _peak(M: Tensor, gamma: Tensor) -> Tensor:

@@ -163,7 +163,7 @@ def saturate_in_null_space(
         The shifted velocity [rad/s], which may exceed bounds that the given velocity kept; or
         the given velocity, if its twist after clamping is at least as near to `twist`.
     """
-    cut = torch.minimum(torch.maximum(task, lower), upper)
+    cut = task.clamp(lower, upper)
     free = cut == task
     if everywhere(free):
         return task
@@ -173,8 +173,7 @@ def saturate_in_null_space(
     shared = torch.where(free, others.squeeze(-1), cut)
 
     def off(velocity: Tensor) -> Tensor:
-        within = torch.minimum(torch.maximum(velocity, lower), upper)
-        missing = twist - torch.linalg.vecdot(J, within.unsqueeze(-2))
+        missing = twist - torch.linalg.vecdot(J, velocity.clamp(lower, upper).unsqueeze(-2))
         return torch.linalg.vecdot(missing, missing).unsqueeze(-1)
 
     # Where no limit acts, both velocities are equal up to rounding.
@@ -205,16 +204,12 @@ def scale_task(
     Returns:
         The velocity, scaled down at most until no limit acts [rad/s].
     """
-    cut = torch.minimum(torch.maximum(task, lower), upper)
+    cut = task.clamp(lower, upper)
     if everywhere(cut == task):
         return task
-    asked, done = (
-        torch.linalg.vector_norm(
-            torch.linalg.vecdot(J, v.unsqueeze(-2)).view(*v.shape[:-1], 2, 3) / caps[:, None],
-            dim=(-2, -1),
-        ).unsqueeze(-1)
-        for v in (task, cut)
-    )
+    twists = torch.linalg.vecdot(J, torch.stack((task, cut)).unsqueeze(-2))
+    speeds = twists.unflatten(-1, (2, 3)) / caps[:, None]
+    asked, done = torch.linalg.vector_norm(speeds, dim=(-2, -1)).unsqueeze(-1)
     moving = torch.where(task == 0, torch.finfo(task.dtype).tiny, task)
     fits = torch.maximum(lower / moving, upper / moving).amin(-1, keepdim=True)
     slowed = torch.maximum(asked / done, fits).clamp(0, 1)
@@ -244,12 +239,12 @@ def scale_null_space(
     Returns:
         The scaled null-space velocity [rad/s].
     """
-    at_rest = null == 0
-    if everywhere(at_rest & ~task.isnan()):
+    both = task + null
+    if everywhere(both.clamp(lower, upper) == both):
         return null
     # A joint without null-space motion does not bound the factor: divided by the smallest
     # number, its bounds become infinite, or of the wrong sign where the task alone is too fast.
-    null_or_tiny = torch.where(at_rest, torch.finfo(null.dtype).tiny, null)
+    null_or_tiny = torch.where(null == 0, torch.finfo(null.dtype).tiny, null)
     at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
     least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
     most = torch.maximum(at_lower, at_upper).amin(-1, keepdim=True)
@@ -324,8 +319,7 @@ _NO_SPEED = 1e-6
 def planned_motion(
     task_twist: Float[Tensor, "*batch 6"],
     twist: Float[Tensor, "*batch 6"],
-    jacobian: Float[Tensor, "*batch 6 n"],
-    joint_velocity: Float[Tensor, "*batch n"],
+    done: Float[Tensor, "*batch 6"],
     dt: float | Float[Tensor, ""],
 ) -> Float[Tensor, "*batch 6"]:
     """Motion of the tool that the task plans for the coming step (linear [m], angular [rad]).
@@ -338,11 +332,9 @@ def planned_motion(
     Args:
         task_twist: Twist of the task alone.
         twist: Twist of the task and of the drift correction.
-        jacobian: Jacobian of the tool.
-        joint_velocity: Filtered joint velocity [rad/s].
+        done: Twist of the tool at the filtered joint velocity.
         dt: Step [s].
     """
-    done = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))
     along = torch.linalg.vecdot(done, twist) + _NO_SPEED**2
     square = torch.linalg.vecdot(twist, twist) + _NO_SPEED**2
     fraction = (along / square).clamp(0, 1)
@@ -572,19 +564,18 @@ def regional_feedback(
     xi_r = torch.cat([xi_position, xi_orientation], dim=-1)
     error = blending.feature - goals.vision.target
     gain = blending.level.unsqueeze(-1)
+    descent = torch.linalg.vecdot(image_jacobian, xi_x.unsqueeze(-1), dim=-2)
     if vision_rate < math.inf:
-        gain = gain / _excess_rate(image_jacobian, xi_x, error, vision_rate)
-    xi_x = gain * xi_x
-    s = torch.linalg.vecdot(image_jacobian, xi_x.unsqueeze(-1), dim=-2) + xi_r
-    return Feedback(xi_x, xi_r, s, P_t + P_o + blending.level * P_v)
+        gain = gain / _excess_rate(image_jacobian, descent, error, vision_rate)
+    s = torch.addcmul(xi_r, gain, descent)
+    return Feedback(gain * xi_x, xi_r, s, P_t + P_o + blending.level * P_v)
 
 
 def _excess_rate(
-    J_s: Tensor, xi_x: Tensor, error: Tensor, vision_rate: float
+    J_s: Tensor, descent: Tensor, error: Tensor, vision_rate: float
 ) -> Float[Tensor, "*batch 1"]:
     """Divisor of the vision feedback, at least 1, that caps the decay of the pixel error."""
-    # The feature moves with J_s J_s^T xi_x, if the estimate is right.
-    descent = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
+    # The feature moves with J_s descent = J_s J_s^T xi_x, if the estimate is right.
     speed = torch.linalg.vecdot(J_s, descent.unsqueeze(-2))
     speed = torch.linalg.vector_norm(speed, dim=-1, keepdim=True)
     distance = torch.linalg.vector_norm(error, dim=-1, keepdim=True)

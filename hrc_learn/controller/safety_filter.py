@@ -263,8 +263,9 @@ class SafetyFilter(nn.Module):
             v, report = self._keep_constraints(given, v)
         if given.points is not None:
             v, braked = self._keep_speed(given, v, cap)
-            speeding = speeding | braked
-            excess = (_speed(given.points, v) - cap).clamp(min=0).squeeze(-1)
+            if braked is not None:
+                speeding = speeding | braked
+                excess = (_speed(given.points, v) - cap).clamp(min=0).squeeze(-1)
         # In the order of INTERVENTIONS.
         flags = (fast, cut, hard, jerky, speeding, near)
         flags = torch.cat((*flags, given.invalid, given.stopped, wrong_start), dim=-1)
@@ -389,7 +390,7 @@ class SafetyFilter(nn.Module):
         if self.config.constraints is None:
             u = u / excess.clamp(min=1)
         inside = u.clamp(*given.bounds)
-        cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _REPORTED
+        cut = (inside - u).abs().amax(-1, keepdim=True) > _REPORTED
         # With constraints, no single joint is cut: the null space can give way to the whole
         # task.
         return inside if self.config.constraints is None else u, _acts(excess), cut
@@ -430,17 +431,17 @@ class SafetyFilter(nn.Module):
             The velocity, and the flags `acceleration` and `jerk`.
         """
         barrier, state, dt = self.barrier, given.state, given.dt
-        acceleration, jerk = barrier.usable(dt)
-        change = (target - state.velocity) / dt
+        usable = acceleration, jerk = barrier.usable(dt)
+        change, reach = (target - state.velocity) / dt, jerk * dt
         excess = _excess(change, acceleration)
         # a = change/s with the root s of a dt + a^2/(2 j) = change dt, which fades out in time.
-        fading = (1 + torch.sqrt(1 + 2 * _excess(change, jerk * dt))) / 2
+        fading = (1 + torch.sqrt(1 + 2 * _excess(change, reach))) / 2
         jump = change / torch.maximum(excess, fading) - state.acceleration
-        jerky = _excess(jump, jerk * dt)
+        jerky = _excess(jump, reach)
         wanted = torch.addcdiv(state.acceleration, jump, jerky.clamp(min=1))
         if bounds is not None:
             wanted = barrier.nearest_acceleration(
-                wanted, state.acceleration, state.velocity, bounds, dt
+                wanted, state.acceleration, state.velocity, bounds, dt, usable
             )
         return state.velocity + wanted * dt, _acts(excess), _acts(jerky)
 
@@ -488,8 +489,9 @@ class SafetyFilter(nn.Module):
 
     def _keep_speed(
         self, given: _Inputs, v: Tensor, cap: Tensor | float
-    ) -> tuple[Tensor, Bool[Tensor, "*batch 1"]]:
-        """The velocity, reduced as far as the cap on the speed of points requires, and a flag.
+    ) -> tuple[Tensor, Bool[Tensor, "*batch 1"] | None]:
+        """The velocity, reduced as far as the cap on the speed of points requires, and a flag;
+        no flag if all arms keep the cap.
 
         The result lies inside the barrier, on the line from the wanted velocity to gentle
         braking (`_easing`), as near to the wanted velocity as possible. Where gentle braking is
@@ -498,9 +500,10 @@ class SafetyFilter(nn.Module):
         """
         cap = cap * (1 - 8 * torch.finfo(v.dtype).eps)
         speed = self._highest_speed(given, v)
-        passes = (speed <= cap) | given.invalid | given.stopped
+        keeps = speed <= cap
+        passes = keeps | given.invalid | given.stopped
         if everywhere(passes):
-            return v, ~passes
+            return v, None if everywhere(keeps) else ~passes
         stopping, easing = self._stopping(given), self._easing(given)
         hard, gentle = self._highest_speed(given, stopping), self._highest_speed(given, easing)
         eases = gentle <= cap

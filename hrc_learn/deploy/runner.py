@@ -151,7 +151,8 @@ class EagerRunner(StepRunner):
         self._before.copy_(vectors[0])
         before, state, observation, command = self._views
         read = zip(before + observation, self._dtypes, strict=True)
-        results = self._packed.stepped([x.to(dtype) for x, dtype in read])
+        read = [x if x.dtype == dtype else x.to(dtype) for x, dtype in read]
+        results = self._packed.stepped(read)
         torch._foreach_copy_(command + state, results)
 
 

@@ -387,6 +387,10 @@ class _Unroller:
     def aten_linalg_vecdot(self, a: Tensor, b: Tensor, *, dim: int = -1) -> Tensor:
         return self.aten_sum(self._each("mul", a, b), dim)
 
+    def aten_cumsum(self, x: Tensor, dim: int) -> Tensor:
+        ends = range(1, x.shape[dim] + 1)
+        return torch.stack([self.aten_sum(x.narrow(dim, 0, k), [dim]) for k in ends], dim)
+
     def aten_pow(self, x: Tensor, exponent: Any) -> Tensor:
         if exponent == 0.5:
             return self._each("sqrt", x)

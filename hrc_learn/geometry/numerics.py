@@ -152,6 +152,10 @@ def arctan_ratio(
     Returns:
         The ratio, 1 / c at s = 0.
     """
+    if torch.is_inference_mode_enabled() and may_branch(sine_square):
+        # Without derivatives the closed form is exact down to the smallest sine.
+        s = sine_square.clamp(min=torch.finfo(sine_square.dtype).tiny).sqrt()
+        return torch.atan2(s, cosine) / s
     small = sine_square < _ARCTAN_THRESHOLD * cosine * cosine
     s = torch.sqrt(torch.where(small, 1.0, sine_square))
     c = torch.where(small, cosine, 1.0)

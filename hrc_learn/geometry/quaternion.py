@@ -37,7 +37,8 @@ _OUTER = torch.tensor([
     [9, 0, 0, 0, 0, -9, 0, 0, 0, 0, -9, 0, 0, 0, 0, 9],
 ])  # fmt: skip
 _OUTER_INDEX, _OUTER_SIGN = Constant(_OUTER.abs() - 1), Constant(_OUTER.sign().double())
-_OUTER_OFFSET = Constant(torch.eye(4, dtype=torch.float64))
+_OUTER_OFFSET = Constant(torch.eye(4, dtype=torch.float64).flatten())
+_COMPONENTS = Constant(torch.arange(4))
 # Below this angle [rad] an axis of rotation is rounding noise.
 _AXIS_THRESHOLD = 1e-6
 
@@ -78,7 +79,7 @@ def log(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
     """
     q = canonical(q)
     w, v = q[..., 0], q[..., 1:]
-    return (2 * arctan_ratio((v * v).sum(-1), w))[..., None] * v
+    return (2 * arctan_ratio(torch.linalg.vecdot(v, v), w))[..., None] * v
 
 
 def exp(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
@@ -114,11 +115,10 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     if torch.compiler.is_compiling():
         return _written_out_from_matrix(R)
     entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
-    outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
-    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    # Not take_along_dim: exporting it fixes the batch size.
-    row = outer.gather(-2, largest[..., None, None].expand(*outer.shape[:-2], 1, 4))
-    return normalize(row.squeeze(-2))
+    outer = entries.sum(-2) + _OUTER_OFFSET.like(R)
+    largest = outer[..., ::5].argmax(-1, keepdim=True)
+    row = outer.gather(-1, 4 * largest + _COMPONENTS.like(R))
+    return normalize(row)
 
 
 def angle(

@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
-from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import check_settings, has_numbers, is_number, matmul
+from hrc_learn.geometry import Pose, numerics
+from hrc_learn.geometry.numerics import check_settings, everywhere, has_numbers, is_number
 from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import chosen, pytree
@@ -126,7 +126,7 @@ def evaluate(
     weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
 ) -> Float[Tensor, "*batch rows 6"]:
     """Image Jacobian J_s_hat of weights W and activations theta: vec(J_s_hat^T) = W theta."""
-    return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))
+    return numerics.matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))
 
 
 class FixedEstimator(ImageJacobianEstimator):
@@ -202,7 +202,7 @@ class MotionSample:
     def error(self, weight: Float[Tensor, "*batch entries K"]) -> Float[Tensor, "*batch rows"]:
         """Prediction error dx - J_s_hat dr [px]."""
         J = evaluate(weight, self.theta)
-        return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
+        return self.dx - numerics.matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
 
 
 class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
@@ -314,6 +314,8 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         )
         # The first valid frame becomes a key frame, and so does the second frame of every pair.
         take = moved | (measurement.valid & ~key.present)
+        if everywhere(~take):
+            return key, pair
         pose, feature = measurement.pose, measurement.feature
         here = KeyFrame(pose=pose, feature=feature, theta=theta, present=take)
         return chosen(take, here, key), pair
@@ -358,7 +360,7 @@ def paper_rate(
     d(J_s_hat)/dt = -gain |theta|^2 xi_x s^T.
     """
     xi_x = measurement.xi_x.unsqueeze(-1)
-    s = matmul(J.mT, xi_x).squeeze(-1) + measurement.xi_r
+    s = numerics.matmul(J.mT, xi_x).squeeze(-1) + measurement.xi_r
     push = (xi_x * s.unsqueeze(-2)).flatten(-2)  # (*batch, 12)
     return -gain * push.unsqueeze(-1) * theta.unsqueeze(-2)
 
@@ -544,8 +546,10 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         """
         weight = state.weight
         covariance = state.covariance + now.dt * self.walk
+        if everywhere(~pair.valid):
+            return replace(state, covariance=covariance)
         phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
-        P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
+        P_phi = numerics.matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
         spread = (P_phi * phi).sum(-1, keepdim=True) + 2 * self.config.pixel_noise**2
         change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
         change = change.unflatten(-1, (6, -1)) * self.scale.unsqueeze(-1)  # (*batch, 2, 6, K)

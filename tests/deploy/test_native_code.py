@@ -44,6 +44,7 @@ def operations(x: Tensor) -> list[Tensor]:
         a.logsumexp(0, keepdim=True), a.logsumexp(0)[None],
         pairs.logsumexp(1), pairs.softmax(1).flatten(0, 1), pairs.argmax(1).to(x.dtype),
         pairs.roll(1, 1).flatten(0, 1), torch.linalg.vector_norm(pairs, dim=1),
+        a.cumsum(0), pairs.cumsum(1).flatten(0, 1),
         a.argmin(0, keepdim=True).to(x.dtype), a.gather(0, b.argmax(0, keepdim=True)),
         filled(a), a.flip(0), a.roll(3, 0), torch.stack([a, b], 1).reshape(16, *a.shape[1:]),
         torch.nn.functional.pad(a.movedim(0, -1), (1, 2)).movedim(-1, 0),
