@@ -70,9 +70,13 @@ def test_new_episodes_have_the_columns_of_the_demonstrations(dataset, tmp_path):
 
 
 @pytest.mark.long
-def test_it_goes_on_where_it_was_killed(dataset, tmp_path, monkeypatch):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    multiplied(dataset, whole)
+@pytest.mark.parametrize("judge", ["", f"{panda_environment.__file__}:Taking"])
+def test_it_goes_on_where_it_was_killed(tmp_path, monkeypatch, judge):
+    whole, broken, dataset = (tmp_path / name for name in ("whole", "broken", "three"))
+    write_dataset(dataset, gripper=True)
+    settings = ["--config", "judge.processes=1", "objects.block.z=[0.05,0.05]"]
+    settings += ["--judge", judge] * bool(judge)
+    multiplied(dataset, whole, *settings)
     write = multiply_dataset.MultipliedWriter.write
 
     def killed(self, *given):
@@ -81,13 +85,13 @@ def test_it_goes_on_where_it_was_killed(dataset, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(multiply_dataset.MultipliedWriter, "write", killed)
-    assert multiplied(dataset, broken).status == 1
+    assert multiplied(dataset, broken, *settings).status == 1
     assert not broken.exists()
-    other = multiplied(dataset, broken, "--config", "multiply.seed=1")
+    other = multiplied(dataset, broken, *settings, "--config", "multiply.seed=1")
     assert other.status == 2
     assert "other settings" in other.error
     monkeypatch.undo()
-    assert multiplied(dataset, broken).status == 0
+    assert multiplied(dataset, broken, *settings).status == 0
     assert origins(broken) == origins(whole)
     for one, two in zip(load_demos(broken), load_demos(whole), strict=True):
         assert np.array_equal(one.joint_position, two.joint_position)
