@@ -4,9 +4,10 @@ One thread; float64, batches float32. The measured step has all features: Kalman
 image Jacobian, a person, late images, safety filter. The floor is the time that any
 resolved-rate step needs: forward kinematics, Jacobian, and one 6 x 6 solve. Calls are made in
 turn, with cold caches; `exported_alone` is called repeatedly. Reported are median, 99th
-percentile and minimum of the CPU time. If mink is installed, its `solve_ik` with a frame and a
-posture task is measured as well. Exported steps are built once, each in a minute or two, and
-kept.
+percentile and minimum of the CPU time. If mink is installed (`tools/make_environments.sh
+peers`), its `solve_ik` with a frame and a posture task is measured in turn with the rest.
+`call` is the floor of a compiled step: the call of a compiled function without instructions.
+Exported steps are built once, each in seconds, and kept.
 """
 
 import os
@@ -38,6 +39,9 @@ from hrc_learn.controller import (
 )
 from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.deploy import EagerRunner, StepRunner, open_step
+from hrc_learn.deploy.native_code import NativeCode, NativeStep, assemble
+from hrc_learn.deploy.package import StepLayouts
+from hrc_learn.deploy.scalar_program import ScalarProgram
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
@@ -113,7 +117,8 @@ def _figures(timings: dict[str, Timing], batched: dict[str, Timing]) -> dict[str
         figures[f"{name}_us"] = 1e6 * timing.median
         figures[f"{name}_p99_us"] = 1e6 * timing.p99
         figures[f"{name}_least_us"] = 1e6 * timing.least
-    for name, other in (("exported", "eager"), ("exported", "mink"), ("eager", "floor")):
+    pairs = [("exported", "eager"), ("exported", "call"), ("exported", "mink")]
+    for name, other in (*pairs, ("eager", "floor"), ("eager", "mink")):
         if {name, other} <= timings.keys():
             figures[f"{name}_over_{other}"] = timings[name].median / timings[other].median
     for name, timing in batched.items():
@@ -148,10 +153,12 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
             console.print(str(warning.message), style="yellow")
         if not isinstance(runner, EagerRunner):
             calls["exported"] = settled(runner)
+            calls["call"] = _empty_call()
     if importlib.util.find_spec("mink") is not None:
         calls["mink"] = _mink_call()
     else:
-        console.print("no mink to compare with: pip install mink daqp", style="yellow")
+        text = "no mink to compare with: run tools/make_environments.sh peers, use its Python"
+        console.print(text, style="yellow")
     return calls
 
 
@@ -225,6 +232,14 @@ def _servoing(
         dt=0.001,
     )
     return AdaptiveController(panda, estimator, goals), observation
+
+
+def _empty_call() -> Callable[[], object]:
+    """Call of a compiled step without instructions."""
+    code = NativeCode(ScalarProgram(torch.float64), StepLayouts._fields, 1)
+    run = NativeStep(assemble(code.text), 1, code.workspace)
+    vectors = [torch.zeros(1, dtype=torch.float64) for _ in StepLayouts._fields]
+    return partial(run, vectors)
 
 
 def _mink_call() -> Callable[[], object]:

