@@ -74,9 +74,11 @@ FRAME = 10
 """Steps between two images: 25 images a second."""
 QUALITY = 85
 """Quality of the JPEG images."""
+MOVING = 0.05
+"""Speed of a joint above which a command of zeros is a stop by the driver [rad/s]."""
 LONGEST = 600.0
 """Longest duration of a job [s]."""
-COUNTED = "contacts", "joint limit violations", "robot_violations"
+COUNTED = "contacts", "joint limit violations", "robot_violations", "stops"
 """Counts that are summed over the jobs."""
 COMPARED = {
     "place error": "mm",
@@ -104,7 +106,7 @@ class Args:
     """Commands over topics."""
     waits: float = 0.0
     """Longest time for which the robot's clock waits for a command [s]; 0: real time. On a busy
-    machine, waiting keeps the loop from being late."""
+    machine, waiting keeps the loop from being late. Joint states may then be older."""
     first_seed: int = 7300
     """First seed of object places, images and imperfections."""
     jobs: int = 50
@@ -116,7 +118,7 @@ class Args:
     """Two such files, without ROS and over topics, whose common seeds are compared."""
 
 
-def site_of(interface: Any) -> ArmSite:
+def site_of(interface: Any, waits: float = 0.0) -> ArmSite:
     """The arm over topics: as fast as the simulated arm, with its force sensor and gripper."""
     sizes = Imperfections.nominal()
     config = Ros2Config(
@@ -124,6 +126,7 @@ def site_of(interface: Any) -> ArmSite:
         wrench="/force_sensor",
         gripper="/gripper/commands",
         gripper_joint="finger_joint",
+        silence=max(Ros2Config.silence, 40 * waits),
     )
     return ArmSite(
         driver="ros2",
@@ -224,14 +227,19 @@ class Surroundings:
 
 
 class JobRobot(Ros2Robot):
-    """The robot, its camera and the person on topics."""
+    """The robot, its camera and the person on topics.
+
+    Attributes:
+        lateness: Delay of each step behind real time [s].
+        stops: Number of commands of zeros while a joint moved faster than `MOVING`.
+    """
 
     def __init__(self, surroundings: Surroundings, config: Ros2Config, waits: float):
         """Publish everything."""
         from sensor_msgs.msg import CompressedImage
         from std_msgs.msg import Float64MultiArray, String
 
-        self._around, self.lateness = surroundings, list[float]()
+        self._around, self.lateness, self.stops = surroundings, list[float](), 0
         self._phases, self._exposed = queue.SimpleQueue[str](), queue.SimpleQueue[Any]()
         self._ready = threading.Event()
         super().__init__(surroundings.world, config, rate=RATE, waits=waits)
@@ -246,6 +254,10 @@ class JobRobot(Ros2Robot):
         self._ready.set()
 
     def _step(self) -> None:
+        moving = np.abs(self.state.joint_velocity).max() > MOVING
+        self.stops += bool(
+            moving and self._velocity is not self._sent and not self._velocity.any()
+        )
         super()._step()
         self._around.keep(self.now)
         self.lateness.append(self.late)
@@ -418,7 +430,7 @@ def carried_out(
     )
 
 
-def over_topics(models: Path, interface: str) -> Done:
+def over_topics(models: Path, interface: str, waits: float) -> Done:
     """Carry out the task over topics, in a process of its own."""
     from sensor_msgs.msg import CompressedImage
     from std_msgs.msg import Float64MultiArray, String
@@ -433,7 +445,7 @@ def over_topics(models: Path, interface: str) -> Done:
     node.create_subscription(Float64MultiArray, PUSH, person.take, form)
     phases = node.create_publisher(String, PHASE, queued_quality())
     try:
-        site = site_of(interface)
+        site = site_of(interface, waits)
         return carried_out(
             models, site, camera, person, lambda x: phases.publish(String(data=x))
         )
@@ -444,9 +456,9 @@ def over_topics(models: Path, interface: str) -> Done:
 def topics_job(workers: ProcessPoolExecutor, seed: int, args: Args) -> dict[str, Any]:
     """Run the job of a seed over topics, and return its row."""
     around = Surroundings(skills_of(args.models)[2], seed)
-    config = site_of(args.interface).ros2
+    config = site_of(args.interface, args.waits).ros2
     with JobRobot(around, config, args.waits) as robot:
-        given = args.models, args.interface
+        given = args.models, args.interface, args.waits
         try:
             done = workers.submit(over_topics, *given).result(LONGEST)
         except (DriverError, WatchdogError) as error:
@@ -454,7 +466,11 @@ def topics_job(workers: ProcessPoolExecutor, seed: int, args: Args) -> dict[str,
             failed = {"seed": seed, "failure": f"driver: {error}", "missed": ["driver"]}
         late = 1e3 * np.array(robot.lateness)
     row = failed if done is None else row_of(around, done, seed)
-    row |= {"held": robot.held, "robot_late_ms": np.percentile(late, [50, 99, 100]).tolist()}
+    row |= {
+        "held": robot.held,
+        "stops": robot.stops,
+        "robot_late_ms": np.percentile(late, [50, 99, 100]).tolist(),
+    }
     return row | {"robot_violations": robot.violations, "robot_commands": robot.commands}
 
 
