@@ -464,6 +464,7 @@ def topics_job(workers: ProcessPoolExecutor, seed: int, args: Args) -> dict[str,
         except (DriverError, WatchdogError) as error:
             done = None
             failed = {"seed": seed, "failure": f"driver: {error}", "missed": ["driver"]}
+            failed["load"] = os.getloadavg()[0]
         late = 1e3 * np.array(robot.lateness)
     row = failed if done is None else row_of(around, done, seed)
     row |= {
@@ -553,17 +554,14 @@ def compare(direct: list[dict[str, Any]], topics: list[dict[str, Any]]) -> None:
         text = f"{mean:+.2f} ({low:+.2f} to {high:+.2f}), n = {values.shape[1]}"
         table.add_row(f"{name} ({unit})", *cells, text)
     Console(width=140).print(table)
-    late, step = (
-        np.array([row[name] for row in second]) for name in ("robot_late_ms", "step_ms")
-    )
-    late_by, steps = np.median(late, axis=0), np.median(step, axis=0)
-    print(
-        f"robot late by [ms]: p50 {late_by[0]:.1f}, p99 {late_by[1]:.0f}, most {late.max():.0f}"
-    )
-    print(
-        f"steps of the task [ms]: p50 {steps[1]:.0f}, p99 {steps[2]:.0f}, most {step.max():.0f}"
-    )
-    print(f"load: {np.median([row['load'] for row in second]):.1f}")
+    step = np.array([row["step_ms"] for row in second if "step_ms" in row])
+    p50, p99 = np.median(step, axis=0)[1:3]
+    print(f"steps of the task [ms]: p50 {p50:.0f}, p99 {p99:.0f}, most {step.max():.0f}")
+    if not any(row.get("held") for row in second):  # otherwise the clock waits
+        late = np.array([row["robot_late_ms"] for row in second])
+        p50, p99 = np.median(late, axis=0)[:2]
+        print(f"robot late by [ms]: p50 {p50:.1f}, p99 {p99:.0f}, most {late.max():.0f}")
+    print(f"load: {np.median([row.get('load', np.nan) for row in second]):.1f}")
     for place, rows in (("without ROS", first), ("over topics", second)):
         for row in rows:
             if missed := missed_by(row):
