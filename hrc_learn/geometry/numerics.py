@@ -152,7 +152,7 @@ def arctan_ratio(
     Returns:
         The ratio, 1 / c at s = 0.
     """
-    if torch.is_inference_mode_enabled() and may_branch(sine_square):
+    if may_branch(sine_square) and torch.is_inference_mode_enabled():
         # Without derivatives the closed form is exact down to the smallest sine.
         s = sine_square.clamp(min=torch.finfo(sine_square.dtype).tiny).sqrt()
         return torch.atan2(s, cosine) / s

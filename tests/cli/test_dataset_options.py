@@ -115,6 +115,7 @@ def test_a_check_fails_on_errors_and_if_strict_on_warnings_and_motion(
     )
     monkeypatch.setattr(dataset_commands, "check_dataset", lambda *given, **more: report)
     monkeypatch.setattr(dataset_commands, "_camera_moved", lambda args: moved)
+    (tmp_path / "meta").mkdir()
     args = Check(
         dataset=tmp_path,
         strict=strict,

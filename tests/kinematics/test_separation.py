@@ -161,7 +161,7 @@ def test_axes_that_meet_have_no_direction_and_no_infinite_gradient():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_distances_from_balls_have_the_gradient_of_the_closed_form(dtype):
-    q = panda.ready.to(dtype).requires_grad_()
+    q = panda.ready.to(dtype, copy=True).requires_grad_()
     centre = torch.tensor([0.7, 0.2, 0.4], dtype=dtype)
     found = separation(ARM, q, centre.expand(1, 2, 3), torch.full((1,), 0.1, dtype=dtype))
     rows = [torch.autograd.grad(d, q, retain_graph=True)[0] for d in found.distance[:, 0]]
