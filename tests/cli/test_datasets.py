@@ -458,11 +458,16 @@ def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(
     assert not Path(viewer[0][-1]).exists()
 
 
-def test_demonstrations_are_streamed_to_the_browser(viewer, recording, tmp_path):
+def test_demonstrations_are_streamed_to_the_browser(viewer, recording, tmp_path, monkeypatch):
+    pages = []
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(dashboard_commands.webbrowser, "open", pages.append)
     hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
     shown = hrc("show", tmp_path / "set", "--web", "--json", tmp_path / "figures.json")
     assert shown.status == 0
-    assert "/#token=" in shown.output
+    (page,) = pages
+    assert "/#token=" in page
+    assert page in shown.output
     assert not viewer  # no recording is written first
     assert json.loads((tmp_path / "figures.json").read_text())["episodes"] == 1
 
