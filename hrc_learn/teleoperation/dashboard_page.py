@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -123,12 +122,16 @@ def _viewer_contents() -> dict[str, Content]:
 
 def _fetched_viewer() -> dict[str, bytes]:
     """Files of the viewer, which Rerun's program provides by HTTP only."""
+    import rerun
+
     ports = []
     for _ in range(2):
         with socket.create_server(("127.0.0.1", 0)) as free:
             ports.append(free.getsockname()[1])
     command = [
-        *(sys.executable, "-m", "rerun", "--serve-web", "--bind", "127.0.0.1"),
+        # Not `python -m rerun`: it starts the program as a child, which would outlive it.
+        *(str(Path(rerun.__file__).parents[1] / "rerun_cli/rerun"), "--serve-web"),
+        *("--bind", "127.0.0.1"),
         *("--web-viewer-port", str(ports[0]), "--port", str(ports[1])),
     ]
     quiet = subprocess.DEVNULL

@@ -2,9 +2,11 @@
 
 import asyncio
 import json
+import socket
+import subprocess
 from io import BytesIO
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from urllib.parse import urlsplit
 
 import pytest
@@ -102,8 +104,19 @@ def test_recordings_are_served_as_they_are_and_to_nobody_without_the_secret(tmp_
 
 
 def test_the_viewer_is_that_of_the_installed_rerun(tmp_path, monkeypatch):
+    started: list[list[str]] = []
+    begin, module = cast("Any", subprocess.Popen), cast("Any", dashboard_page)
+
+    def start(command: list[str], **options: Any) -> Any:
+        started.append(command)
+        return begin(command, **options)
+
+    monkeypatch.setattr(module.subprocess, "Popen", start)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     contents = dashboard_page._viewer_contents()
+    port = int(started[0][started[0].index("--web-viewer-port") + 1])
+    with pytest.raises(ConnectionRefusedError):  # the server has ended
+        socket.create_connection(("127.0.0.1", port), timeout=5)
     assert contents["/viewer/re_viewer_bg.wasm"].body[:4] == b"\0asm"
     # What our page calls.
     for name in (b"open_channel(id, channel_name)", b"send_rrd_to_channel(id, data)"):
