@@ -379,7 +379,9 @@ def test_few_columns_without_names_that_move_by_changes_may_be_a_pose():
         assert ("joint_position" in found) == doubted
     joints = followed([50.0] * 4)["joint_position"]
     assert joints.confidence == 0.5
-    assert joints.evidence.startswith("small; 4 columns without names that move by changes may")
+    assert joints.evidence.startswith(
+        "small; the commands are changes, so these 4 columns without"
+    )
     assert "joint_position" not in followed([50.0] * 4, names=tuple("abcd"))
 
 

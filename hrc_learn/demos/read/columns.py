@@ -1,7 +1,9 @@
 """Find the columns of a dataset that hold each quantity.
 
-The caller's mapping comes first, then the contract or sidecar kept with the dataset, then the
-naming conventions of `naming`. No column is assigned to a quantity by its position alone.
+A quantity is named by its role, such as `joint_position` (see `quantities.ROLES`). The caller's
+mapping comes first, then the contract or the sidecar file kept with the dataset (see
+`contract`), then the naming conventions of `naming`. No column is assigned to a quantity by its
+position alone.
 """
 
 import re
@@ -30,8 +32,8 @@ _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_ve
 _POSES = ("position", *ORIENTATION_ROLES)
 _ORIENTATIONS = (*ORIENTATION_ROLES, "quaternion", "rotation")
 _ASSUMED = naming.WORDS["assumed"]
-# Content of a pose feature without component names, by its width: the encoding of the
-# orientation after x, y, z, and the assumption to report.
+# Number of components of a pose feature without component names -> encoding of the orientation
+# that follows x, y, z, and the assumed content, which is reported.
 _CARTESIAN = {
     6: ("euler_xyz", "x, y, z, roll, pitch, yaw"),
     7: ("quaternion_xyzw", "x, y, z, qx, qy, qz, qw"),
@@ -53,7 +55,7 @@ class ColumnSelection:
     units: tuple[str, ...] = ()
     """Unit in the name of each column, "" for none; () if no name states one."""
     assumed: str = ""
-    """Encoding that no name states, in words; "" if names or the caller state it."""
+    """Assumption about the encoding, in words; "" if names or the caller state the encoding."""
 
     def column_name(self, number: int) -> str:
         """Feature and label of a column, for messages."""
@@ -124,7 +126,7 @@ def _with_units(selection: ColumnSelection, features: Mapping[str, Feature]) -> 
 
 
 def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str:
-    """Note on a quantity whose joints differ from those of the rest, with the remedy."""
+    """Note that a quantity has other joints than the other quantities, with the remedy."""
     if set(joints) < set(names):
         advice = ""
     elif len(joints) == len(names):
@@ -138,7 +140,10 @@ def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str
 
 
 def replaced_roles(mapping: MappingSpec) -> set[str]:
-    """Roles that a caller's mapping replaces: one encoding of orientations replaces all."""
+    """Roles that a caller's mapping replaces.
+
+    A mapping with one encoding of the orientation replaces all encodings.
+    """
     return {*mapping} | ({*ORIENTATION_ROLES} if {*mapping} & {*ORIENTATION_ROLES} else set())
 
 
@@ -187,7 +192,7 @@ Components = Mapping[str, Any]
 def column_places(
     role: str, text: str, features: Components, file: str | Path
 ) -> list[tuple[str, int]]:
-    """Feature and component of each column that a text stands for.
+    """Feature and component of each column that the caller's text stands for.
 
     The text may be a feature ("key", or the end of its path), a part of a feature ("key[2:5]",
     "key[3]"), or a component ("NAME" or "key/NAME").
@@ -234,7 +239,7 @@ def feature_key(
     """Feature with this key, or the only feature with a path that ends in it.
 
     Raises:
-        DatasetError: There is no such feature, or there are several, or several components.
+        DatasetError: No feature matches, or several features or components match.
     """
     if text in features:
         return text
@@ -255,7 +260,7 @@ class _Conventions:
 
     def __init__(self, notes: list[str]):
         self._notes = notes
-        """Receives the assumptions made."""
+        """List to which each assumption is added."""
 
     def find(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
         self._commanded = {
@@ -268,7 +273,7 @@ class _Conventions:
         """Joints that an action names, without the gripper and the pose of the tool."""
         whole: dict[str, ColumnSelection] = {}
         by_component: dict[str, ColumnSelection] = {}
-        # A state of joints comes before a state that may hold anything.
+        # Features named after joints take precedence over a state of mixed content.
         for feature in sorted(features.values(), key=lambda f: "joint" not in f.key):
             meanings, known = self._whole_feature(feature), whole
             if meanings is None:
@@ -345,7 +350,8 @@ class _Conventions:
     ) -> ComponentMeaning | None:
         """Meaning of a component as a joint; None if names show that it is no joint.
 
-        An action names the joints that move: a component that only the state has is no joint.
+        The joints that move are named in an action. A component of the state that no action
+        names is therefore no joint.
         """
         joint = naming.joint_of(name)
         named = {naming.joint_of(other) for other in feature.names or ()}
@@ -371,7 +377,8 @@ class _Conventions:
                 slots.setdefault(meaning.slot, index)
         for role, side in [*groups]:
             if role == "pose_matrix" and len(groups[role, side]) in _CARTESIAN:
-                # The components of a pose are only numbered: their count shows the encoding.
+                # The components of this pose are only numbered, so their count decides on the
+                # encoding.
                 slots = groups.pop((role, side))
                 encoding, content = _CARTESIAN[len(slots)]
                 self._notes.append(f"{feature.key}: assumed to be {content}")
@@ -433,7 +440,7 @@ def _is_command(feature: Feature) -> bool:
 def _align_joints(
     found: dict[str, ColumnSelection],
 ) -> tuple[tuple[str, ...], dict[str, ColumnSelection], dict[str, tuple[str, ...]]]:
-    """Bring all quantities with one column per joint into the joint order of the first one.
+    """Bring all quantities with one column per joint into the order of the first such quantity.
 
     Returns:
         Joint names, selections in this order, and role -> joints for quantities with other

@@ -50,9 +50,11 @@ class ComponentContract:
     unit: str
     """Unit on disk; "" if unknown."""
     low: float
-    """Lower end of the range: 5 % quantile of the 0.5 % quantiles of all episodes."""
+    """Lower end of the range: the 0.5 % quantile of each episode, then the 5 % quantile of
+    these values over all episodes."""
     high: float
-    """Upper end of the range: 95 % quantile of the 99.5 % quantiles of all episodes."""
+    """Upper end of the range: the 99.5 % quantile of each episode, then the 95 % quantile of
+    these values over all episodes."""
     sign: Literal[-1, 0, 1] = 0
     """Direction in which the state follows an increasing command, +1 or -1; 0 if unknown."""
     delay: float | None = None
@@ -290,7 +292,8 @@ def infer_contract(
             place = {"key": feature.key, "index": index, "name": name}
             part = ComponentContract(role="other", unit="", low=least, high=most, **place)
             unnamed[part.column] = part
-    # A quantity is read in the order of the contract: x, y, z, w on disk become w, x, y, z.
+    # The contract lists components in the order in which they are read: a quaternion stored as
+    # x, y, z, w is listed as w, x, y, z.
     parts = [
         _describe(unnamed.pop(column), number, decisions[role], profiles, folder.fps)
         for role, selection in mapping.selections.items()

@@ -35,7 +35,7 @@ def require_file(root: Path, file: str, episode: int | None = None) -> None:
         episode: Episode that needs the file, for the message.
 
     Raises:
-        DatasetError: There is no such file, it is a device or a pipe, may not be read, is a
+        DatasetError: The file is missing, is a folder, device or pipe, cannot be read, is a
             pointer of Git LFS, or lies outside the dataset.
     """
     place: dict[str, Any] = {"file": file, "episode": episode}
@@ -310,8 +310,8 @@ def _pages(content: bytes) -> Iterator[_Page]:
 def _row_group(pages: Sequence[_Page], model: Sequence[_Struct]) -> tuple[int, _Struct] | None:
     """Number of pages and metadata of the next row group; None if it is incomplete.
 
-    A column begins with its dictionary, unless it holds Booleans. The number of pages of the
-    first column is unknown, so each page is tried as its last one.
+    A column begins with its dictionary, unless it holds Booleans. The first column has an
+    unknown number of pages, so each page in turn is tried as the last page of this column.
     """
     for first in accumulate(page.values for page in pages):
         rows, columns, at = first // model[0][5][1], [], 0
@@ -384,7 +384,10 @@ def _read_number(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _written(kind: int, value: Any) -> bytes:
-    """A value in Thrift's compact protocol; fields of structs are at most 15 numbers apart."""
+    """A value in Thrift's compact protocol.
+
+    The numbers of successive fields of a struct may differ by 15 at most.
+    """
     if kind in (_TRUE, _FALSE):
         return b""
     if kind == _BYTE:

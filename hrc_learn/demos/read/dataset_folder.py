@@ -216,7 +216,8 @@ def _episodes_v3(root: Path, info: dict) -> Iterator[EpisodeEntry]:
             row |= {name: integer(row[name], name, "meta/episodes") for name in columns}
             by_file.setdefault((row[columns[3]], row[columns[4]]), []).append(row)
     for numbers, rows in by_file.items():
-        # Once per file: following links takes longer than all other work on an episode.
+        # The path is found once per file, not once per episode: `path_in` follows links, which
+        # takes longer than all other work on an episode.
         there = dict(zip(places, numbers, strict=True))
         path = path_in(root, info.get("data_path"), "data_path", **there)
         first = min(row["dataset_from_index"] for row in rows)
@@ -279,7 +280,7 @@ def read_tasks(root: Path, info: dict) -> dict[int, str]:
 
 
 def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
-    """Complete statistics of the features, by episode index.
+    """Statistics of the features, by episode index; features with incomplete ones are left out.
 
     Raises:
         DatasetError: A file of statistics is damaged.
@@ -346,7 +347,7 @@ def select_episodes(
         folder: The dataset.
         episodes: Indices of the episodes; None for all, in their order.
         tasks: Select episodes of one of these tasks.
-        where: Select episodes for which this is true.
+        where: Select episodes for which this condition is true.
 
     Raises:
         DatasetError: An episode or task does not exist, or no episode is left.

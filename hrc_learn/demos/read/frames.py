@@ -29,7 +29,7 @@ def read_frames(
 
     Raises:
         DatasetError: A file or column is missing or damaged, a column is not as wide as
-            declared, or the rows are not those that the metadata promise.
+            declared, or the rows contradict the metadata.
     """
     yield from zip(entries, raising(read_each(folder, entries, keys)), strict=True)
 
@@ -57,8 +57,8 @@ def read_each(
         folder: The dataset.
         entries: Episodes wanted, in any order; the order on disk is the fastest.
         keys: Columns wanted; LeRobot's own index columns are added where they exist.
-        strict: Check that the rows are those that the metadata promise. False reads only the
-            wanted columns, without checks.
+        strict: Check the rows against the metadata. False reads only the wanted columns,
+            without checks.
     """
     for file, group in groupby(entries, key=lambda entry: entry.file):
         listed = list(group)
@@ -106,7 +106,7 @@ def _read_batch(
     keys: Sequence[str],
     strict: bool,
 ) -> Iterator[RawFrames | DatasetError]:
-    """Episodes of one file, read together; one by one if that fails."""
+    """Read episodes of one file together, or one by one if this fails."""
     first = min(entry.start for entry in entries)
     try:
         columns = _read_rows(folder, parquet, entries, keys)
@@ -223,7 +223,10 @@ def read_quantities(
 def _not_finite(
     entry: EpisodeEntry, quantities: Quantities, selections: Mapping[str, ColumnSelection]
 ) -> DatasetError | None:
-    """Error for a value that is not finite; such values of an invisible feature become 0."""
+    """Error for the first value that is not finite.
+
+    While the image feature is not visible, its values that are not finite become 0 instead.
+    """
     seen = quantities.get("feature_visible")
     for role, values in quantities.items():
         # If the sum is finite, all values are. The sum is far cheaper than a mask.
@@ -277,9 +280,9 @@ def frame_timestamps(
 ) -> Float64[np.ndarray, " frames"]:
     """Stamps of one episode [s].
 
-    A column of true stamps is preferred. LeRobot's own `timestamp` is frame / fps by
-    definition. If the values agree with this to the resolution of float32, frame / fps is
-    computed in float64 instead.
+    The column of measured times, `true_stamps`, is preferred. LeRobot's own `timestamp` is
+    frame / fps by definition. If its values agree with frame / fps to the resolution of
+    float32, the stamps are computed anew in float64.
 
     Raises:
         DatasetError: The stamps do not increase.

@@ -40,9 +40,9 @@ class Agreement:
     residual: float
     """Root mean square distance [m]."""
     other: float
-    """Residual of the joints as recorded, in rad or in deg, whichever fits better [m]."""
+    """Residual of the unchanged joints, read in rad or in deg, whichever fits better [m]."""
     change: str = ""
-    """Signs or order that differ from the record, in words."""
+    """Difference of signs or order from the recorded joints, in words."""
 
 
 def arm_columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
@@ -65,7 +65,7 @@ def arm_columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
 
 
 def _plain(name: str) -> str:
-    """A joint's name without case, separators and the word for its position."""
+    """A joint's name in lower case, without separators and a suffix such as `pos`."""
     return re.sub("[^a-z0-9]", "", re.sub(r"[._ ](pos|position|q)$", "", name.lower()))
 
 
@@ -160,7 +160,8 @@ def zero_offsets(
     some = np.unique(np.linspace(0, len(q) - 1, _FRAMES).astype(int))
     q, position = q[some], position[some]
     nothing, before = np.zeros(q.shape[1]), residual(arm, q, position)
-    # The weight, 1 mm at 0.1 rad, removes offsets that a moved tool explains equally well.
+    # An offset of 0.1 rad costs as much as a position error of 1 mm. This removes offsets that
+    # a displaced tool explains equally well.
     found = least_squares(
         lambda offset: np.append(_left(arm, q + offset, position), 1e-2 * offset), nothing
     ).x

@@ -160,7 +160,7 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
 def info_content(
     features: Mapping[str, dict], fps: float, robot_type: str, counts: Mapping[str, int]
 ) -> dict:
-    """Content of `meta/info.json`; `counts` are those of episodes, frames and tasks."""
+    """Content of `meta/info.json`; `counts` holds the numbers of episodes, frames and tasks."""
     has_video = any(feature["dtype"] == "video" for feature in features.values())
     return {
         "codebase_version": VERSION,

@@ -95,7 +95,7 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def meaning_of_component(name: str) -> ComponentMeaning | None:
-    """Meaning of a component by its name; None if the name alone does not tell."""
+    """Meaning of a component by its name; None if the name alone does not show it."""
     name = without_unit(name)[0]
     plain = name.strip().lower()
     pose = _meaning_in_pose(plain)

@@ -1,7 +1,8 @@
 """Robust statistics of one episode's columns, and of how the state follows the command.
 
 No statistic depends on a single value: sizes are quantiles, delays and slopes use all frames.
-The contract and the consistency checks compare these profiles over episodes.
+The contract (`contract`) and the consistency checks (`quality.consistency_checks`) compare
+these profiles over episodes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +24,8 @@ _MOST_FRAMES = 4000
 """Frames used to find a delay; the middle of a longer episode is enough."""
 _LONGEST_DELAY = 1.5
 """Largest delay considered [s]; no controller answers later."""
-# Negligible fraction of the variance. An error of a tenth of the motion causes 0.01.
+# Negligible fraction of the variance: an error of a tenth of the motion leaves 0.01
+# unexplained.
 _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
@@ -42,14 +44,14 @@ _SAME_UNIT, _LATE = np.log(2.0), 0.75
 """`_SAME_UNIT`: largest logarithm of the slope (a factor of 2) for a state that follows
 commanded positions. `_LATE`: largest delay of such a state [s]."""
 PROMPT = 0.2
-"""Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion that is
-delayed by more resembles the rate of the same motion."""
+"""Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion resembles
+its own rate of change if the delay is longer."""
 RATE_WINDOW = 0.2
-"""Time over which joint rates, and commands that they are compared with, are averaged [s]: a
-change from frame to frame is mostly noise."""
+"""Averaging time for joint rates and for the commands that are compared with them [s]. A change
+from frame to frame is mostly noise."""
 MOST_NAMED = 6
 """Largest number of components named in a message."""
-# Largest relative variance of a window in which a component rests: what rounding causes.
+# Largest relative variance of a window in which a component rests; rounding causes this much.
 _RESTING = 1e-10
 
 
@@ -151,7 +153,7 @@ def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
         noise=_middle(bends),
         held=_longest_hold(values),
         distinct=1 + (np.diff(ordered, axis=0) > 0).sum(0),
-        low=ordered[0].copy(),  # a view would keep all frames
+        low=ordered[0].copy(),  # a view would keep all frames in memory
         high=ordered[-1].copy(),
         at_ends=np.stack([(values == end).sum(0) for end in (ordered[0], ordered[-1])]),
         flat=(steps == 0).mean(0),
@@ -161,7 +163,7 @@ def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
 def _middle(
     values: Float64[np.ndarray, "frames components"],
 ) -> Float64[np.ndarray, " components"]:
-    """Median of each component: `np.median` takes ten times as long for a short episode."""
+    """Median of each component, ten times faster than `np.median` for a short episode."""
     places = (len(values) - 1) // 2, len(values) // 2
     ordered = np.partition(values, places, axis=0)
     return (ordered[places[0]] + ordered[places[1]]) / 2
@@ -219,9 +221,10 @@ class FeatureProfiles:
 
     @property
     def varied(self) -> Bool[np.ndarray, " components"]:
-        """Mask of components that are smooth, or whose extremes take many values.
+        """Mask of components that are smooth, or whose extremes take more than four values.
 
-        In short episodes, values such as pixels hardly change, but differ between episodes.
+        Values such as pixels may hardly change within short episodes, but their extremes differ
+        between episodes.
         """
         ends = np.sort(np.concatenate([self.stack("low"), self.stack("high")]), axis=0)
         return self.smooth | ((np.diff(ends, axis=0) > 0).sum(0) > 3)
@@ -281,9 +284,10 @@ def feature_profiles(
 
 
 def gain_over(tracking: Tracking, delay: int) -> float:
-    """Relative improvement of the episode's own delay over another delay, 0 to 1.
+    """Relative improvement of the fit at the episode's own delay over another delay, 0 to 1.
 
-    It is 0 if the other delay fits well too: delays of slow motions are hard to determine.
+    The improvement is 0 if the other delay fits well too: delays of slow motions are hard to
+    determine.
     """
     residual = tracking.residual
     other = residual[int(np.clip(len(residual) // 2 + delay, 0, len(residual) - 1))]
@@ -362,7 +366,7 @@ def _resting_offset(
 ) -> Float64[np.ndarray, " components"]:
     """Median of command minus state over the frames in which both hardly move."""
     span = np.maximum(np.ptp(state, axis=0), np.ptp(command, axis=0))
-    # Compared over five frames: a slow motion is no rest.
+    # Values are compared over five frames, so that a slow motion does not count as rest.
     still = np.maximum(
         *(np.abs(values[_REST:] - values[:-_REST]) for values in (command, state))
     ) <= _REST_MOTION * np.maximum(span, 1e-12)
@@ -403,7 +407,7 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
 def _means(
     values: Float64[np.ndarray, "frames components"], window: int
 ) -> Float64[np.ndarray, "_windows components"]:
-    """Means over `window` frames, from each frame on except for the last `window` frames."""
+    """Mean of `window` frames from each frame on, except for the last `window` frames."""
     sums = np.cumsum(values, axis=0)
     return (sums[window:] - sums[:-window] - values[window:] + values[:-window]) / window
 
@@ -411,7 +415,7 @@ def _means(
 def commanded_rates(
     trackings: Sequence[Mapping[str, Tracking]], fps: float
 ) -> tuple[Float64[np.ndarray, " components"], float] | None:
-    """Evidence that commands which have the names of positions are changes or velocities.
+    """Evidence that commands named as positions are changes or velocities.
 
     Args:
         trackings: Tracking in each episode, as `track_quantities` gives it.

@@ -34,8 +34,8 @@ columns of the rotation matrix, one after the other, and `rotation_6d_rows` its 
 `rotation_matrix` is flattened in row order; `pose_matrix` is a flattened 4x4 homogeneous
 transform."""
 SIZES: dict[str, list[tuple[float, str, float, str]]] = _TABLES["sizes"]
-"""Quantity whose unit is guessed by size -> rows of largest value, unit, confidence and second
-candidate."""
+"""Quantity whose unit is guessed from the size of its values -> rows of largest value, unit,
+confidence and second candidate."""
 
 ORIENTATION_ROLES: tuple[str, ...] = tuple(_TABLES["orientations"]["roles"])
 """Encodings of an orientation, preferred first."""

@@ -194,10 +194,10 @@ class OpenedDataset:
         place: UnitDecision,
         poses: Sequence[tuple[np.ndarray, np.ndarray]],
     ) -> dict[str, UnitDecision]:
-        """Decisions on joints and positions for which the kinematics agree; {} if none agree.
+        """Units of joints and positions that the kinematics confirm; {} if they confirm none.
 
         Args:
-            joints: Decision from the values of the joints.
+            joints: Decision on the joints, made from their values.
             place: Decision on the positions of the end effector.
             poses: Joint positions and positions of the end effector, as recorded.
         """
@@ -233,7 +233,7 @@ def _meaning_of_commands(
     trackings: Sequence[Mapping[str, profiles.Tracking]],
     fps: float,
 ) -> dict[str, UnitDecision]:
-    """Decisions that replace the old ones if the commands are not positions of the joints."""
+    """New decisions by role if the commands are not positions of the joints; else {}."""
     command, selection = decisions[_COMMAND], columns.selections[_COMMAND]
     if (found := profiles.commanded_rates(trackings, fps)) is None:
         if not selection.numbered or profiles.are_positions(trackings, fps):
@@ -263,8 +263,8 @@ def _meaning_of_commands(
     joints = decisions["joint_position"]
     if not columns.selections["joint_position"].numbered or len(units) >= FEWEST_JOINTS:
         return {_COMMAND: steps}
-    text = f"{joints.evidence}; {len(units)} columns without names that move by changes may be"
-    text += " a pose, which is read with --mapping position KEY[0:3]"
+    text = f"{joints.evidence}; the commands are changes, so these {len(units)} columns without"
+    text += " names may be a pose, which is read with --mapping position KEY[0:3]"
     return {_COMMAND: steps, joints.role: replace(joints, confidence=0.5, evidence=text)}
 
 
@@ -325,8 +325,8 @@ def load_demos(
             the arm instead of a unit.
         joint_names: Joints wanted, in the order wanted; None takes all in their order.
         tasks: Read only episodes that show one of these tasks.
-        where: Read only episodes for which this is true; it receives their `index`, `length`
-            and `tasks`. To select by content, use `DemonstrationSet.filter`.
+        where: Read only episodes for which this condition is true; it receives their `index`,
+            `length` and `tasks`. To select by content, use `DemonstrationSet.filter`.
 
     Raises:
         DatasetError: The dataset cannot be read; the message names file, episode, frame and key

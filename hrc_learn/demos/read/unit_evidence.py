@@ -23,8 +23,8 @@ ASSUMED = 0.95
 
 _BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES.items()}
 """Quantity -> unit -> largest value, with an allowance for noise."""
-# Largest joint angles in rad and in deg. Wrists may turn more than once. No demonstration in
-# degrees stays within 13 degrees.
+# Largest joint angles in rad and in deg. Wrists may turn more than once, so that the bound in
+# rad is about two turns, 13 rad. No demonstration in degrees stays within 13 degrees.
 _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
@@ -36,14 +36,15 @@ _RANGED = (0.045, 0.2)
 """Bounds of one encoder step in values from -100 to 100, for an encoder of 4096 steps a turn
 and joint ranges from a whole turn to a quarter turn."""
 _DYNAMIXEL = re.compile("koch|omx|aloha|widowx|viperx", re.IGNORECASE)
-"""Robot types with motors that reverse themselves; LeRobot reverses those of other makers."""
+"""Robot types with Dynamixel motors, which apply `drive_mode` themselves. For motors of other
+makers, LeRobot changes the sign of the values."""
 _SLIDE = 0.12
 """Longest stroke of a gripper's finger [m]."""
 # Old datasets of LeRobot name the columns of joints and of poses alike.
 _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
 _REVOLUTIONS = 0.5
-"""Largest value of unnamed joints that may count revolutions: few arms stay within half a
-radian."""
+"""Largest value for which joints without names may be in revolutions instead of rad: few arms
+stay within half a radian."""
 FEWEST_JOINTS, _POSE_AND_FINGERS = 5, 8
 """`FEWEST_JOINTS`: number of joints of the smallest usual arms.
 `_POSE_AND_FINGERS`: number of columns of a pose and two fingers."""
@@ -72,7 +73,7 @@ class Sizes(NamedTuple):
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
     step: Float64[np.ndarray, " components"] = np.zeros(1)
-    """Step of an encoder, of which all differences of values are multiples; 0 if none fits."""
+    """Encoder step: all differences of values are multiples of it; 0 if no step fits."""
 
 
 class Guess(NamedTuple):
@@ -133,7 +134,7 @@ def is_hobby_arm(robot_type: str, labels: Sequence[str]) -> bool:
 
 
 def read_calibration(file: Path) -> dict[str, tuple[float, bool]]:
-    """Range of each motor in a calibration of LeRobot [encoder steps], and its `drive_mode`.
+    """Range of each motor [encoder steps] and its `drive_mode`, from a calibration of LeRobot.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -176,7 +177,8 @@ def calibrated_units(
         text = f"has no {', '.join(missing)}; there are {', '.join(known)}"
         raise DatasetError(f"{text}: give the calibration of the robot recorded", file=file)
     spans, hands = (np.array(x) for x in ([known[n][0] for n in names], [*map(is_hand, names)]))
-    # Encoder steps in each recorded step; LeRobot stores grippers as 0..100.
+    # Number of encoder steps in one step of the recorded values, which span 200 units, or 100
+    # for grippers: LeRobot stores grippers as 0..100.
     steps = np.broadcast_to(sizes.step, len(names)) * spans / np.where(hands, 100, 200)
     other = (steps > 0) & (np.abs(steps - np.maximum(np.rint(steps), 1)) > 5e-3 * steps)
     if (beyond := sizes.peak > _CLIP + 0.05).any():
@@ -301,7 +303,7 @@ def guess_fingers(
 
 
 def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: bool) -> Guess:
-    """The guess, less certain if columns without clear names may hold no joints at all.
+    """The guess, less certain if columns without clear names may not be joints at all.
 
     Args:
         guess: Unit, if the columns are joints.

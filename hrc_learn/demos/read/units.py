@@ -1,7 +1,8 @@
 """Units of a dataset's values: given by the caller, declared, or guessed from evidence.
 
-LeRobot declares no units, and radians, degrees, encoder ticks and -100..100 all occur. A name
-that states a unit decides; else the values and the type of the robot are the evidence.
+LeRobot declares no units, and radians, degrees, encoder ticks and -100..100 all occur. If the
+name of a column states a unit, this unit is used. Otherwise, the values and the type of the
+robot are the evidence. The quantities are named by their roles (see `quantities.ROLES`).
 """
 
 import math
@@ -51,7 +52,7 @@ class UnitDecision:
     other: str = ""
     """Second candidate for the unit; "" if there is none."""
     leader: str = ""
-    """Other quantity that gives this quantity its unit; "" if there is none."""
+    """Other quantity from which this quantity takes over its unit; "" if there is none."""
 
     @property
     def factor(self) -> float | Float64[np.ndarray, " components"]:
@@ -260,7 +261,10 @@ def _guess(
 
 
 def _with_command(joints: Sizes, command: Sizes) -> Sizes:
-    """Sizes of joints and commands: commands are clipped at 100 where joints stop earlier."""
+    """Sizes of joints and commands together.
+
+    Commands reach the limit of 100 and are clipped there even where joints stop earlier.
+    """
     if len(command.peak) != len(joints.peak):
         return joints
     near = (joints.peak > 90) & (command.peak > 90)
@@ -281,7 +285,7 @@ def _guess_joint_units(
     hand[-1] |= sizes.opening[-1] and not sizes.opening.all()
     stated = np.array([bool(unit) for unit in named])
     guess = unit_evidence.guess_joints(sizes, ~hand & ~stated, labels, robot_type)
-    # The key of a whole feature may tell its content, such as `qpos`.
+    # The key of a whole feature, such as `qpos`, may show its content.
     unnamed = selection.numbered and role_of_key(selection.columns[0][0]) is None
     guess = unit_evidence.doubt_meaning(guess, sizes, labels, unnamed)
     fingers = unit_evidence.guess_fingers(
@@ -330,7 +334,7 @@ def units_from_episodes(
         selections: Columns of the quantities.
         episodes: Episodes in the units on disk.
         fps: Frame rate [1/s].
-        declared: Units from the sidecar, as in `decide_units`.
+        declared: Units from the sidecar, in the form of `stated` in `decide_units`.
         given: Units from the caller, which take precedence; for joints, also calibration files.
         sample: Indices of the episodes that decide; None for all.
         robot_type: Robot type of the dataset, "" if unknown.
