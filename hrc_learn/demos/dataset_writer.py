@@ -33,10 +33,10 @@ class DatasetWriter:
             ...
             writer.save_episode()
 
-    Saved episodes wait in `ROOT.recording/`; `finalize`, which the end of the `with` block
-    calls, turns them into the dataset in one step. If the recording is interrupted, by an
-    exception or a kill, the saved episodes stay there, and `recover_dataset` makes a dataset
-    of them or appends them to the dataset being extended.
+    Saved episodes are kept in the folder `ROOT.recording/`. The end of the `with` block calls
+    `finalize`, which turns them into the dataset in one step. If an exception or a kill
+    interrupts the recording, the saved episodes stay in this folder, and `recover_dataset`
+    makes a dataset of them or appends them to the dataset being extended.
 
     Attributes:
         root: Folder of the dataset.

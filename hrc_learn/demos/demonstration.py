@@ -266,7 +266,7 @@ class DemonstrationSet(Sequence[Demonstration]):
         return self._like([demo for demo in self if wanted(demo)])
 
     def map(self, change: Callable[[Demonstration], Demonstration]) -> "DemonstrationSet":
-        """The set with every demonstration changed, such as by a step of `preprocessing`."""
+        """The set with `change`, such as a step of `preprocessing`, applied to each item."""
         return self._like([change(demo) for demo in self])
 
     def padded(self) -> PaddedDemonstrations:

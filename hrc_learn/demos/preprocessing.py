@@ -26,7 +26,7 @@ def local_polynomial(
     This generalises the filter of Savitzky and Golay (1964) to the uneven stamps of robots and
     cameras: each fit uses the same number of neighbours at their true times. Near the ends, the
     first and last full windows are used. On even stamps, the result equals that of the original
-    filter. A polynomial of the given degree passes unchanged.
+    filter. Samples of a polynomial of the given degree are returned unchanged.
 
     Args:
         time: Increasing stamps [s].
@@ -151,7 +151,7 @@ def estimate_twist(
     """Linear [m/s] and angular [rad/s] velocity of the end effector, in the base frame.
 
     The angular velocity is 2 q' q*, from the quaternion q, its time derivative q' and its
-    conjugate q*; polynomials are fitted to the components of q. The motion found does not
+    conjugate q*; polynomials are fitted to the components of q. The estimated motion does not
     depend on the choice of the base frame.
 
     Args:
@@ -197,7 +197,7 @@ def resting(demo: Demonstration) -> Bool[np.ndarray, " _frames"]:
     speed = np.linalg.norm(rates, axis=1) if joints is None else np.abs(rates).max(1)
     low, high = _LINEAR_REST if joints is None else _JOINT_REST
     state = np.where(speed > high, 1, np.where(speed < low, -1, 0))
-    # The arm counts as moving before the first clear state.
+    # The arm counts as moving until its speed first shows clearly that it moves or rests.
     last = np.maximum.accumulate(np.where(state != 0, np.arange(len(demo)), -1))
     still = np.where(last >= 0, state[last], 1) < 0
     for start, stop in _runs(still):
@@ -494,11 +494,13 @@ def warp(
 _BAND = 0.2
 """Largest difference in timing, as a fraction of the duration."""
 _VELOCITY_WINDOW = 0.1
-"""Width of the neighbourhood for times and velocities [s]."""
+"""Width of the neighbourhood for smoothing warped times and for estimating velocities [s]."""
 
 
 def align(demos: DemonstrationSet) -> DemonstrationSet:
-    """Warp every demonstration to the timing of a reference: that of median duration.
+    """Warp every demonstration to the timing of the demonstration of median duration.
+
+    This demonstration is the reference.
 
     Time warping compares the joint positions, each scaled by its range over all demonstrations.
     Without joints, it compares the positions and the orientations of the end effector, scaled

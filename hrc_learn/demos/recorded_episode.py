@@ -20,8 +20,9 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
 
 TIME_KEY = "time"
-"""Feature that holds the true stamps. It is not called `observation.time`: policies would take
-such a feature as an input, which no robot provides."""
+"""Feature that holds the true stamps, measured at recording, whereas LeRobot's `timestamp` is
+frame / fps. It is not called `observation.time`: policies would take such a feature as an
+input, which no robot provides."""
 _METADATA_KEY = b"hrc_learn"
 
 Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]

@@ -262,7 +262,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     whole = replace(whole, fields=fields, notes=tuple(notes))
     if parts == [(start, stop)]:
         return [whole]
-    shown = whole.notes  # they concern the whole bag: only the first part shows them
+    shown = whole.notes  # notes concern the whole bag, so only its first part shows them
     return [
         replace(whole, label=f"part {k}", fields=_during(fields, a, b), notes=shown * (not k))
         for k, (a, b) in enumerate(parts)
@@ -270,7 +270,7 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
 
 
 def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
-    """For each gap, times of the last message before and of the first message after it [s]."""
+    """Times of the last message before and of the first message after each gap [s]."""
     steps = np.diff(time)
     if not len(steps):
         return [(-np.inf, np.inf)]

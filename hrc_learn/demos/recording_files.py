@@ -121,10 +121,10 @@ class Recording:
         return column_places(role, text, self.fields, self.file)
 
     def clock_of(self, name: str, preferred: str = "") -> str:
-        """Field that holds the stamps of another field; "" if none has as many frames.
+        """Field of stamps for the field `name`; "" if no field of stamps has as many frames.
 
-        Stamps named after the field come first, then those of the same group, those of an
-        enclosing group, and the preferred field.
+        If there are several, stamps with a similar name are chosen first, then stamps in the
+        same group, then stamps in an enclosing group, then the field `preferred`.
         """
         if self.fields[name].clock:
             return self.fields[name].clock

@@ -125,7 +125,8 @@ class ImportPlan:
     def _tokens(self, places: Sequence[Place]) -> list[str]:
         """Fields and ranges of fields, such as "qpos[0:6]", that stand for the columns."""
         fields, tokens = self.recordings[0].fields, []
-        # Within a run, the component index increases with the place in the list.
+        # A run is a range of one field: its component indices increase with the place in the
+        # list, so that their difference is constant.
         runs = groupby(enumerate(places), key=lambda one: (one[1][0], one[1][1] - one[0]))
         for (name, _), run in runs:
             indices = [index for _, (_, index) in run]

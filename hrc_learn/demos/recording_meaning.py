@@ -1,7 +1,8 @@
 """Meaning of the fields of recordings, from the caller's options, their names and their values.
 
 Names and units are judged as for datasets (`read.columns`, `read.units`). Fields that are not
-understood are left out and listed; a state or an action among them is kept as recorded.
+understood are left out and listed. Only a state or an action that is not understood is kept as
+recorded.
 """
 
 import re
@@ -32,7 +33,8 @@ _REACH = 5.0
 _ANGLES = re.compile(r"(?:^|[._])r_?x$", re.IGNORECASE)
 _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 """`_CHECKED_EPISODES`: approximate number of episodes in which commands are compared with
-joints. `_CHECK_RATE`: frame rate of the comparison [1/s] for topics and where none is known."""
+joints. `_CHECK_RATE`: frame rate of the comparison [1/s] for topics, and for recordings whose
+rate is unknown."""
 _ALIKE = 0.3
 """Ratio of the distances from a joint to the nearest and to the second nearest unnamed command.
 The order of the commands is clear if the ratio of every joint is smaller."""

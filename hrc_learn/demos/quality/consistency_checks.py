@@ -33,7 +33,8 @@ _IMPOSSIBLE = 1e12
 _IMPLAUSIBLE = 1e3
 """Multiple of the usual size that no sensor reports."""
 _FAR_OFF = 3.0
-"""Distance from the other episodes, in spreads, above which an episode is examined."""
+"""Distance from the other episodes, as a multiple of the spread over episodes, above which an
+episode is examined."""
 _HALF_TURN = 0.9 * np.pi
 """Length of a rotation vector [rad] above which small motions can flip its sign."""
 _SATURATED = 0.25
@@ -104,7 +105,8 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
     held, frames = feature.stack("held"), feature.lengths
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
-    # A large part of the episode, long for this component, and longer than a short pause.
+    # A component froze if it rests for a large part of the episode, for much longer than usual,
+    # and for longer than a short pause.
     frozen = (fraction > 0.1) & (fraction > 5 * usual + 0.02)
     frozen &= (held > max(10, 0.3 * feature.fps)) & feature.smooth
     frozen &= feature.median("span") > 0
@@ -125,7 +127,7 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     noisy = (noise > 10 * feature.median("noise")) & (noise > 0.005 * span) & moving
     frames = feature.lengths[:, None]
     levels = feature.stack("distinct") / frames
-    # A fifth of the usual levels: values were rounded or the encoder lost bits.
+    # Fewer than a fifth of the usual levels: values were rounded, or the encoder lost bits.
     coarse = (levels < 0.2 * np.median(levels, axis=0)) & moving
     coarse &= feature.stack("held") / frames < 0.1  # a component at rest is not coarse
     for odd, what in ((noisy, "is far noisier"), (coarse, "has far fewer levels")):
@@ -208,7 +210,7 @@ def _permuted(
     # The bound keeps one outlier from deciding the whole assignment.
     _, best = linear_sum_assignment(np.minimum(cost, 50))
     # Keep cycles of the permutation in which every component is far from its usual values. If
-    # only some components are far, they resemble the others by chance.
+    # only some components of a cycle are far, the cycle arose by chance.
     cyclic, after = best != np.arange(len(best)), best
     for _ in best:
         cyclic &= off[after] > _FAR_OFF
@@ -258,7 +260,7 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
 
     These are quaternions, and rotation vectors near half a turn in any episode.
     """
-    # The meaning of `object.qy`, a name that is not of the arm, is that of `qy`.
+    # The last part of a name decides: `object.qy` has the meaning of `qy`.
     meanings = [meaning_of_component(name.rpartition(".")[2]) for name in feature.names]
     roles = np.array([meaning.role if meaning else "" for meaning in meanings])
     vectors = roles == "rotation_vector"
@@ -333,7 +335,7 @@ def command_offsets(
     parts = zip(offsets.T, command.labels, state.columns, np.rad2deg(factors), strict=True)
     for own, name, (key, index), degrees in parts:
         found = np.flatnonzero(np.isfinite(own))
-        # Hands that hold an object, and flags, do not reach their command.
+        # A hand that holds an object does not reach its command, and flags have no offset.
         if not len(found) or key not in spans or is_hand(name):
             continue
         usual, least = float(np.median(own[found])), _OFFSET * float(spans[key][index])

@@ -225,7 +225,7 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
 
 
 def _while_all_rest(edit: EpisodeEdit, first: int, last: int) -> tuple[int, int]:
-    """First and last frame to keep: all state and action columns rest before and after them."""
+    """First and last frame to keep; all state and action columns rest outside this range."""
     for key, values in edit.frames.items():
         if not key.startswith(("observation.", "action", "state")) or is_clock(values):
             continue
@@ -274,7 +274,8 @@ def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
     """Remove jumps by whole turns from joints, Euler angles and rotation vectors.
 
     Only measurements of the arm change: commands, hands, grippers and switches stay as they
-    are. A joint also stays as it is if its command jumps, so that the two agree.
+    are. If the command of a joint jumps, the joint also stays as it is, so that joint and
+    command still agree.
     """
     quantities = edit.quantities
     for role in (*_MEASURED_ANGLES, "rotation_vector"):
@@ -309,8 +310,10 @@ def _turns(
 ) -> Float64[np.ndarray, "frames columns"]:
     """Whole turns by which each value has jumped since the first frame.
 
-    A jump counts only if its remainder fits the motion before and after. A signal that switches
-    between -3 and 3 rad leaves a remainder of 0.28 rad, but otherwise rests: it does not turn.
+    The remainder of a jump is its difference from a whole number of turns. A jump counts only
+    if its remainder fits the motion before and after the jump. For example, a signal that
+    switches between -3 and 3 rad leaves a remainder of 0.28 rad, but rests before and after:
+    it does not turn.
     """
     steps = np.diff(values, axis=0)
     whole = np.rint(steps)
@@ -346,8 +349,8 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     are interpolated as they are: unwrap them first. Stamps must increase.
 
     Raises:
-        DatasetError: The episode is shorter than a period. Or it holds commands that are
-            changes per step, or poses as matrices, which cannot be interpolated.
+        DatasetError: The episode is shorter than a period, or it holds values that cannot be
+            interpolated: commands that are changes per step, or poses as matrices.
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 

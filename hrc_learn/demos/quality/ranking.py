@@ -152,7 +152,7 @@ def _one_of_each_kind(
 def _demonstrations(
     root: Path, qualities: Mapping[int, EpisodeQuality], progress: Progress | None
 ) -> Iterator[tuple[EpisodeQuality, Demonstration]]:
-    """Readable episodes, one at a time; the errors of all others are added to their doubt."""
+    """Readable episodes, one at a time; the error of any other episode adds to its doubt."""
     dataset = open_dataset(root)
     entries = dataset.folder.episodes
     # Faults are ignored here: the check reports episodes whose units differ from the rest.
@@ -268,7 +268,8 @@ def _principal_components(
     # A component that rests in most episodes must not dominate.
     scale = np.maximum(scale, 0.05 * scale.max())
     centred = ((columns - np.median(columns, axis=0)) / scale).reshape(len(shapes), -1)
-    # Without a bound, here twenty ranges, outliers would determine all principal components.
+    # Values are clipped at twenty ranges. Otherwise, outliers would determine all principal
+    # components.
     left, sizes, _ = np.linalg.svd(np.clip(centred, -20, 20), full_matrices=False)
     return (left * sizes)[:, :_DIMENSIONS] / np.sqrt(_PHASES)
 

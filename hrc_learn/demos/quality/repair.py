@@ -312,7 +312,7 @@ class _Repair:
         self.dataset, self.folder, self.kept = dataset, dataset.folder, kept
         self.options, self.tasks = options, copying.listed_tasks(dataset.folder)
         self._regular = True
-        """True if the increasing stamps of LeRobot are 1/fps apart in all episodes."""
+        """True if LeRobot's stamps, where they increase, are 1/fps apart in all episodes."""
         self.decisions, faults = dataset.units_from(self._readable(), units)
         self.finished = False
         """True if the recorder was killed, so that episodes may lack their videos."""

@@ -36,7 +36,7 @@ _PLACEHOLDERS = (
     *("test", "testing", "asdf", "todo", "tbd", "n/a", "na", "none", "null", "xxx", "foo"),
     *("task", "demo", "placeholder", "untitled"),
 )
-"""Task texts that were typed only to skip the question."""
+"""Task texts that were typed only to skip the recorder's question for the task."""
 
 
 def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
