@@ -62,8 +62,8 @@ from hrc_learn.vision.markers import as_grey
 # background image.
 _FRAMES, _STARTS, _USUAL = 72, 10, 31
 # `_SHORTEST`: fewest frames in which a track is seen.
-# `_STILL`: least median distance of a track's pixels from their median, and between two tracks
-# to which cameras are fitted [px at an image width of 1440].
+# `_STILL`: least median distance of a track's pixels from their median; also the least median
+# distance between two tracks to which cameras are fitted [px at an image width of 1440].
 # `_TRIED`: largest number of tracks to which cameras are fitted.
 # `_ENOUGH`: number of explained tracks at which the search for a camera stops.
 # `_AGREES`: error below which a pixel agrees with the camera [px at an image width of 1440].
@@ -79,8 +79,8 @@ _FOLLOWED = 320
 # Largest width of one image in the picture of the findings [px].
 _TILE = 720
 # `_DEEPEST`: length of the line ahead of the tool on which the object lies when a demonstration
-# ends [m]. `_CLEAR`: images of each demonstration from which the object is learned: those in
-# which the tool is farthest from the object.
+# ends [m]. `_CLEAR`: number of images of each demonstration from which the object is learned;
+# in these images, the tool is farthest from the object.
 _DEEPEST, _CLEAR = 0.25, 7
 
 
@@ -260,7 +260,7 @@ class _Search:
                 for finding in filter(None, (tools[k], item)):
                     draw_finding(image, finding)
                 tiles.append(image[::smaller, ::smaller])
-            # A single image with the tool is the first and the last one.
+            # If only one image shows the tool, this image is both the first and the last.
             rows.append(np.hstack((tiles * 2)[:2]))
         return np.vstack(rows)
 
@@ -400,7 +400,8 @@ def _tool(
     points = points[agrees]
     place = np.median(points, axis=0)
     if link.axis is not None:
-        # Use the nearest point on the axis of the last joint: the last joint does not move it.
+        # Use the nearest point on the axis of the last joint, because a motion of this joint
+        # does not move the point.
         origin, direction = link.axis
         place = origin + ((place - origin) @ direction) * direction
     f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
@@ -466,8 +467,8 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
     end = _pose_of(demo)[-1]
     depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)[:, None]
     points = end.position + depth * quaternion.to_matrix(end.orientation)[:, 2]
-    # `marker_pixels` projects a marker on the tool. A marker at the origin of the tool frame
-    # and poses at the points give the pixels of the points.
+    # `marker_pixels` projects a marker that is fixed to the tool. Here, the marker lies at the
+    # origin of the tool frame, and the tool is placed at each of the points.
     bare = torch.cat([camera[:10], camera.new_zeros(3)])
     return marker_pixels(bare, Pose(points, end.orientation.expand(len(depth), 4)))[0].numpy()
 

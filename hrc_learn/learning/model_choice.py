@@ -1,7 +1,8 @@
 """Choose the model that predicts held-out demonstrations best (see `dmp.learned_motion`).
 
 A model predicts a motion from its context: values known before the motion, by default its
-start and goal.
+start and goal. The simplest model is the mean primitive. Models are chosen by channel: for the
+joints and for the position of the end effector.
 """
 
 from collections.abc import Sequence
@@ -45,7 +46,7 @@ def contexts(
 
     Args:
         demos: Demonstrations.
-        columns: Columns whose first row is the context. Default: start and goal.
+        columns: Columns whose first row is the context. If empty: start and goal.
         motions: The same demonstrations, padded.
         channel: Channel of start and goal.
 
@@ -115,7 +116,7 @@ def keep_best(
 
 
 def best_models(folder: Path) -> dict[str, str]:
-    """Kind of the best model by channel, without the channels for which the mean is best.
+    """Kind of the best model by channel, without channels for which the mean primitive is best.
 
     Raises:
         ValueError: The file is damaged.

@@ -26,15 +26,15 @@ DT = 0.02
 _DEVIATION = 2e-3
 """Largest distance of a joint from the planned path [rad]: 1 mm at a lever of 0.5 m."""
 _KINDS = "velocity", "acceleration"
-"""Limits checked on the planned path; the motion filter enforces the jerk limit."""
+"""Limits checked on the planned path; the limit of jerk is enforced by `MotionFilter`."""
 # `_SLOWER`: factor on the duration if the jerk limit distorts the path. `_ATTEMPTS`: durations
 # tried.
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
 """Longest time that a motion may take to settle after the end of its path [s]."""
 _TURNS = 30
-"""Steps of inverse kinematics that turn an arm of fewer than six joints to an orientation,
-which the arm may not reach."""
+"""Number of steps of inverse kinematics that bring the tool of an arm of fewer than six joints
+as near to an orientation as possible."""
 _MISSED = 1e-3
 """Smallest error of a pose that counts as out of reach [m, rad]."""
 
@@ -175,7 +175,8 @@ def _planner(
 ) -> tuple[str, Callable[[float], Float[Tensor, "samples joints"]]]:
     """Channel that plans the motion, and a function that maps duration [s] to joint path [rad].
 
-    The path follows the tool's primitive by inverse kinematics, or else the joints' primitive.
+    For a goal of the tool, the path follows the tool's primitive by inverse kinematics if the
+    model has such a primitive. Otherwise, the path follows the joints' primitive.
     """
     tool = "pose" if model.pose is not None else "position"
     if goal.joints is None and tool in model.primitives:
@@ -185,7 +186,7 @@ def _planner(
         raise ValueError(
             f"{model.folder} holds no primitive of joints: give --goal position or pose."
         )
-    usual = model.in_rad(robot, model.joint.goal)  # rejects units without a fixed size first
+    usual = model.in_rad(robot, model.joint.goal)  # raises if the unit has no fixed size
     if goal.joints is None:
         end = _joints_at(model, robot, goal, usual, robot.forward(usual))
     else:
@@ -226,7 +227,8 @@ def _joint_path(
 def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration: float) -> Pose:
     """Poses of the end effector, starting at rest.
 
-    A model of positions has the goal's orientation throughout, or else no rotation.
+    With a model of positions, the orientation is constant: that of the goal, or the identity if
+    the goal has none.
     """
     time, pose = _times(duration), model.pose
     assert goal.position is not None
@@ -258,8 +260,8 @@ def _joints_along(
     """Joint positions [rad] along the model's poses, starting at the joints `first` [rad].
 
     In the null space, the arm moves towards the joint positions of the model's goal. An arm of
-    fewer than six joints moves towards joint positions that turn the tool to the goal's
-    orientation.
+    fewer than six joints moves towards joint positions that turn the tool as near to the goal's
+    orientation as possible.
     """
     begin = robot.forward(first)
     start = Target(position=begin.position, orientation=begin.orientation)
@@ -308,7 +310,8 @@ def _joints_at(
 ) -> Float[Tensor, " joints"]:
     """Joint positions [rad] that reach a target, near the joint positions `near` [rad].
 
-    An arm of fewer than six joints reaches the position, and comes near the orientation.
+    An arm of fewer than six joints reaches the position, and comes as near to the orientation
+    as it can.
     """
     pose = _completed(target, usual)
     free = target is not None and target.orientation is None and model.pose is None

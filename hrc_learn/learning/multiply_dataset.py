@@ -54,8 +54,9 @@ type Place = tuple[str, int]
 class _Lead(NamedTuple):
     """Lead of commands over measured positions.
 
-    An arm lags behind its commands by some frames, and deviates from them by an offset that is
-    linear in its position, within the range of the demonstrations.
+    An arm lags behind its commands by some frames, and deviates from them by an offset. The
+    offset is a linear function of the position, limited to the range of offsets in the
+    demonstrations.
     """
 
     frames: int = 1
@@ -111,7 +112,7 @@ class MultipliedColumns:
             taught: Arm of the demonstrations.
             robot: Arm of the new motions.
             objects: Name of an object -> columns of its pose as FEATURE[FIRST:STOP]; only
-                needed for objects that the names of the columns do not reveal.
+                needed for objects that cannot be found by the names of the columns.
 
         Raises:
             ValueError: Columns in `objects` do not exist, or do not form a pose.
@@ -135,7 +136,8 @@ class MultipliedColumns:
             self._places[f"object {name}"] = places
             first = np.stack([self._first(places, main) for main in range(len(source))])
             self.objects[name] = pose_of(torch.from_numpy(first))
-        # A commanded tool pose leads the tool pose of the next frame as demonstrated.
+        # Actions with the names of tool columns are commanded tool poses. They lead the tool
+        # poses, as in the demonstrations (see `_Lead`).
         shown = {
             self._old[k].component(i): (r, n)
             for r in _TOOL
@@ -184,7 +186,7 @@ class MultipliedColumns:
                 raise ValueError(f"{key} ({self._old[key].component(i)}) {text}")
 
     def _find_lead(self) -> _Lead:
-        """Lead of commanded tool positions; that of another arm is the next frame."""
+        """Lead of commanded tool positions; one frame if another arm was demonstrated."""
         sent = {n: (key, i) for key, i, role, n in self._next if role == "position"}
         if not self._same or len(sent) < 3:
             return _Lead()
@@ -209,7 +211,11 @@ class MultipliedColumns:
         return int(np.argmax(scores))
 
     def _gripper_phase(self, phase: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-        """Fractional frames of gripper commands: a slower motion does not slow the gripper."""
+        """Fractional frames of gripper commands.
+
+        Commands precede the opening by the lag of the gripper, which stays the same in a slower
+        motion.
+        """
         later = np.arange(len(phase)) + self._lag
         beyond = (later - len(phase) + 1).clip(min=0)
         return (phase[later - beyond] + beyond - self._lag).clip(min=phase[0])
@@ -297,7 +303,9 @@ class MultipliedColumns:
     def object_paths(
         self, made: NewMotion, scene: Mapping[str, Float[np.ndarray, "7"]]
     ) -> dict[str, Float[np.ndarray, "T 7"]]:
-        """Pose of each object over time: it moves with the tool where the demonstrated one did.
+        """Pose of each object over time.
+
+        An object moves with the tool while the demonstrated object moves.
 
         Args:
             made: Motion in a new scene.

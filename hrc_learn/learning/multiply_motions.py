@@ -5,8 +5,8 @@ pose primitive in the frame in which the segment's final poses agree best over t
 demonstrations: an object's frame, a frame at the object that does not turn with the object, or
 the base frame. In a new scene, the primitives of all demonstrations are averaged with random
 weights, and move with their frames. A segment begins with the final pose and velocity of the
-previous segment. Over the part in which the demonstrations still differ, it joins its own path
-along a minimum-jerk curve.
+previous segment. While the demonstrations still differ, a minimum-jerk curve leads from this
+pose to the segment's own path.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Segmentation:
     """Frame of each segment: "base", an object, or "OBJECT position" for a frame at the object
     that does not turn with it."""
     cuts: dict[int, tuple[int, ...]]
-    """By episode: first frame of each segment, then the last frame of the last segment."""
+    """Cuts by episode: first frame of each segment, then the last frame of the last segment."""
 
     def rows(self, demos: Sequence[Demonstration]) -> list[tuple[str, ...]]:
         """Table of the segments, with a header: frame of each segment, times by episode [s]."""
@@ -297,8 +297,8 @@ def _turned(frame: Pose, twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
 def _stopped(s: Float[Tensor, "B T"], part: float) -> Float[Tensor, "B T"]:
     """Progress of a motion of unit duration that comes to rest in its last part.
 
-    That part takes twice its time: with u from 0 to 1, its progress is 2 u - 2 u^3 + u^4, whose
-    acceleration is zero at both ends.
+    Because of the stop, this part takes twice as long. Within the part, while u goes from 0 to
+    1, the progress is 2 u - 2 u^3 + u^4, whose acceleration is zero at both ends.
     """
     u = ((s - 1 + part) / (2 * part)).clamp(0, 1)
     return torch.where(u > 0, 1 - part + part * (2 * u - 2 * u**3 + u**4), s)
@@ -308,8 +308,8 @@ def _stopped(s: Float[Tensor, "B T"], part: float) -> Float[Tensor, "B T"]:
 def _free_fraction(dmp: PoseDMP) -> float:
     """Fraction of a segment after which the demonstrations agree in its frame.
 
-    Before that, the demonstrations come from different positions, so a new motion may come from
-    yet another position.
+    Before this point, the demonstrations come from different positions, so a new motion may
+    come from yet another position.
     """
     s = torch.linspace(0, 1, _COMPARED, dtype=torch.float64)
     position = dmp.rollout(s * dmp.duration[:, None]).position
@@ -419,9 +419,9 @@ class MotionSource:
             poses = self.poses(part)
             q, missed = self._joint_paths(part, poses)
             factor, limit = self.robot.limits.excess(q, 1 / self.fps)
-            # The joints of a motion that does not reach its poses may jump, whatever its speed.
             factor = (factor / _USABLE).clamp(max=_JUMP)
-            # Such a motion is slowed down and retried only once.
+            # If a motion does not reach its poses, its joints may jump at any speed. Such a
+            # motion is slowed down and retried only once.
             again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
             where = _collisions(self.robot, self.obstacles, q[~again])
             for k in (~again).nonzero()[:, 0].tolist():
@@ -511,9 +511,10 @@ class MotionSource:
 def _followed(
     robot: Arm, path: Pose, start: Float[Tensor, "*rows joints"], wish: Tensor | None = None
 ) -> tuple[Float[Tensor, "T *rows joints"], Float[Tensor, "T *rows"]]:
-    """Joint positions along poses [rad], and errors [m or rad]; as `follow_poses` otherwise.
+    """Joint positions along poses [rad], and errors [m or rad], as `follow_poses` returns them.
 
-    Fewer than six joints reach the positions, with orientations up to `_TURNED` away.
+    For an arm of fewer than six joints, the error is that of the position alone as long as the
+    error of the orientation is below `_TURNED`.
     """
     q, error = follow_poses(robot, path, start, wish)
     if robot.joints < 6:
@@ -525,7 +526,7 @@ def _followed(
 def _collisions(
     robot: Arm, obstacles: Float[Tensor, "boxes 6"], q: Float[Tensor, "B T joints"]
 ) -> list[str]:
-    """For each motion, its collision with the arm itself or a box in words; empty: none."""
+    """Collision of each motion with the arm itself or with a box, in words; empty if none."""
     q, (centre, half) = q[:, ::_CHECKED], obstacles.split(3, dim=-1)
     frames = robot.link_frames(q)
     hit = (robot.whole.self_distance(q, frames) < 0).any(-1)

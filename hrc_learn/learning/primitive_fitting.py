@@ -58,9 +58,9 @@ shape."""
 _LEAST_MOTION = 1e-4
 """Smallest motion above the noise of encoders and trackers [rad, m, quaternion components]."""
 HELD_AT_ONCE = 700_000
-"""Largest number of values of a channel in memory: demonstrations times frames of the longest
-one times columns (joints, at least the 7 of a pose). Fitting them and comparing models takes up
-to 300 MB."""
+"""Largest number of values of a channel in memory. This is the number of demonstrations, times
+the frames of the longest demonstration, times the columns (number of joints, but at least the 7
+of a pose). Fitting so many values and comparing models takes up to 300 MB."""
 LONGEST = 5_000
 """Largest number of frames of a demonstration in a sample; enough for 100 basis functions."""
 
@@ -95,7 +95,7 @@ class Motions:
         """Pad demonstrations to one batch.
 
         A Panda's end-effector pose is computed from its joints, unless a position or an
-        orientation was recorded, which may refer to another frame.
+        orientation was recorded: the recorded values may refer to another frame.
 
         Raises:
             ValueError: A demonstration has no motion, or values that are not finite.
