@@ -179,8 +179,8 @@ class CameraModel:
         p, still, lens = self.to_camera(point), np.zeros(3), np.array(self.distortion)
         if not p.size:  # OpenCV returns nothing
             return np.zeros((*p.shape[:-1], 2, 6))
-        # The derivative by a common shift of all points is, for each pixel, the derivative by a
-        # shift of its point.
+        # OpenCV differentiates by a translation that all points have in common. For each pixel,
+        # this equals the derivative by a translation of its own point.
         _, slope = cv2.projectPoints(p.reshape(-1, 3), still, still, self.matrix, lens)
         slope = np.asarray(slope[:, 3:6], dtype=float).reshape(*p.shape[:-1], 2, 3)
         J_point = slope @ self.pose[:3, :3].T

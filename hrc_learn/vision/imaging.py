@@ -1,6 +1,6 @@
 """Realistic images, with lens distortion, blur and sensor noise, and a camera without OpenGL.
 
-The camera draws only markers, by exact ray casting into a static background. Markers are enough
+The camera draws only markers, by exact ray casting, on a static background. Markers are enough
 for visual servoing, and drawing them takes a fraction of a renderer's time. Sweeps and machines
 without OpenGL use this camera in place of the simulator's.
 """
@@ -105,7 +105,8 @@ def pixel_rays(model: CameraModel) -> Float32[np.ndarray, "h w 2"]:
     return _rays((model.height, model.width), model.focal, model.principal, model.distortion)
 
 
-# The cameras of a study differ only in pose: reuse the rays, which take half a second.
+# The cameras of a study differ only in pose: reuse the rays, whose computation takes half a
+# second.
 @lru_cache(maxsize=4)
 def _rays(
     shape: tuple[int, int],
@@ -122,7 +123,8 @@ MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 """Returns the pose of each marker now, by its id: p_base = pose @ p_marker."""
 
 
-# Texture resolutions [px per module], one octave apart: bilinear sampling aliases beyond that.
+# Texture resolutions [px per module], one octave apart: bilinear sampling of a texture that is
+# much finer than the image causes aliasing.
 _MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
 # Grey levels of a lit print: white is not 255, black not 0.
 _PAPER, _INK = 235.0, 25.0
@@ -318,7 +320,7 @@ def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
 def _octave(plate_pixels: Float[np.ndarray, "4 2"]) -> int:
     """Index of the texture with a resolution nearest to that of the plate in the image.
 
-    Edges in the image are then about one pixel soft.
+    Edges in the image are then blurred over about one pixel.
     """
     edges = np.linalg.norm(plate_pixels - np.roll(plate_pixels, 1, axis=0), axis=1)
     octave = np.log2(max(edges.mean() / PLATE_MODULES, 1.0))

@@ -164,7 +164,7 @@ class Tool:
     def _guided(
         self, seen: Features, there: Float[np.ndarray, "n 2"], reach: float
     ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-        """Indices of features, and of the most similar points expected near them.
+        """Indices of features, and of the most similar tool point expected near each of them.
 
         Args:
             seen: Features of the image.
@@ -182,7 +182,7 @@ class Tool:
         return image[order], own[order]
 
     def _matches(self, seen: Features) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """Indices of features, and of the tool's points that they match, the clearest first."""
+        """Indices of features and of the tool points that match them, clearest pair first."""
         if min(len(seen.pixels), len(self.points)) < FEWEST_POINTS:
             return np.zeros(0, int), np.zeros(0, int)
         # Other views of the same point do not compete with the best match.
@@ -201,8 +201,9 @@ class Object:
     """Views of an object, each with its features around the object's middle."""
 
     views: tuple[Features, ...]
-    """Features in a frame at the object's middle, along its direction, at the object's size in
-    the first view [px]."""
+    """Features of each view [px]. Their frame has its origin at the object's middle and its
+    first axis along the object's direction; its scale is the object's size in the first
+    view."""
 
     def find(self, seen: Features, width: int) -> Finding | None:
         """Find the object among an image's features; None: not found."""

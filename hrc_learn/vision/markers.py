@@ -189,7 +189,7 @@ class MarkerDetector:
 def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
     """Image of a marker's middle: the intersection of its diagonals.
 
-    The mean of the corners differs, as perspective shrinks the farther half.
+    The mean of the corners would be wrong, because perspective shrinks the farther half.
     """
     a, b, c, d = corners
     across, between, ca = d - b, b - a, c - a
