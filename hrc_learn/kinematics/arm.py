@@ -33,7 +33,7 @@ from hrc_learn.kinematics.inverse import (
 )
 
 # Density of aluminium shells with motors and gears, a little above the density of water. It is
-# a guess: where a description has no masses, they are this density times volumes of capsules.
+# a guess for links without a mass in the description: mass = density * volume of the capsules.
 _DENSITY = 1200.0  # [kg/m^3]
 _STARTS = 200  # random starts from which `postures` searches
 _SCAN = 57  # positions of joint 7 among which `inverse` chooses
@@ -53,8 +53,8 @@ _HAND = (
 )
 
 type NullSpace = Literal["arm angle", "free", "none"]
-"""Self-motion of the arm at a fixed pose of the tool: a change of the arm angle (Franka's
-arms), another motion ("free"), or none, as for six joints."""
+"""Self-motion of the arm while the tool keeps its pose: "arm angle" (Franka's arms, see
+`inverse.arm_angle`), "none" (arms with up to six joints), or "free" (all other arms)."""
 
 
 class UnreachableError(ValueError):
@@ -77,13 +77,15 @@ class FingerJoint:
     closed: float
     """Position of the closed gripper [rad or m]."""
     opened: float
-    """Position of the open gripper [rad or m]: the end of the range further from zero."""
+    """Position of the open gripper [rad or m]: the end of the joint's range that is further
+    from zero."""
     follows: tuple[str, float, float] | None = None
     """Leading joint, factor and offset: position = factor * leading position + offset."""
     carrier: str | None = None
     """Joint of the gripper that carries this joint; None: the hand carries it."""
     mount: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    """Frame of the joint at zero, in the frame of the carrier or, without one, of the tool."""
+    """Frame of the joint at position zero, in the frame of the carrier, or of the tool if there
+    is no carrier."""
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Unit vector of the axis in the joint's frame."""
     meshes: tuple[MeshFile, ...] = ()
@@ -121,9 +123,9 @@ class Arm(SerialChain):
         description: File of the description; None for arms written in this package.
         base: Link of the file that is the base.
         tip: Link of the file that is the flange.
-        hand_size: Size of the hand and of what it handles, relative to the Franka hand.
+        hand_size: Scale of the hand and of the objects that it handles; 1 for the Franka hand.
         task: Constrained part of the tool's pose in inverse kinematics: "pose", or "nearest
-            pose" for an arm of fewer than six joints with the hand of the work cell.
+            pose" for an arm with fewer than six joints that `with_hand` returned.
     """
 
     def __init__(
@@ -180,7 +182,7 @@ class Arm(SerialChain):
 
     @property
     def frame_names(self) -> dict[str, str]:
-        """Names of the frames of a recording's poses: "base", and "ee", the end effector."""
+        """Names of the two frames of recorded poses: "base", and "ee" for the end effector."""
         return {"base": f"{self.name} base", "ee": f"{self.name} tool centre point"}
 
     @property
@@ -199,9 +201,9 @@ class Arm(SerialChain):
 
     @cached_property
     def whole(self) -> CapsuleArm:
-        """Capsules that contain all links and the gripper, with pairs that need no check.
+        """Capsules that contain all links and the gripper, and pairs of links to ignore.
 
-        Fitted on first use unless they were given; a fit takes a few seconds.
+        If no capsules were given, they are fitted on first use, which takes a few seconds.
         """
         if self._capsules is not None:
             return CapsuleArm(self, self._capsules, self._overlapping)
@@ -247,15 +249,15 @@ class Arm(SerialChain):
         """Joint positions within the limits that bring the tool centre point to poses [rad].
 
         Without `near`, the last batch dimension is a path: the first solution is the closest to
-        the ready posture, and each further one is the closest to the previous solution, so that
-        neighbouring poses have neighbouring solutions. With `near`, each pose is solved by
-        itself. Not differentiable.
+        the ready posture, and each later solution is the closest to the solution before it.
+        Neighbouring poses therefore have neighbouring solutions. With `near`, each pose is
+        solved by itself. The method is not differentiable.
 
         Args:
             pose: Poses of the tool centre point in the base frame.
             q7: Position of joint 7 [rad], for arms with a closed-form inverse (Franka's); None
-                leaves it free. The elbow branch of these arms with q4 > -0.467 rad is never
-                returned.
+                leaves it free. The closed-form inverse never returns the elbow branch with
+                q4 > -0.467 rad.
             near: Configuration to stay close to [rad], one for all poses or one for each.
             task: Constrained part of the pose; None: the arm's `task`. Five joints reach few
                 full poses.
@@ -309,7 +311,7 @@ class Arm(SerialChain):
             return self._closed_form(self, pose, as_tensor(q7))
         lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
         batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
-        # A margin from the limits leaves room for corrections.
+        # The scan keeps a margin from the limits, so that joint 7 can still move both ways.
         scan = torch.linspace(
             lower + _MARGIN, upper - _MARGIN, samples, dtype=torch.float64, device=near.device
         )
@@ -414,7 +416,8 @@ class Arm(SerialChain):
             # A fixed jaw belongs to the gripper that the hand replaces.
             last = [_behind(capsule, flange) for capsule in links if capsule.link == n]
             links = [*(c for c in links if c.link < n), *(c for c in last if c is not None)]
-        # Along the arm's own direction of approach, which need not be the flange's z axis.
+        # The tool centre point lies along the arm's own direction of approach, which may differ
+        # from the flange's z axis.
         tcp[:3, 3] = size * TCP_OFFSET * tcp[:3, 2]
         return Arm(
             name=self.name,

@@ -181,7 +181,7 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Capsule]:
 
 
 def _smallest_capsule(points: Float[np.ndarray, "points 3"]) -> _Capsule:
-    """The smallest of the capsules around points along their principal axes."""
+    """The smallest of three capsules around points, one along each principal axis."""
     fits = []
     for axis in principal_axes(points):
         along = points @ axis

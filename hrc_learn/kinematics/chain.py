@@ -111,11 +111,11 @@ def _matrix(rows: list[_Row]) -> Tensor:
 class SerialChain:
     """A chain of joints that turn about, or slide along, the z axis of their own frame.
 
-    The mounts absorb axes of other directions (`hrc_learn.kinematics.arm` does this for
-    descriptions in files). The transform from one joint to the next is linear in 1, sin q and
-    cos q, and in q for a sliding joint, so all transforms come from two or three fused
-    multiply-adds; one matrix product per joint remains. Transforms are kept as their upper
-    three rows (R | p).
+    A joint with an axis in another direction gets a rotated mount (`described_arm` does this
+    for arms from files). The transform from one joint to the next is linear in 1, sin q and
+    cos q, and in q for a sliding joint. Two or three fused multiply-adds therefore compute all
+    these transforms, and one matrix product per joint chains them. Transforms are kept as their
+    upper three rows (R | p).
 
     Joint positions are in radians, those of sliding joints in metres. Methods take tensors,
     NumPy arrays or lists with any number of leading batch dimensions, and follow the dtype and
@@ -195,9 +195,7 @@ class SerialChain:
         return SerialChain(**self.description_of_chain() | new)
 
     def description_of_chain(self) -> dict[str, Any]:
-        """Arguments with which `SerialChain` makes the same chain: all that its motion depends
-        on.
-        """
+        """Constructor arguments for the same chain; its motion depends on nothing else."""
         names = "joint_names", "mounts", "flange", "tcp", "limits", "ready", "kinds"
         return {name: getattr(self, name) for name in names}
 

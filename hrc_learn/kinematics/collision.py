@@ -104,7 +104,7 @@ class CapsuleArm:
         self._moving, self._moving_radius = Constant(moving), Constant(self.radius[moving])
 
     def with_capsules(self, more: Sequence[LinkCapsule]) -> CapsuleArm:
-        """The same arm with additional capsules, such as those of an object on its hand."""
+        """The same arm with additional capsules, for example of an object in its gripper."""
         return CapsuleArm(self.chain, (*self.capsules, *more), self.overlapping)
 
     def segments(
@@ -167,11 +167,12 @@ class CapsuleArm:
         half_size: Float[Tensor, "*boxes 3"],
         frames: Float[Tensor, "*batch links 3 4"] | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """Distance of the nearest moving link from boxes along the base axes [m].
+        """Distance of the nearest moving link from boxes aligned with the base axes [m].
 
-        Where the axis of a capsule enters a box, the distance is minus the radius, not the
-        depth. Pairs of a link and a box that are too far apart to be the nearest are skipped by
-        a branch on the data, so this method neither compiles nor works under `vmap`.
+        Where the axis of a capsule enters a box, the distance is minus the capsule's radius
+        instead of minus the depth. A branch on the data skips pairs of a link and a box that
+        are too far apart to be the nearest. Therefore, this method neither compiles nor works
+        under `vmap`.
 
         Args:
             q: Joint position [rad].
@@ -221,14 +222,14 @@ def nearest_on_segments(
     start, along = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
     other, across = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
     offset = start - other
-    # Segments of length zero are points. The root is the least divisor with a finite square,
-    # which the derivative contains.
+    # Segments of length zero are points. The derivative divides by the squares of a and e, so
+    # the bound `tiny` is the smallest value whose square does not underflow.
     tiny = math.sqrt(torch.finfo(first.dtype).tiny)
     a, e = ((v * v).sum(-1).clamp(min=tiny) for v in (along, across))
     b, c, f = (along * across).sum(-1), (along * offset).sum(-1), (across * offset).sum(-1)
     determinant = (a * e - b * b).clamp(min=0)
-    # For nearly parallel segments, any point of the first segment may be the nearest; a smaller
-    # determinant is rounding.
+    # For parallel segments, any point of the first segment may be the nearest. Determinants
+    # below this threshold are rounding errors.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant))
     t = ((b * s.clamp(0, 1) + f) / e).clamp(0, 1)
@@ -279,7 +280,7 @@ class GraspedBox:
     """A box between the fingers, with edges along the axes of the tool's frame."""
 
     half_size: tuple[float, float, float]
-    """Half of its edges along x, y (the line of closing) and z of the tool [m]."""
+    """Half of the edges along x, y (the closing direction) and z of the tool [m]."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of the box in the frame of the tool centre point [m]."""
 

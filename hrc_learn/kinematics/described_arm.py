@@ -171,8 +171,9 @@ def _ready(
 def _places(
     description: Description, base: str, moving: Sequence[Joint], base_turn: float
 ) -> tuple[dict[str, tuple[int, Transform]], list[Transform]]:
-    """Number of the frame that carries each link with the link's pose in this frame, and the
-    mounts of the moving joints.
+    """Frame number and pose of each link, and mounts of the moving joints.
+
+    The frame with this number carries the link, and the pose is relative to this frame.
     """
     turned = motion("revolute", np.array([0.0, 0.0, 1.0]), base_turn)
     subtree = description.rigid_subtree(base)
@@ -221,8 +222,9 @@ def _shape(
     ]
     bodies = dict(places)
     gripper = []
-    # A joint, its parent's pose in the frame of the tool with the gripper open, the joint that
-    # carries the parent, and the parent's pose in the frame of that joint or of the tool.
+    # Rows of `ahead`: a joint; the pose of its parent link in the tool's frame, with an open
+    # gripper; the gripper's joint that carries the parent, or None; the parent's pose in the
+    # frame of this carrier, or in the tool's frame if there is no carrier.
     ahead: list[tuple[Joint, Transform, str | None, Transform]] = [
         (joint, at, None, at)
         for joint in roots

@@ -116,7 +116,7 @@ class Joint:
     effort: float | None = None
     """[N m] or [N]"""
     follows: tuple[str, float, float] | None = None
-    """Mimicked joint, factor and offset; the name is empty if the joint rests at the offset."""
+    """Mimicked joint, factor and offset; an empty name fixes the joint at the offset."""
 
     @property
     def is_finger(self) -> bool:
@@ -159,8 +159,8 @@ class Description:
 
         Raises:
             ValueError: A name is used twice, a joint names a link that does not exist, a link
-                has two parents, joints form a cycle or mimic each other in one, or parts are
-                100 m or more apart.
+                has two parents, joints form a cycle, joints mimic each other in a cycle, or
+                parts are 100 m or more apart.
         """
         if not links:
             raise ValueError(f"{path} has no links: is it complete, and is its xacro expanded?")
@@ -222,7 +222,7 @@ class Description:
 
     @property
     def roots(self) -> list[str]:
-        """Links that no joint carries."""
+        """Links that are the child of no joint."""
         return [name for name in self.links if name not in self._above]
 
     def below(self, link: str) -> Sequence[Joint]:
@@ -230,7 +230,7 @@ class Description:
         return self._below.get(link, ())
 
     def subtree(self, link: str) -> list[str]:
-        """A link and all that it carries, parents first."""
+        """A link and all links below it, parents first."""
         found = [link]
         for name in found:  # grows during the loop
             found += [joint.child for joint in self.below(name)]
@@ -251,8 +251,8 @@ class Description:
 
         Args:
             base: A link; None: the root.
-            tip: A link; None: the tool frame, if the tree has only one end apart from those of
-                a gripper. The joints of the gripper are left out with a warning.
+            tip: A link; None: the tool frame, if the tree has only one end besides the fingers
+                of a gripper. The gripper's joints are then left out, with a warning.
 
         Raises:
             ValueError: A link does not exist, no joint moves between base and tip, there are
@@ -329,8 +329,8 @@ class Description:
     def _ends(self, base: str) -> tuple[list[_End], list[Joint]]:
         """Bodies at which an arm may end, and the first joints of grippers.
 
-        A joint belongs to a gripper by its name, or if several joints branch off where the arm
-        ends, each with a shorter chain than the arm.
+        A joint belongs to a gripper if its name says so, or if it is one of several joints that
+        branch off at the end of the arm, each with a shorter chain than the arm.
         """
         height: dict[str, int] = {}  # largest number of joints in a row beyond a link
         for link in reversed(self.subtree(base)):
@@ -357,7 +357,7 @@ class Description:
 
 
 def _length(joint: Joint, height: dict[str, int]) -> int:
-    """Number of moving joints from a joint, which counts too, to the furthest leaf."""
+    """Number of moving joints from a joint, including this joint, to the furthest leaf."""
     return height[joint.child] + (joint.kind != "fixed")
 
 

@@ -73,11 +73,11 @@ def arm_bodies(
     joint_position: Float[np.ndarray, "time joints"],
     opening: Float[np.ndarray, " time"] | None = None,
 ) -> tuple[Body, ...]:
-    """Links, hand and fingers of an arm along a motion, as meshes or, without them, capsules.
+    """Links, hand and fingers of an arm along a motion, as meshes or, if unknown, capsules.
 
     Args:
         robot: The arm.
-        joint_position: [rad].
+        joint_position: Joint positions along the motion [rad].
         opening: Opening of the gripper, 0 (closed) to 1; None draws it open.
     """
     poses = robot.link_poses(joint_position)

@@ -4,16 +4,16 @@ Both arms have the same published geometry and differ in their limits.
 
 The inverse is He and Liu 2021, "Analytical inverse kinematics for Franka Emika Panda", as
 implemented by `frankik`: about 2 us a pose. It never returns the branch of the elbow with
-q4 > -0.467 rad, where the forearm folds to the other side, and in one pose of 300 it misses a
-valid solution at the shoulder singularity (q2 = 0). Its results are checked here.
+q4 > -0.467 rad, where the forearm folds to the other side. In one pose of 300, it misses a
+valid solution at the shoulder singularity (q2 = 0). This module checks its results.
 
-For the Research 3 it also misses most solutions outside the Panda's range (q6 > 3.7525 rad,
-|q7| > 2.8973, |q2| > 1.7628), unless all joints are within the range that Franka gives for
-constant velocity limits. The inverse finds 81 % of the configurations in the whole range with
-q4 < -0.467, and 99.8 % of such configurations within the Panda's range.
+For the Research 3, `frankik` also misses most solutions outside the Panda's range (q6 > 3.7525
+rad, |q7| > 2.8973, |q2| > 1.7628), unless all joints are within the range that Franka gives for
+constant velocity limits. Among the Research 3's configurations with q4 < -0.467, the inverse
+finds 81 % in the whole range, and 99.8 % within the Panda's range.
 
-Franka's meshes agree to 2 mm for both arms. They protrude from the capsules by at most 30 mm at
-the links (link 2), 46 mm at the base and 9 mm at the gripper: clearances must cover this.
+Franka's meshes of the two arms agree to 2 mm. They protrude from the capsules by at most 30 mm
+at the links (link 2), 46 mm at the base and 9 mm at the gripper: clearances must cover this.
 """
 
 from functools import partial
@@ -45,9 +45,9 @@ PANDA_LIMITS = _limits(**_TABLES["panda_limits"])
 
 FR3_LIMITS = _limits(**_TABLES["fr3_limits"])
 """The strictest limits of the tables that `vintage` names, which every Research 3 accepts: the
-innermost position limits, and the smallest velocity offsets with curves below the curves of all
-tables. A robot uses the values of the URDF that it sends to its driver; these values depend on
-its system image."""
+innermost position limits, and the smallest velocity offsets whose velocity curves lie below the
+curves of all tables. A robot itself uses the values of the URDF that it sends to its driver;
+these values depend on its system image."""
 
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
 _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]

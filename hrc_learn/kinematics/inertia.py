@@ -20,8 +20,8 @@ from hrc_learn.kinematics.description import pseudo_inertia
 class MassMatrix:
     """Mass matrix of an arm with its gripper and a held load.
 
-    Bodies without an inertia in the description have their mass spread evenly over the axes of
-    their capsules.
+    If the description gives no inertia of a body, the body's mass is spread evenly over the
+    axes of its capsules.
     """
 
     def __init__(self, arm: Arm, rotor_inertia: float = 0.0):
@@ -46,7 +46,7 @@ class MassMatrix:
     def __call__(
         self, q: Float[Tensor, "*batch joints"], load: Float[Tensor, "*#batch"] | float = 0.0
     ) -> Float[Tensor, "*batch joints joints"]:
-        """Mass matrix at joint positions [kg m^2]; rows of sliding joints in kg and kg m.
+        """Mass matrix at joint positions [kg m^2]; rows of sliding joints are in kg and kg m.
 
         Args:
             q: Joint positions [rad].

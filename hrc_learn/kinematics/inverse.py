@@ -5,7 +5,7 @@ Levenberg-Marquardt method is the squared error, so that it vanishes at a soluti
 2011, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method"). Each
 start of each pose is one row of a batch; converged rows are removed from the batch. Every
 iteration keeps the joint limits. Among the solutions of a pose, the one nearest to a wanted
-configuration is kept and moved further towards it in the null space.
+configuration is kept. Null-space motion then brings it closer to this configuration.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ TASK_ROWS: dict[TaskSpace, int] = {
 # Weight of angles relative to distances [m/rad]: 1 rad counts as much as this distance.
 _LEVER = 0.3
 # Singular values below these fractions of the largest one count as zero: `_RANK` in
-# `null_space_dimension`, `_WEAK` in `task_rank`. With `_WEAK`, directions in which the joints
-# hardly move the tool do not count: the SO-101's tool is only 8 mm off its last joint's axis.
+# `null_space_dimension`, `_WEAK` in `task_rank`. `_WEAK` excludes directions in which joints
+# hardly move the tool: the SO-101's tool, for example, is only 8 mm off its last joint's axis.
 _RANK, _WEAK = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
 # Starts per pose in each round, largest number of rounds, and iterations from each start.
@@ -128,10 +128,11 @@ _SAMPLES = 64  # random joint positions that `task_rank` evaluates: nearly all a
 def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
     """Number of task dimensions that an arm controls, away from its singularities.
 
-    The rank is six for the pose of an arm with six or more joints. For "position+axis" it is
-    five, but four (position and tilt) for a five-joint arm if the last joint turns the tool
-    about its z axis. The remaining joint motion is null space. A direction does not count if it
-    needs more than 50 times as much joint motion as the direction that needs least.
+    The rank is six for the pose of an arm with six or more joints. For "position+axis", the
+    rank is five. It is only four (position and tilt) for a five-joint arm whose last joint
+    turns the tool about the tool's z axis. Joint motion beyond the rank is null space. A
+    direction does not count if it needs more than 50 times as much joint motion as the
+    direction that needs least.
 
     Args:
         chain: The arm.
@@ -147,13 +148,13 @@ _LINEAR = Constant(torch.eye(6, dtype=torch.float64)[:3])
 
 
 def position_first(J: Float[Tensor, "*batch 6 n"]) -> Float[Tensor, "*batch n 6"]:
-    """Orthonormal basis of the tool's twists that an arm of three to five joints controls.
+    """Orthonormal basis B of the tool twists that an arm with three to five joints controls.
 
-    Rows are the linear velocities, then the rotations that the joints cause while the position
-    rests: B = [I 0; 0 U^T]. With J_v and J_w the linear and angular rows of J, and Z a basis of
-    the null space of J_v, U is an orthonormal basis of the range of J_w Z. Solving
-    B J q_dot = B v moves the position as wanted, and turns the tool as near to the wanted
-    rotation as the joints can.
+    Rows are the linear velocities, then the rotations that the joints can cause without moving
+    the position: B = [I 0; 0 U^T]. Let J_v and J_w be the linear and angular rows of J, and Z a
+    basis of the null space of J_v. Then U is an orthonormal basis of the range of J_w Z. The
+    solution of B J q_dot = B v moves the position as wanted, and turns the tool as close to the
+    wanted rotation as the joints can.
 
     Args:
         J: Geometric Jacobian of the tool.
@@ -383,7 +384,7 @@ def _drawn_nearer(
     wish.
     """
     moved = q
-    for _ in range(15):  # each removes most of the distance that the null space can remove
+    for _ in range(15):  # each step removes most of the distance that null-space motion can
         moved, _ = _step(chain, goal, moved, task, wish)
     moved, reached = _descend(chain, goal, moved, task)
     nearer = torch.linalg.vector_norm(moved - wish, dim=-1) < torch.linalg.vector_norm(
@@ -394,8 +395,8 @@ def _drawn_nearer(
 
 # Redundancy. The arm angle is one number for the posture of a seven-joint arm with its end
 # effector at rest: the angle by which the plane of shoulder, elbow and wrist is turned out of
-# the vertical (Kreutz-Delgado et al. 1992). Unlike the position of joint 7 it changes steadily
-# as the elbow circles, and keeps its meaning when the end effector moves.
+# the vertical (Kreutz-Delgado et al. 1992). Unlike the position of joint 7, the angle changes
+# monotonically as the elbow circles, and keeps its meaning when the end effector moves.
 
 # Smallest singular value of the 6 x n Jacobian (with unscaled metres and radians) below which
 # its exact inverse demands joint speeds that no arm reaches.
@@ -418,8 +419,9 @@ _ALIKE = 0.5
 def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
     """Angle of the elbow about the line from shoulder to wrist [rad], in (-pi, pi].
 
-    The angle is zero with the elbow straight above this line and grows right-handed about it.
-    It is undefined where the wrist is straight above the shoulder, or the arm is stretched.
+    The angle is zero with the elbow straight above this line, and positive for a right-handed
+    rotation about it. It is undefined where the wrist is straight above the shoulder, or the
+    arm is stretched.
 
     Args:
         chain: A seven-joint arm with shoulder, elbow and wrist at joints 2, 4 and 6.

@@ -38,7 +38,8 @@ class MotionLimits:
     jerk: Float[Tensor, " joints"]
     """[rad/s^3]"""
     velocity_offset: Float[Tensor, " joints"] | None = None
-    """Offset o in `velocity_bounds` [rad/s]; None if velocity limits do not vary."""
+    """Offset o in `velocity_bounds` [rad/s]; None if velocity limits do not depend on the
+    position."""
     deceleration: Float[Tensor, " joints"] | None = None
     """Deceleration d in `velocity_bounds` [rad/s^2]."""
 
@@ -136,10 +137,10 @@ class JointLimits(MotionLimits):
         return worst, at
 
 
-# Defaults for limits that a description does not give. The velocity of revolute joints is at
-# most the slowest joint's limit on every registered arm except Kinova's Jaco. The velocity of
-# prismatic joints is the reduced speed of ISO 10218-1:2025. We chose the times to full speed
-# and to full acceleration; the Panda's times are 0.13 to 0.29 s and 2 ms.
+# Defaults for limits that a description does not give. The default velocity of revolute joints
+# does not exceed the limit of any joint of the registered arms, except Kinova's Jaco. The
+# default velocity of prismatic joints is the reduced speed of ISO 10218-1:2025. We chose the
+# times to full speed and to full acceleration; the Panda's times are 0.13 to 0.29 s and 2 ms.
 DEFAULT_VELOCITY = 1.0  # [rad/s]
 DEFAULT_SLIDING_VELOCITY = 0.25  # [m/s]
 _SECONDS_TO_FULL_SPEED = 0.2

@@ -27,9 +27,9 @@ _NO_MASS = 1e-9
 def read_mjcf(path: Path) -> Description:
     """Read an MJCF file.
 
-    A body becomes a link, a site a link fixed to its body. Several joints of one body become
-    links in a row, named after the body and the joint. Missing meshes are left out, and a
-    warning names the first one.
+    A body becomes a link, and a site becomes a link fixed to its body. If a body has several
+    joints, each joint adds one link of a chain, named after the body and the joint. Missing
+    meshes are left out, and a warning names the first one.
 
     Raises:
         ValueError: The file is not MJCF.

@@ -1,6 +1,6 @@
 """Robot arms by registered name, or from a description file.
 
-registered_arms.toml lists where the descriptions of registered arms are and what they lack.
+registered_arms.toml lists the file of each registered arm, and settings that the file lacks.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
     """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
 
     The result is also None if the package with the description is not installed. Our simulated
-    robots, such as mujoco_ur5e, carry the hand of the work cell.
+    robots, such as mujoco_ur5e, have the hand of the work cell (see `ArmChoice.work_arm`).
     """
     simulated = (robot_type or "").removeprefix("mujoco_")
     name = _registered_name(robot_type or "")

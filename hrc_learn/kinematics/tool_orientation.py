@@ -1,9 +1,10 @@
-"""Tool orientations: the paper's rule for three-axis devices, and the tangent of approaches.
+"""Tool orientations: the paper's rule for three-axis devices, and tangents of approaches.
 
-`coarse_orientation` (eq. coarse_orientation): a three-axis haptic device moves the end effector
-but cannot turn it, so the tilt follows from the sideways position: straight down in front of
-the robot, level at the end of its reach. `Approach` (section Collaboration Task): the
-orientation for grasping points along the tangent of the demonstrated motion near the object.
+A three-axis haptic device moves the end effector but cannot turn it. Therefore,
+`coarse_orientation` (eq. coarse_orientation of the paper) derives the tilt from the sideways
+position: straight down in front of the robot, level at the end of its reach. `Approach`
+(section Collaboration Task) is an orientation for grasping, which points along the tangent of
+the demonstrated motion near the object.
 """
 
 import math
@@ -22,9 +23,9 @@ from hrc_learn.store import Radians, read_json, write_json
 NEAR = 0.05
 """Length of the last part of a path [m]; the direction of this part is the tangent."""
 
-# Tangents are not used if they differ by more than this from their mean (root mean square), or
-# if their mean differs by more than this from the direction in which the end effector points
-# [rad]: the end effector then came to the object from the side.
+# Tangents are not used if their root-mean-square angle to their mean exceeds this angle [rad].
+# They are not used either if their mean differs by more than this angle from the direction in
+# which the end effector points: the end effector then approached the object from the side.
 MAX_SPREAD = math.radians(30)
 # Shorter vectors are rounding noise and have no direction.
 _SHORTEST = 1e-12
@@ -79,17 +80,18 @@ def turn_about_vertical(
 class Approach:
     """Orientation of the end effector in front of an object, from demonstrated approaches.
 
-    The orientation belongs to a gripper that closes along x: turns about the vertical are
-    removed, since objects lie at any yaw. The saved file has the same fields.
+    Objects lie at any yaw, so the rotation about the vertical is removed: the orientation is
+    that of a gripper that closes along x. The saved file has the same fields.
     """
 
     version: Literal[1] = 1
     orientation_wxyz: tuple[float, float, float, float]
     """Unit quaternion; its z axis is the direction of approach to the object."""
     spread_rad: Radians
-    """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
+    """Root-mean-square angle between the demonstrations' tangents and their mean [rad]."""
     turned_rad: Radians
-    """Angle from the mean demonstrated orientation [rad]; 0 where the tangents are not used."""
+    """Angle from the mean demonstrated orientation to `orientation_wxyz` [rad]; 0 if the
+    tangents are not used."""
 
     def __post_init__(self) -> None:
         if not math.isclose(math.hypot(*self.orientation_wxyz), 1.0, abs_tol=1e-3):

@@ -22,7 +22,7 @@ from hrc_learn.kinematics.description import (
 )
 
 _BOUNDS = ("lower", "upper", "velocity", "effort")
-# Attributes that hold text. In other attributes, these words are numbers that are not finite.
+# `_WORDS`: attributes that hold text. `_NOT_FINITE`: words that are numbers elsewhere.
 _WORDS = ("name", "link", "joint", "type", "filename")
 _NOT_FINITE = re.compile(r"\b(nan|inf|infinity)\b", re.IGNORECASE)
 
@@ -216,7 +216,7 @@ class _Reader:
         zero = (0.0, 0.0, 0.0)
         x, y, z = np.eye(3)
         roll, pitch, yaw = self._numbers(origin, "rpy", zero, what)
-        # About the fixed axes x, y, z in turn.
+        # Rotations about the fixed axes x, y and z, in this order.
         turn = motion("revolute", z, yaw) @ motion("revolute", y, pitch)
         pose = turn @ motion("revolute", x, roll)
         pose[:3, 3] = self._numbers(origin, "xyz", zero, what)
