@@ -1,6 +1,6 @@
-"""Metrics of a collaboration. With several objects, the worst one counts.
+"""Metrics of a collaboration; with several objects, each metric is the worst value.
 
-Success is read from contacts and poses of the simulator, not from the report of the task.
+Success is decided by contacts and poses of the simulator, not by the report of the task.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -24,9 +24,9 @@ type Measure = Callable[[CollaborationRun], float | int | None]
 _SAME_TASK = "main task not affected (Experiment 3)"
 
 
-# Largest normalised error of a reproduction. The remaining error is the tremor of the
-# demonstrating hand, which primitives do not reproduce. It is 0.0006 (SO-101) to 0.00102 (UR3)
-# of the joints' range, and the same with 15, 60 and 80 basis functions.
+# Largest normalised error of a reproduction. The error of the present models is the tremor of
+# the demonstrating hand, which primitives do not reproduce. It is 0.0006 (SO-101) to 0.00102
+# (UR3) of the joints' range, and the same with 15, 60 and 80 basis functions.
 _REPRODUCTION = 1.5e-3
 
 
@@ -132,7 +132,7 @@ def _handed(
     unit: str = "",
     at_most: float | int | None = None,
 ) -> Metric[CollaborationRun]:
-    """Metric of a hand-over; left out without one, or if it was not recognised."""
+    """Metric of a hand-over; left out if there was none, or if it was not recognised."""
 
     def measure(run: CollaborationRun) -> float | None:
         receipt = next((p.receipt for p in run.picks if p.receipt is not None), None)

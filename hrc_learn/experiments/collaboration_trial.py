@@ -143,7 +143,7 @@ class CollaborationRun(CellRun):
 
     @cached_property
     def near_worker(self) -> NearWorker | None:
-        """Margin of the worker's distance, and force of contacts; None without a worker."""
+        """Margin over the stopping distance, and force of contacts; None without a worker."""
         if self.visit is None:
             return None
         log = self.cell.log
@@ -337,7 +337,7 @@ class _Stage:
         return self._visit if self.giving is None else self.giving.hand_over.visit
 
     def update(self) -> None:
-        """Move occluder and person to where they are now."""
+        """Move occluder and person to their present positions."""
         self._occluder.update()
         if self.giving is not None:
             self.giving.update()

@@ -1,4 +1,4 @@
-"""Frame of every experiment: run once, repeat with other seeds, evaluate, report.
+"""Procedure of every experiment: run once, repeat with other seeds, evaluate, report.
 
 An experiment is a frozen dataclass of its settings with the methods of `Experiment`;
 `run_experiment` runs it and writes its results.
@@ -69,7 +69,7 @@ class ExperimentRun(Protocol):
 
     @property
     def failure(self) -> str:
-        """Reason why the task was given up; empty if it was not. Metrics are separate."""
+        """Reason why the task was given up; empty if it was not. Metrics do not count here."""
         ...
 
     @property
@@ -193,7 +193,8 @@ def run_experiment[Run: ExperimentRun](
     if options.serve:
         view = live_view(experiment.title, lambda at: console.print(f"Dashboard at {at}"))
         observer = replace(observer, view=view)
-    # Next to the folder, which exists only after the run, so that interrupted trials resume.
+    # The folder exists only after the run. The file of trials is therefore kept next to it, so
+    # that interrupted trials can resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
     made_by: dict[str, Any] = asdict(study.trial)  # pyright: ignore[reportArgumentType]
     if options.trials and trial_file.exists():  # refuse other settings before the run
@@ -236,7 +237,7 @@ def run_experiment[Run: ExperimentRun](
 def _write_recordings[Run: ExperimentRun](
     folder: Path, experiment: Experiment[Run], run: Run, make_film: bool
 ) -> tuple[Film | None, Sequence[Section]]:
-    """Write log and recordings; returns the film, if asked for, and sections of the report."""
+    """Write log and recordings; return the film, if requested, and the report's sections."""
     run.log.save(folder / "log.npz")
     recordings = experiment.recordings(run)
     for name, recording in recordings.items():

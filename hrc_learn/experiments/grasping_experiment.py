@@ -39,14 +39,15 @@ from hrc_learn.vision import CameraModel
 from hrc_learn.viz.report import Section
 
 LIFTED = 0.10
-"""Height above the table at which an object counts as lifted [m]: half of the lift."""
+"""Height above its start at which an object counts as lifted [m]: half of the full lift,
+`GraspingConfig.lift`."""
 GRASP_OFFSET = 15.0
 """Largest horizontal distance of the end effector from the object at which the open fingers
 still enclose the object [mm]; they leave 18 mm on either side."""
 ROTATION_SCALE = 0.15
 """Weight of a radian in the norm of a Jacobian [m/rad]: a typical lever arm."""
 REACH = 0.02
-"""Points this close to a demonstrated one are inside the demonstrated workspace [m]."""
+"""Points within this distance of a demonstrated point count as demonstrated workspace [m]."""
 
 
 def descent(run: GraspingRun) -> tuple[float, float]:

@@ -31,7 +31,7 @@ from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.vision import CameraModel
 
-# Joint speed [rad/s] and time between samples [s] of the approach checked for contacts.
+# Joint speed [rad/s] and time between samples [s] of the approach that is checked for contacts.
 _APPROACH_SPEED, _PATH_STEP = 0.6, 0.05
 # Largest yaw of objects in a scene without imperfections, either way [rad]: people lay objects
 # roughly parallel to the table's edges.
@@ -163,7 +163,7 @@ def simulate_grasp(
         access: Access to the arm.
         human: Person near the arm; None: no person.
         page: Browser page that shows the run in real time, where users can draw goals and pull
-                at the arm; None: no page.
+            the arm; None: no page.
         observer: Live dashboard and messages.
     """
     workplace = scene.workplace.approached(aiming.approach)

@@ -33,7 +33,8 @@ class Metric[Run]:
     name: str
     """Name in words; with the unit it makes the key of the value in JSON files."""
     of: Callable[[Run], float | int | None]
-    """Measures a run. An integer is a count, summed over trials. None leaves the row out."""
+    """Measures a run. An integer result is a count, which is summed over trials. If the result
+    is None, the row is left out."""
     unit: str = ""
     _: KW_ONLY
     at_most: float | int | None = None
@@ -105,7 +106,7 @@ class Evaluation:
 
     @property
     def ok(self) -> bool:
-        """True without faults and if every bound of the table is met."""
+        """True if there are no faults and every bound of the table is met."""
         return not self.faults and all(m.ok is not False for m in self.table)
 
     def __add__(self, other: "Evaluation") -> "Evaluation":
@@ -169,7 +170,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def spread(values: Float[np.ndarray, " trials"]) -> dict[str, float]:
     """Quantiles of finite values, at least one: median, p95, min and max."""
     levels = {"median": 0.5, "p95": 0.95, "min": 0.0, "max": 1.0}
-    # "higher": a measured value, with at least the requested fraction below it.
+    # "higher" returns a measured value: at least the requested fraction is at or below it.
     found = np.quantile(values, [*levels.values()], method="higher")
     return dict(zip(levels, found.tolist(), strict=True))
 
@@ -212,7 +213,7 @@ class Summary:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Interval of 95 % of the success rate."""
+        """Confidence interval (95 %) of the success rate."""
         return wilson_interval(self.successes, self.trials)
 
     @property

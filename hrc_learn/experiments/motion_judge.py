@@ -2,8 +2,8 @@
 
 A judge puts the objects in their places, lets the arm follow joint positions at the frame rate,
 and checks for success at the end: by MuJoCo's contacts in the work cell, by a Python function
-in other scenes. An environment of gymnasium executes the actions of the new episode instead,
-and its observations are written.
+in MJCF scenes. An environment of gymnasium executes the actions of the planned episode instead,
+and its observations replace the planned observations.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ class JudgeConfig:
     """Success function for an MJCF scene, as FILE.py:FUNCTION or MODULE:FUNCTION. It takes
     model and data at the end of a motion and returns True after a success."""
     gripper: tuple[str, ...] = ()
-    """Actuators of the gripper in an MJCF scene. Default: all that move no arm joint."""
+    """Actuators of the gripper in an MJCF scene. Default: all actuators that move no joint of
+    the arm."""
     base: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the arm's base in an MJCF scene [m]."""
     processes: int = 2
@@ -97,7 +98,7 @@ class JudgeConfig:
 
     @property
     def is_environment(self) -> bool:
-        """True if a Python function makes an environment."""
+        """True if the scene is an environment that a Python function makes."""
         return ":" in self.scene and not Path(self.scene).exists()
 
     def open(self, robot: ArmChoice, fps: float, widest: float) -> AnyJudge:
@@ -179,7 +180,7 @@ class SceneJudge:
         joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
         direct = np.isin(model.actuator_trntype, joint)
         at = np.where(direct, model.actuator_trnid[:, 0], -1)
-        # The force of a position actuator falls with the position.
+        # A position actuator is one whose force decreases with the position.
         servos = np.flatnonzero(direct & (model.actuator_biasprm[:, 1] < 0))
         drives = {int(at[a]): int(a) for a in servos}
         names = robot.arm().joint_names
@@ -229,7 +230,7 @@ class SceneJudge:
         return "" if done else f"{self._config.success} returned False"
 
     def _put(self, name: str, pose: Float[np.ndarray, "7"]) -> None:
-        """Set the pose of a body: of its free joint, as a mocap body, or in its parent."""
+        """Set the pose of a body: by its free joint, as a mocap body, or within its parent."""
         body = self.model.body(name)
         first, mocap = int(body.jntadr[0]), int(body.mocapid[0])
         if first >= 0 and self.model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:
@@ -248,9 +249,10 @@ class EnvironmentJudge:
     the pose of each object by name (x, y, z [m] and quaternion w, x, y, z),
     `options["joint_position"]` the first joint positions [rad]. Observations are a dictionary
     of the dataset's features, or of LeRobot's `agent_pos` and `environment_state`. `step` takes
-    the feature `action`, or a dictionary if there are several actions. The last step decides:
-    `info["is_success"]` or `info["success"]`, and `info["failure"]`, a reason in words, which
-    may also reject the scene in `reset`.
+    the feature `action`, or a dictionary if there are several actions. The last step reports
+    the outcome: `info["is_success"]` or `info["success"]`, and after a failure
+    `info["failure"]` with the reason. `reset` may also return `info["failure"]`, which rejects
+    the scene.
     """
 
     def __init__(self, function: str, fps: float):

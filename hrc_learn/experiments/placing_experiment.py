@@ -176,8 +176,8 @@ class PlacingExperiment:
             title="Placing on each shelf from random starts",
             trial=RandomStart(self),
             metrics=TRIAL_METRICS,
-            text="Each seed draws every start joint about home. Motions are planned in task "
-            "space.",
+            text="Each seed draws another start posture near home for each shelf. Motions are "
+            "planned in task space.",
         )
 
     @property

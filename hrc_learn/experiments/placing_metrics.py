@@ -1,4 +1,4 @@
-"""Metrics of placings: outcome of each, values of a run, statistics over random starts."""
+"""Metrics of placings: outcome of one placing, values of a run, statistics of random starts."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +37,8 @@ class PlacingOutcome:
     """Measured outcome of one placing."""
 
     deviation: float
-    """Distance of the approach from the demonstrated path, shifted to end at this goal [m]."""
+    """Largest distance of the approach from the demonstrated path, when the demonstrated path
+    is shifted so that it ends at this goal [m]."""
     place_error: float
     """Horizontal distance of the object on its board from its intended place [m]."""
     place_tilt: float
@@ -89,7 +90,7 @@ def approach_deviation(
     demonstrated: Float[np.ndarray, "frames 3"],
     edge: float,
 ) -> float:
-    """Largest distance of an approach from the demonstrated one, shifted to the goal [m].
+    """Largest distance of an approach from the demonstrated approach shifted to its goal [m].
 
     Approaches run along -y, because the boards open towards +y. Their sideways and vertical
     distance at equal depths is measured, so that different shelves can be compared.
@@ -115,7 +116,7 @@ def approach_deviation(
 def _approach(
     path: Float[np.ndarray, "steps 3"], goal: Float[np.ndarray, "3"], edge: float
 ) -> Float[np.ndarray, "samples 3"]:
-    """Offset from the goal in the last part of a path, behind the edge [m]."""
+    """Offsets from the goal along the last part of a path, which is behind the edge [m]."""
     outside = np.flatnonzero(path[:, 1] > edge)
     return path[int(outside[-1]) + 1 if len(outside) else 0 :] - goal
 

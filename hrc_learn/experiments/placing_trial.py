@@ -47,13 +47,13 @@ _DRAWS = 100
 class SimulatedPlacing(CellRun):
     """One placing, from the start of the transfer to the end of the retreat.
 
-    Later placings may have reused its world.
+    Later placings may have changed the world since then.
     """
 
     goal: Pose
     """True pose at which the end effector should release the object."""
     plan: Plan
-    """Plan that ends at the pose that the arm should read at the goal."""
+    """Plan; it ends at the pose that the encoders should show at the goal."""
     object_pose: Float[np.ndarray, "4 4"]
     """Final pose of the object."""
     contacts: tuple[Touch, ...]
@@ -155,7 +155,7 @@ def taught_correction(
     Args:
         world: World with the imperfections of the arm.
         place: Known place.
-        near: Joint positions near which the arm is guided there [rad].
+        near: Joint positions near which the arm reaches the place [rad].
         rng: Source of the person's error.
 
     Raises:

@@ -58,12 +58,12 @@ Driver = Literal["franky", "franka", "lerobot", "ros2"]
 LeRobot, or topics of ROS 2."""
 
 _SILENCE = 0.15
-"""Silence of the loop after which the arm is stopped [s], as in `franka_panda`."""
+"""Time without commands after which the arm is stopped [s], as in `franka_panda`."""
 _DELAY = 0.03
-"""Delay from reading the joints to the motion of the arm [s]: that of
-`Imperfections.nominal`, not measured."""
+"""Delay from reading the joints to the motion of the arm [s]. It is not measured, but taken
+from `Imperfections.nominal`."""
 _SERVO_DELAY = 0.08
-"""The same delay for position servos on a bus that is read at 50 Hz [s], not measured."""
+"""The same delay for position servos on a bus that is read at 50 Hz [s]; not measured."""
 _REDUCED_SPEED = 0.25
 """Speed of the tool near people [m/s] (ISO 10218-1:2025, reduced speed)."""
 
@@ -77,7 +77,7 @@ class ArmSite:
     ip: str = ""
     """Address of the control box."""
     robot: Literal["panda", "fr3"] = "panda"
-    """Franka arm with its limits."""
+    """Franka arm, for its kinematics and limits."""
     device: dict[str, Any] = field(default_factory=dict)
     """LeRobot's settings of the robot, which `--robot.NAME=VALUE` sets: type, port, id."""
     leader: dict[str, Any] = field(default_factory=dict)
@@ -164,7 +164,7 @@ a failure, or an empty string."""
 
 @dataclass(frozen=True, kw_only=True)
 class ArmRun(CellRun):
-    """Result of a task on a real arm; its world is that of the assumed surroundings."""
+    """Result of a task on a real arm; its world models the assumed surroundings."""
 
     @property
     def duration(self) -> float:

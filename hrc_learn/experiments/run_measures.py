@@ -32,15 +32,15 @@ _AFTER = 1.0
 _LAG = 0.5
 # Distance that the goal must move within `_LAG` to have a direction [m].
 _LEAST_MOTION = 0.002
-# Orientation of a held object in the hand: its x axis along the closing direction of the
-# fingers, which is the y axis of the hand, its top towards the palm.
+# Orientation of a held object in the frame of the hand. The object's x axis lies along the
+# closing direction of the fingers, which is the y axis of the hand; its top faces the palm.
 _IN_HAND = quaternion.from_matrix(
     torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
 )
 
 
 def lasting(phases: Sequence[Event], last: float = math.inf) -> list[tuple[Event, float]]:
-    """Each phase with its end [s]: the start of the next phase; `last` for the last one."""
+    """Phases with their ends [s]: the start of the next phase, or `last` for the last phase."""
     return list(zip(phases, [*(phase.time for phase in phases[1:]), last], strict=False))
 
 
@@ -57,7 +57,7 @@ def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
 def true_image_jacobian(
     log: LoggedSteps, world: World, cameras: Sequence[tuple[float, CameraModel]]
 ) -> Float[np.ndarray, "time 2 6"]:
-    """True image Jacobian of the gripper's marker wherever the controller used its estimate.
+    """True image Jacobian of the gripper's marker at steps that used the estimate, else NaN.
 
     Args:
         log: Log of the run.
@@ -171,7 +171,7 @@ def unwanted_contacts(
 ) -> dict[str, tuple[Touch, ...]]:
     """Contacts of the arm and of the objects it carried, by the object that was hit.
 
-    The fingertips may touch the table while the arm feels for the table's height.
+    The fingertips may touch the table while the arm moves down to find the table's height.
 
     Args:
         world: World at the end of the run.
@@ -236,7 +236,7 @@ def place_angle(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> flo
 def place_pitch_and_yaw(
     pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]
 ) -> tuple[float, float]:
-    """Pitch and yaw of a placed box from its intended orientation, without signs [rad].
+    """Absolute pitch and yaw of a placed box relative to its intended orientation [rad].
 
     Yaw is about the vertical, pitch about the horizontal axis across the approach of the hand.
 
@@ -277,8 +277,9 @@ def pull_effects(
 ) -> list[PullEffect]:
     """Effects of the pulls that acted during a run.
 
-    While the arm follows a motion or holds its end effector, the distance from this path is
-    measured. Visual servoing has no path: the grasp offset is measured instead.
+    While the arm follows a path or holds its end effector in place, the effect on the end
+    effector is its distance from this path. Visual servoing has no path, so this effect is NaN;
+    the grasp offset shows it instead.
 
     Args:
         log: Log of a work cell.
@@ -296,7 +297,7 @@ def pull_effects(
     effects = []
     for pull in pulls:
         elbow, known = [], [math.nan]
-        # Each phase has another path, from which the elbow is displaced.
+        # Each phase has its own path, and the displacement of the elbow is relative to it.
         for phase, end in lasting(log.events):
             rows = (time >= max(pull.start, phase.time)) & (time < min(pull.end + _AFTER, end))
             if not (rows & (time < pull.end)).any():

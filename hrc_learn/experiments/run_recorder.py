@@ -93,7 +93,7 @@ def record(
         plans: Planned motion to the shelf, for each transfer that began.
         cameras: True cameras, each with the time from which it was used [s]; by default the
             camera of the world.
-        region: Box above the table in which the vision region takes over.
+        region: Box above the table inside which visual servoing takes over.
         demonstration: Demonstration that the motion was learned from.
     """
     # Another thread may call this while the loop runs: take the steps that both logs have.
@@ -151,7 +151,7 @@ def record(
 
 
 def region_of_vision(workplace: Workplace, servo: VisualServoConfig) -> Box:
-    """Box above the table in which the vision region takes over."""
+    """Box above the table inside which visual servoing takes over."""
     x, y, z = workplace.hover().position.tolist()
     return Box(centre=(x, y, z), half_size=servo.half_size)
 

@@ -1,7 +1,7 @@
 """Report of a run: sections, and figures like those of the paper's Experiments 2 and 3.
 
-Most figures take the recording of a run and, by name of the object, the time interval in which
-the robot handled it.
+Most figures take the recording of a run and, for each object, the time interval in which the
+robot handled it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,9 +71,9 @@ def worded(topic: str, figures: Mapping[str, Figure], more: str = "") -> Section
     """Section with the heading, the text and the captions of `run_report.toml`.
 
     Args:
-        topic: Name of the section there.
+        topic: Name of the section in this file.
         figures: Figures by the names of their captions.
-        more: End of the text.
+        more: Text to append.
     """
     said = _TEXTS.section[topic]
     pictures = [Picture(name, drawn, said.captions[name]) for name, drawn in figures.items()]

@@ -49,7 +49,7 @@ class ArmAccess:
     """
 
     open: Callable[[World], AbstractContextManager[OpenedArm]]
-    """Connects to the arm of a world at rest, until the run ends."""
+    """Connects to the arm of a world at rest; the connection lasts until the run ends."""
     delay: float = 0.0
     """Delay from a command until the servos of the arm receive it [s]."""
     dynamics: float = 1.0

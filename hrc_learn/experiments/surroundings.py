@@ -107,8 +107,8 @@ _ENTERS, _REACHES = (4.0, 9.0), (3, 5)
 # of a sleeve. `_CHECKED_EVERY`: time between checks of this distance [s]. `_DRAWS`: largest
 # number of workers that are drawn to find one who can reach under the arm at this distance.
 _KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 60
-# The search ends if none of this many drawn workers can reach under the arm. Where there is
-# room, one in three can.
+# The search ends if none of this many drawn workers can reach under the arm. Under arms with
+# enough room, one worker in three can.
 _HOPELESS = 30
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
 # push creep.
@@ -117,8 +117,9 @@ _AT_REST = 0.01
 _BLOCK = 250
 # Demonstrated visits by different people: 30 hand-overs among 120 other movements.
 _VISITS = 30
-# Basis functions for a movement of about a second: on twelve other visits four functions
-# recognised every kind from its first half; six and eight fit the noise of the tracker.
+# Number of basis functions for a movement of about a second. In a test on twelve other visits,
+# models with four functions recognised every kind of movement from its first half. Models with
+# six and eight functions fit the noise of the tracker.
 _BASIS_FUNCTIONS = 4
 # Waiting position of the end effector relative to its hover position over the table [m].
 _WAITING_OFFSET = (0.05, -0.16, 0.25)
@@ -131,7 +132,8 @@ _FEWEST_IMAGES = 8
 # which the person perceives the position of the robot's hand [m]. `_RELEASE_AFTER`: time for
 # which the robot has held the object when the person releases it [s].
 _APPROACHED, _RESTED, _PERCEPTION_NOISE, _RELEASE_AFTER = 0.05, 0.5, 0.004, 0.3
-# Speed below which a hand rests [m/s], and longest time for which the object is held out [s].
+# Speed below which the robot's hand counts as at rest [m/s], and longest time for which the
+# person holds out the object [s].
 _RESTING_SPEED, _GIVE_UP_AFTER = 0.02, 25.0
 
 
@@ -340,10 +342,10 @@ def near_worker(
     contacts, at each step.
 
     The stopping distance is v_h v/a + v^2/(2 a), where the arm approaches the worker at the
-    speed v, and the worker approaches the arm at the speed v_h. This is the protective distance
-    without reaction time and uncertainty. The margin is the smallest over all parts. It is
-    infinite while the arm approaches no part, and for contacts within the limits of power and
-    force limiting.
+    speed v with the deceleration a, and the worker approaches the arm at the speed v_h. It is
+    the protective distance without reaction time and uncertainty. The margin is the smallest
+    over all parts of the body. It is infinite while the arm approaches no part, and for
+    contacts within the limits of power and force limiting.
 
     Args:
         log: Log of the run.
@@ -471,8 +473,8 @@ def shown_hand_overs(
 ) -> InteractionPrimitive:
     """Model of hand-overs, learned from thirty people seen by the same tracker.
 
-    In the demonstrations the robot's hand moves from its waiting pose to where the object is
-    held out.
+    In the demonstrations, the robot's hand moves from its waiting pose to the place where the
+    person holds out the object.
 
     Args:
         workplace: Workplace of the hand-overs.
@@ -499,7 +501,7 @@ def shown_hand_overs(
 def _movements(
     plan: HandOver, home: np.ndarray, sizes: Imperfections, rng: np.random.Generator
 ) -> Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]]:
-    """Times, hand of the person, hand of the robot, and kind of each movement of one visit."""
+    """Movements of one visit: times, positions of the person's and the robot's hand, kind."""
     now = plan.visit.begin
     sensor = WorkerSensor(plan.visit.ends_at, plan.visit.worker.radius, lambda: now, sizes, rng)
     watch, found = MovementWatch(ReceivingConfig(), *_WATCHED), []

@@ -71,7 +71,7 @@ class TrialFile(Claim):
             made_by: Settings; values that JSON cannot hold are saved as text.
 
         Raises:
-            BusyError: Another process is adding trials to it.
+            BusyError: Another process is adding trials to the file.
             ValueError: If the file holds trials with other settings, or no trials.
         """
         self._path = path
