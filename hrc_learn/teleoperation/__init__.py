@@ -1,4 +1,4 @@
-"""Human input (scripted, by keys, gamepad or browser), hand guiding, recorded demonstrations.
+"""Human input (by script, keys, gamepad or browser), hand guiding, recorded demonstrations.
 
 Devices are in `teleoperation.devices`, the browser page in `teleoperation.page`. Scenarios and
 scripted demonstrations need the simulator and have modules of their own.

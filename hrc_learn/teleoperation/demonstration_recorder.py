@@ -40,10 +40,11 @@ _LONGEST_AT_LIMIT = 0.5
 """Time at a limit above which a demonstration is doubted [s]: a joint may touch its limit
 briefly."""
 _NAMED = 3
-"""Number of contacts named in a doubt: an end effector in a shelf touches many of its parts."""
+"""Largest number of contacts that a doubt names: an end effector inside a shelf may touch many
+parts of the shelf."""
 _PRESSES = 60.0
 """Force at the end effector above which a contact is unexpected [N]: the simulated arm's
-friction feels like 17 N, and a gripper that puts something down presses with 20 to 40 N."""
+friction looks like 17 N, and a gripper that puts something down presses with 20 to 40 N."""
 
 
 class RecordingQuality:
@@ -190,8 +191,9 @@ _LATE, _MOST_LATE = 2.0, 0.2
 that a briefly busy machine raises no warning.
 """
 _SLOWEST = 0.8
-"""Pace of a simulated arm below which a demonstration is doubted. At this pace, the motion in
-the dataset is a quarter faster than demonstrated; even faster motions would reach limits."""
+"""Pace of a simulated arm (`RecordingQuality.pace`) below which a demonstration is doubted. At
+this pace, the motion in the dataset is a quarter faster than demonstrated; even faster motions
+would reach limits."""
 _DRAFT_EVERY = 2.0
 """Shortest period of drafts of the open demonstration [s]."""
 
@@ -216,8 +218,8 @@ class RecorderStatus:
 class DemonstrationRecorder:
     """Records one demonstration at a time, and writes each demonstration worth saving.
 
-    A person needs seconds from the button to the arm, and back: the recorder leaves out most of
-    this rest before and after the motion.
+    A person needs seconds to go from the button to the arm and back. The recorder leaves out
+    most of this rest before and after the motion.
 
     A thread writes the episodes, so that the control loop never waits for the disk. The dataset
     is complete when the `with` block has ended; without an episode, no dataset is written. A

@@ -48,13 +48,13 @@ BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
 """
 
 
-# Rumble: the slow motor reports contact and nearby people, the quick one an input that the arm
-# does not follow. Pulses are easier to notice than motors that run continuously.
+# Rumble: the slow motor reports contact and nearby people; the quick motor reports input that
+# the arm does not follow. Pulses are easier to notice than motors that run continuously.
 PULSE_EVERY, _PULSE = 0.25, 0.12  # period and duration of the pulses [s]
 _LEAST_RUMBLE = 0.1  # fraction of full strength; motors hardly turn below
 _CONTACT = (20.0, 60.0)
 """Contact forces at which pulses begin, and at which they are strongest [N]. Friction of the
-simulated joints feels like 17 N; a scripted person pulls with 60 N at most."""
+simulated joints looks like a contact of 17 N; a scripted person pulls with 60 N at most."""
 
 
 def rumble_strength(feedback: Feedback) -> tuple[float, float]:
@@ -242,7 +242,7 @@ _GRIPPER = {"[": OPEN, "]": 0.0}
 
 
 class TerminalKeyboard(Human):
-    """Moves the end effector by keys: i, k away and back; j, l left, right; u, o up, down.
+    """Moves the end effector by keys: i/k away and back, j/l left and right, u/o up and down.
 
     [ opens the gripper, ] closes it; `KEYS` has the requests. The end effector turns to the
     orientation that `coarse_orientation` gives for its position.
@@ -334,14 +334,15 @@ class HapticDevice(Human):
     force.
 
     When the clutch closes, a virtual pointer starts at the end effector. The pointer moves with
-    the device, scaled by 2.5, and the end effector follows the pointer. The person feels how
-    far the arm is behind:
+    the device, scaled by 2.5, and the end effector follows the pointer. A force f shows the
+    person how far the arm lags behind:
 
         f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
 
-    with the device's position x, and the position x_arm of the device at which the pointer
-    would be at the end effector. The device's axes are those of the base if the person faces
-    the arm: x towards the person, z up.
+    x is the device's position and x' its velocity. x_arm is the device's position at which the
+    pointer would be at the end effector. f_contact is the contact force at the end effector. If
+    the person faces the arm, the device's axes are those of the base: x towards the person, z
+    up.
 
         with HapticDevice.open(panda) as device:
             HandGuidedArm(panda, arm, device)
@@ -426,7 +427,7 @@ class HapticDevice(Human):
         return HumanInput(twist=guiding_twist(tool, velocity, self._forces))
 
     def tell(self, feedback: Feedback) -> None:
-        """Update the forces by which the hand feels the arm's lag and contacts."""
+        """Update the forces that show the arm's lag and contacts to the hand."""
         if self._clutched is None:
             self._pull = None
             return

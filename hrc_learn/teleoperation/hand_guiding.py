@@ -4,8 +4,8 @@ follows the hand, and several inputs are combined and filtered.
 This is the mixed interface of the paper, with gizmos (handles that a person drags) on joints
 and end effector. In the paper, the displacement of a joint's gizmo commands a proportional
 velocity, which the pseudo-inverse of the joint's Jacobian maps to the joints (section VII;
-"pinv" here). By default, the displacement is a force here, which the transpose maps to the
-joints. The gizmo of the end effector requests a velocity of the end effector.
+"pinv" here). Here, the displacement by default commands a force, which the transposed Jacobian
+maps to the joints. The gizmo of the end effector requests a velocity of the end effector.
 """
 
 from dataclasses import dataclass, field, replace
@@ -88,9 +88,9 @@ def force_to_nullspace_input(
         d = J^T f         ("transpose")
         d = c_d J^+ v(f)  ("pinv", the paper's section VII)
 
-    with the Jacobian J of the pulled point. The torques of a force never move this point
-    against the pull, not even after the projection into the null space of the task; the paper's
-    mapping can.
+    with the Jacobian J of the pulled point. With "transpose", this point never moves against
+    the pull, not even after the projection into the null space of the task. With the paper's
+    mapping, it can.
 
     Args:
         chain: The arm.
@@ -248,9 +248,10 @@ class GuidedStep:
 class HandGuidedArm:
     """Executes a person's input at each step, within the safety filter's limits.
 
-    The joint velocity is J^+ v + N c_d^-1 d, with the null-space projection N (paper, eq.
-    globalControl). Here, the end-effector motion v comes from the person instead of the camera.
-    If the person requests no motion, v is the attraction to the drawn region and target.
+    The joint velocity is J^+ v + N c_d^-1 d (paper, eq. globalControl), with the Jacobian J of
+    the end effector, the null-space projection N, the damping c_d and the null-space input d.
+    Here, the end-effector motion v comes from the person instead of the camera. If the person
+    requests no motion, v is the attraction to the drawn region and target.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
@@ -298,7 +299,7 @@ class HandGuidedArm:
         self._posture = joint_position
 
     def step(self) -> GuidedStep:
-        """Read the arm and the human input, then command. The caller lets `dt` pass."""
+        """Read the arm and the human input, then command the arm. The caller lets `dt` pass."""
         state = self._arm.read()
         human_input = self._human.read(state)
         q = torch.from_numpy(state.joint_position)
@@ -331,7 +332,7 @@ class HandGuidedArm:
     def _posture_velocity(
         self, q: Float[torch.Tensor, " joints"], human_input: HumanInput
     ) -> Float[torch.Tensor, " joints"] | None:
-        """Joint velocity towards the posture to move to [rad/s]; None: there is none."""
+        """Joint velocity towards the posture of `move_to` [rad/s]; None: no posture is set."""
         if human_input.twist.any() or human_input.effort(len(q)).any():
             self._posture = None
         if self._posture is None:
@@ -450,7 +451,7 @@ class InputFilter(Human):
     """Bounds the acceleration of the end effector in human input.
 
     A pressed key requests full speed immediately, and a released gizmo requests rest. Without
-    the filter, the arm would jerk, and so would motions learned from it.
+    the filter, the arm and motions learned from it would be jerky.
     """
 
     def __init__(self, human: Human, config: InputFilterConfig | None = None):

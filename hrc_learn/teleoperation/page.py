@@ -53,14 +53,14 @@ class PageConfig(AddressConfig):
     """Settings of the page."""
 
     forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
-    """Gains and bounds of gizmos."""
+    """Gains and bounds of gizmos, the handles that a person drags."""
     silence: float = 0.12
-    """Time without a sign of life from the controlling client after which the arm holds still
-    until the next sign of life [s].
+    """Time without a sign of life (`messages.Beat`) from the controlling client after which the
+    arm holds still until the next sign of life [s].
     """
     timeout: float = 0.6
-    """Time without a sign of life from the controlling client after which everything held is
-    released [s]. A browser that is busy for longer loses its drag.
+    """Time without a sign of life from the controlling client after which the arm is released
+    from all drags [s]. If a browser is busy for longer, its drag ends.
     """
     meshes: bool = True
     """True draws the arm with its meshes, False with capsules. With capsules, a browser without
@@ -110,15 +110,15 @@ class Page:
                 page.show(status)
 
     The control loop spends time only in `human.read`, `place` and `show`, which exchange
-    references. viser's objects are changed only in viser's own event loop, because its queues
-    break otherwise.
+    references. The library viser draws the scene. Its objects are changed only in its own event
+    loop, because its queues break otherwise.
 
     Attributes:
         human: Combined input of the people at the page.
         address: Address of the page.
         url: Link with the secret. Anyone with this link can move the arm.
         watch_url: Link for watching only.
-        headset_url: Link for headsets and phones; empty if that client is not built.
+        headset_url: Link for headsets and phones; empty if the headset client is not built.
         control: Control of the arm by one client at a time.
         farewell: Text shown in browsers when the page is closed.
     """
@@ -144,7 +144,7 @@ class Page:
             guides: True if the person guides the end effector and records demonstrations;
                 False if the arm works autonomously.
             draws: True if people draw regions, mark targets and turn the end effector; None:
-                same as `guides`. People can always pull in the null space.
+                the value of `guides`. People can always pull the arm in its null space.
         """
         import viser
 
@@ -246,8 +246,8 @@ class Page:
         """Show the present poses of the bodies; called after each step.
 
         Args:
-            world: World with the same bodies, which replaces the last one; None: the same
-                world.
+            world: World with the same bodies, which replaces the present world; None keeps the
+                present world.
         """
         from hrc_learn.sim import MovingBodies
 
@@ -339,8 +339,8 @@ class Page:
     def _command(self, state: ArmState) -> GizmoCommand:
         """Renew the person's input.
 
-        The server notices a lost connection, as from an unplugged cable, much later, and a
-        pointer at rest sends nothing. Signs of life are therefore checked separately.
+        The server notices a lost connection, for example after a cable was unplugged, only much
+        later. A pointer at rest sends nothing. Signs of life are therefore checked separately.
         """
         control, panel, held = self.control, self._panel, self._held_gizmos
         if control.gone:
@@ -370,7 +370,7 @@ class Page:
         return command
 
     def _let_go(self) -> None:
-        """Release what was held before control changed."""
+        """Release everything that was held before control changed."""
         self._held_gizmos.release()
         self._hands.forget()
 

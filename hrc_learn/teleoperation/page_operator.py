@@ -1,6 +1,6 @@
-"""Combine the people at the page into one `Human`: held gizmos (by mouse or hand), other input.
+"""Combine the people at the page into one `Human`: gizmos held by mouse or hand, other input.
 
-A gizmo is a link of the arm, or its end effector, as a handle that a person drags.
+A gizmo is a handle that a person drags: a link of the arm, or its end effector.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class HeldGizmo:
     """Gizmo that a person holds in a browser."""
 
     joint: int | None
-    """Joint that moves the link held, counted from 1; None: the end effector is held."""
+    """Joint that moves the held link, counted from 1; None: the end effector is held."""
     held_at: Float[np.ndarray, "3"]
     """Held point, in the frame of the link; for the end effector: offset of the held point from
     the tool centre point, along the base axes [m]."""
@@ -132,9 +132,9 @@ class HeldGizmos:
         self._changed()
 
     def release(self, holder: Hashable = None, name: str | None = None) -> None:
-        """Release one gizmo of a holder, all gizmos of a holder, or all that are held.
+        """Release one gizmo of a holder, all gizmos of a holder, or all held gizmos.
 
-        Once a lost connection has returned, the person must take the gizmo again.
+        After a lost connection has returned, the person must take the gizmo again.
         """
 
         def chosen(key: Key) -> bool:
@@ -184,7 +184,7 @@ _AT_REST = np.array([1.0, 0.0, 0.0, 0.0])  # unit quaternion (wxyz)
 
 
 class HeadsetHands:
-    """Converts what two hands hold into held gizmos, with the same rules as for the mouse.
+    """Converts the grips of two hands into held gizmos, with the same rules as for the mouse.
 
     A message lists everything that is held; whatever is no longer listed is released.
 
@@ -310,11 +310,11 @@ class GizmoCommand:
     """Null-space input and end-effector motion, and the arrows that show the pulls."""
 
     nullspace_input: Float[np.ndarray, " joints"]
-    """d [N m]."""
+    """Null-space input d [N m]."""
     twist: Float[np.ndarray, "6"]
     """Twist of the end effector: linear [m/s] and angular [rad/s]."""
     arrows: Float[np.ndarray, "gizmos 2 3"]
-    """Arrows from the points held to the pointers, in the base frame [m]."""
+    """Arrows from the held points to the pointers, in the base frame [m]."""
     held: tuple[int | None, ...] = ()
     """Joints that are held, counted from 1; None: the end effector."""
 

@@ -26,8 +26,8 @@ else:
 
 
 def in_loop[Event](callback: Callable[[Event], object]) -> Callable[[Event], Any]:
-    """Make viser call a callback in its event loop rather than in a pool thread: only in that
-    loop may viser's handles be changed.
+    """Make viser call a callback in its event loop rather than in a pool thread: viser's
+    handles may be changed only in this loop.
     """
 
     async def called(event: Event) -> None:
@@ -51,7 +51,7 @@ _KNOBS = (2, 4, 6)
 
 
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
-"""Colour of the virtual twin, translucent."""
+"""Colour of the virtual twin, a translucent copy of the arm that can be held instead of it."""
 _TWIN_AT = (-0.1, 1.3, 0.0)
 """Position of the virtual twin relative to the arm [m]."""
 _PARENTS = ("", "/twin")
@@ -178,8 +178,8 @@ class PageScene:
         """Show the pulls as arrows; the colour shows how far the arm follows.
 
         Args:
-            arrows: Arrows from the points held to the pointers, in the base frame [m].
-            colour: Colour of the arrows and of the knobs held.
+            arrows: Arrows from the held points to the pointers, in the base frame [m].
+            colour: Colour of the arrows and of the held knobs.
             held: Joints that are held, counted from 1; None: the end effector.
         """
         for joint, knobs in self._knobs.items():

@@ -32,7 +32,8 @@ from hrc_learn.teleoperation.hand_guiding import (
 from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba
 
-# Half thickness of the fields drawn on the boards [m]: enough not to flicker with the board.
+# Half thickness of the fields drawn on the boards [m]: thick enough that a field and its board
+# do not flicker.
 _THICKNESS = 0.002
 # Control steps between two statuses on the page: ten times a second at 10 ms.
 _SHOW_EVERY = 10
@@ -284,7 +285,7 @@ def recorded_frame(step: GuidedStep, hands: Mapping[str, TrackedHand]) -> Frame:
 
 
 class TaskPage(Page):
-    """Page next to a task that runs autonomously: people watch it and pull the arm.
+    """Page for a task that runs autonomously: people watch it and pull the arm.
 
     Attributes:
         cell: Work cell of the task, whose log is shown; None: it has not begun.

@@ -155,8 +155,8 @@ class Control:
             self._acted = self._clock()
 
     def ask(self, client: str) -> None:
-        """Request control. If no client has control, this client gets it immediately; otherwise
-        when the controlling client hands over or is idle.
+        """Request control. If no client has control, this client gets it immediately.
+        Otherwise, it waits until the controlling client hands over or is idle.
         """
         with self._lock:
             one = self._clients.get(client)
@@ -187,8 +187,8 @@ class Control:
 
     @property
     def slow(self) -> tuple[float, float]:
-        """Silence and lag of the controlling client that slowed it down lately [s]; zero if
-        nothing did.
+        """Silence and lag of the controlling client when it was last slow [s]; zeros if this
+        was too long ago.
         """
         with self._lock:
             if (leader := self._leading()) is None:
@@ -206,8 +206,9 @@ class Control:
 
         Returns:
             `role` ("leads" or "watches"), `taken` (true if any client has control), `asked`
-            (for the leader: true if another client has requested control; for another client:
-            true if it has requested control) and `may_lead` (false: it may only watch).
+            (for the controlling client: true if another client has requested control; for any
+            other client: true if it has requested control itself) and `may_lead` (false: the
+            client may only watch).
         """
         with self._lock:
             self._pass_on()

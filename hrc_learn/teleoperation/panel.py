@@ -26,14 +26,14 @@ from hrc_learn.viz.report import page_templates
 
 @dataclass(frozen=True, kw_only=True)
 class PageStatus(RecorderStatus):
-    """Session status shown on the page; `seconds` is the working time of an autonomous arm."""
+    """Session status shown on the page; of an autonomous arm, `seconds` is the working time."""
 
     title: str = ""
     """Name of the guided arm."""
     doing: str = ""
     """Present activity of an autonomous arm; empty if a person guides and records."""
     interventions: Mapping[str, int] = field(default_factory=dict)
-    """Steps in which each kind of intervention of the safety filter was needed."""
+    """Number of steps with an intervention of the safety filter, by kind of intervention."""
     contacts: int = 0
     """Number of contacts with the surroundings."""
     region: DrawnRegion | None = None
@@ -49,7 +49,7 @@ def panel_texts() -> Any:
     return templates.get_template("panel.html", globals=vars(palette)).module
 
 
-# `_LEAST_CONTACT`: smallest contact force shown [N]; simulated joint friction feels like 17 N.
+# `_LEAST_CONTACT`: smallest contact force shown [N]; simulated joint friction looks like 17 N.
 # `_LEAST_SLIP`: smallest change of a gripper's opening that is a slip rather than noise [m].
 _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
 

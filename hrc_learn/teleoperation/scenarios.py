@@ -243,7 +243,7 @@ class ScenarioRun:
             width: Opening of the gripper [m].
 
         Returns:
-            Joint positions commanded instead, within the limits [rad].
+            Joint positions that were commanded in the end, within the limits [rad].
         """
         with torch.inference_mode():
             _, sent = self.servo.follow(joints)
@@ -278,7 +278,7 @@ class ScenarioRun:
 
     @cached_property
     def _sensor(self) -> MarkerSensor:
-        """Marker detector of the fixed camera, which sees the object only."""
+        """Marker detector of the fixed camera, for an image of the object alone."""
         return self._sensor_of(self.scenario.workplace.scene.objects[0].marker, self._noise)
 
     def tool_pixel(self) -> Float[np.ndarray, "2"] | None:
@@ -329,8 +329,8 @@ class ScenarioRun:
     def _watched(self) -> Float[np.ndarray, "points 3"]:
         """Points that the camera must see, in the base frame [m].
 
-        Corners of the objects' region on the table, and of the region of the tool's marker at
-        two heights above it.
+        They are the corners of the objects' region on the table, and the corners of the region
+        of the tool's marker at two heights above the table.
         """
         place = self.scenario.workplace
         middle, half = (x.numpy() for x in place.object_region())

@@ -103,7 +103,7 @@ class ServoDemonstrationConfig(DemonstrationConfig):
     yaw: float = math.pi
     """Largest turn of the object on the table, either way [rad]."""
     wobble: float = 0.12
-    """Amplitude of small rotations during the motion, whose effect the images show [rad]."""
+    """Amplitude of small rotations during the motion [rad]; the images show their effect."""
     record_every: int = 4
     """Control steps from one recorded frame, and image, to the next."""
     markerless: bool = False
@@ -121,7 +121,7 @@ def servo_expert(
     rng: np.random.Generator,
     turned: float = 0.0,
 ) -> ScriptedExpert:
-    """Expert that moves over the table and ends at the point `above` [m], gripper down.
+    """Expert that moves over the table and ends at `above` [m], with the gripper down.
 
     On the way, the gripper turns by `turned` [rad] about the vertical. The motions train the
     image Jacobian. The end points define the goal pixel of the marker and the orientation of

@@ -58,7 +58,8 @@ _PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
 """Ranges of the pause between two pulls and of the duration of a pull [s]. The paper's drags of
 joint 4 last 4 to 7 s."""
 _FAR_AWAY = 10.0
-"""Distance of the point that a pull is directed to [m]: so far that the direction stays."""
+"""Distance of the point that a pull is directed to [m]: so large that the direction hardly
+changes while the arm moves."""
 _SLOPE = math.radians(30.0)
 """Largest angle of a pull to the horizontal [rad]: people pull an elbow aside."""
 _FORCE = 60.0
@@ -92,7 +93,7 @@ def random_pulls(
 
 
 class ScriptedPerturbation(Human):
-    """Person whose only input is pulling the arm at given times."""
+    """Person that only pulls the arm, at given times."""
 
     def __init__(
         self, chain: SerialChain, forces: Sequence[ScriptedForce], begin: float | None = 0.0

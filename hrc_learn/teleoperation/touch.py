@@ -3,9 +3,9 @@
 A push at the elbow moves the arm in the null space, a push at the end effector pauses the task,
 and a sudden contact stops the arm. This needs no device, only estimates of external torques.
 
-A wrench W at the end effector causes joint torques J^T W without a null-space component.
-Torques in the null space therefore come from further up the arm: from the person, regardless of
-what the gripper holds, lifts or puts down.
+A wrench W at the end effector causes joint torques J^T W (J: Jacobian of the end effector),
+which have no null-space component. Torques in the null space therefore come from further up the
+arm: from the person, regardless of what the gripper holds, lifts or puts down.
 """
 
 from __future__ import annotations
@@ -221,8 +221,8 @@ _CHANGES = 8.0
 _MET = np.array([60.0] * 3 + [10.0] * 3)
 
 
-# Change of the gripper's opening between two readings above which the fingers move [m]: 10 mm/s
-# at 100 Hz, half the slowest speed of a gripper.
+# Change of the gripper's opening between two readings above which the fingers count as moving
+# [m]: 10 mm/s at 100 Hz, half the slowest speed of a gripper.
 _FINGERS_MOVE = 1e-4
 
 

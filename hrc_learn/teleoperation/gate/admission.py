@@ -13,7 +13,8 @@ from hrc_learn.teleoperation.gate.address import Address, AddressConfig, network
 Right = Literal["act", "watch"]
 """Right of a client: to act on the arm or the data, or only to watch."""
 
-# Wrong secrets allowed at once, and per second: a secret of 144 bits cannot be guessed.
+# Number of wrong secrets allowed at once, and per second. At this rate, a secret of 144 bits
+# cannot be guessed.
 _WRONG_SECRETS, _FORGIVEN = 20.0, 1.0
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 else:
     ServerConnection = Request = Response = Any
 
-_LARGEST = 16_384  # bytes of a message: the longest of ours has 1.5 kB
+_LARGEST = 16_384  # bytes of a message: our longest message has 1.5 kB
 _RATE, _BURST = 400.0, 800.0  # messages per second, and at once: a mouse sends 2 x 125 per s
 _HANDSHAKE = 30.0
 """Longest time from connecting to the answer [s]; the slowest answer is a block of images."""
@@ -47,7 +47,7 @@ _SESSION_WAIT = 3.0
 """Longest time that a socket waits until the session of its client is open [s]."""
 _POLL = 0.05  # period of checking for the session [s]
 _FAREWELL, _CLOSING = 0.5, 1.0  # longest times to send the last message, and to close [s]
-_PING, _PONG = 5.0, 10.0  # time between pings, and longest time to the answer [s]
+_PING, _PONG = 5.0, 10.0  # time between pings, and longest time until the answer [s]
 _TOO_MUCH, _FAILED, _FULL = 1008, 1011, 1013  # codes of the WebSocket protocol (RFC 6455)
 _SECRET = "secret."  # begins the subprotocol that carries the secret
 

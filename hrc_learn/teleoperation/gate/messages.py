@@ -46,7 +46,7 @@ class Beat(_Message, tag="beat"):
     """A sign of life, several times a second."""
 
     lag: _Time
-    """Time since the page last responded to its worker, which sends these messages [s]."""
+    """Time since the page last responded to its web worker, which sends these messages [s]."""
 
 
 class Hello(_Message, tag="hello"):
@@ -56,7 +56,7 @@ class Hello(_Message, tag="hello"):
 
 
 class Lead(_Message, tag="lead"):
-    """Request for control, or hand-over."""
+    """Request for control of the arm, or hand-over of control to a waiting client."""
 
     wish: Literal["ask", "hand_over"]
 
@@ -100,7 +100,7 @@ class Grip(_Message):
 
     hand: Literal["left", "right", "touch"]
     joint: Annotated[int, Meta(ge=1, le=100)] | None
-    """Joint that moves the link held, counted from 1; None: the end effector."""
+    """Joint that moves the held link, counted from 1; None: the end effector is held."""
     start: Point
     """Point at which the hand took hold, in the base frame [m]."""
     pointer: Point
@@ -116,7 +116,7 @@ class Grip(_Message):
 
 
 class TrackedHand(_Message):
-    """Tracked pose of a hand, whether it holds something or not."""
+    """Tracked pose of a hand, which may hold something or not."""
 
     hand: Literal["left", "right"]
     position: Point
