@@ -1,8 +1,8 @@
-"""Run the drivers of arms and grippers in processes of their own, which answer calls.
+"""Run the drivers of arms and grippers in separate processes, and call them from a loop.
 
 An arm is brought to rest when its program ends, and when its control loop stalls, is suspended
 or dies. Each command shows the driver's process that the loop is alive, and each answer shows
-the loop that the process is alive. Both notice within the timeout if the other is gone.
+the loop that the process is alive. Each side notices within the timeout if the other is gone.
 """
 
 from __future__ import annotations
@@ -104,8 +104,9 @@ class DriverProcess:
         """Start the process and wait until its driver is connected.
 
         Args:
-            serve: Function that runs in the process, with the process's end of the connection
-                and `arguments`; must be picklable. See `opened` and `answer_calls`.
+            serve: Function that runs in the process; must be picklable. Its arguments are the
+                process's end of the connection, then `arguments`. See `opened` and
+                `answer_calls`.
             arguments: Further arguments of `serve`.
             name: Name of the device.
 
@@ -165,7 +166,7 @@ class DriverProcess:
             self.kill()
 
     def kill(self) -> None:
-        """Kill the process, whatever call it is in."""
+        """Kill the process, even during a call."""
         if self.process.is_alive():
             self.process.kill()
         self.process.join()
@@ -323,8 +324,9 @@ class ArmProcess:
     is lost: this ends the motion of any arm with a control box, and the loop's next request
     raises `WatchdogError`.
 
-    After the process has stopped the arm (a trip), it ignores commands until an answer has
-    updated `trips`. The new number shows the loop that it has to start from rest.
+    After the process has stopped the arm (a trip), it ignores commands until the loop has
+    received the new value of `trips`. From this value, the loop knows that it has to start from
+    rest.
 
     Every method raises `DriverError` with the driver's own exception, and `WatchdogError` if
     the process does not answer within the timeout.
@@ -364,7 +366,9 @@ class ArmProcess:
         return self._call("read")
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
-        """Set the joint velocities [rad/s]. A command without an error is a sign of life."""
+        """Set the joint velocities [rad/s]. This counts as a sign of life, unless it raises an
+        error.
+        """
         self._call("command", np.asarray(joint_velocity, dtype=float), self.trips)
 
     def move(self, width: float) -> None:

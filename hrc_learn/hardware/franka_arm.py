@@ -38,11 +38,11 @@ from hrc_learn.protocols import ArmState
 _STARTUP = 60.0
 """Timeout for connecting [s]."""
 _STALE = 0.2
-"""Age of a reading at which the loop counts as stalled [s]: ten times what the control box
-allows before it stops the arm by itself."""
+"""Age of a reading at which the loop counts as stalled [s]: ten times the delay after which the
+control box stops the arm by itself."""
 _STALE_IN_LOCKSTEP = 2.0
-"""The same age for a simulator [s], whose machine may be busy with the task. libfranka itself
-gives up a connection after 1 s."""
+"""Like `_STALE`, for a simulator in lockstep [s]: its machine may be busy with the task.
+libfranka itself gives up a connection after 1 s."""
 _RECOVERY = 15.0
 """Timeout for recovery [s]; the control box needs some seconds."""
 _LOOK = 0.02
@@ -63,8 +63,8 @@ class FrankaArm(Connected):
             while servoing():
                 arm.command(velocity(arm.read()))
 
-    Loop and gripper run in processes of their own: nothing that Python does here delays them,
-    and only `stop`, `recover` and `close` wait for them. A velocity holds for
+    The loop and the gripper run in separate processes: Python code in this process cannot delay
+    them, and only `stop`, `recover` and `close` wait for them. A velocity holds for
     `FrankaConfig.timeout`; afterwards, or when this process has died, the loop brings the arm
     to rest and ends the motion. The arm therefore needs no `ArmProcess` around it. If the loop
     dies or stalls, the control box stops the arm after 20 ms.
@@ -194,7 +194,7 @@ class FrankaArm(Connected):
         self._await(still, self._rest, "stop")
 
     def move(self, width: float) -> None:
-        """Open the gripper to a width, or squeeze what is between its fingers [m].
+        """Open the gripper to a width [m], or squeeze what is between its fingers (below 5 mm).
 
         Does not wait. Failures appear on stderr and are raised by `gripper.check`.
 

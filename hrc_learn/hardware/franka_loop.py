@@ -1,11 +1,11 @@
-"""Run the 1 kHz loop of a Franka arm, in a process of its own.
+"""Run the 1 kHz loop of a Franka arm in a separate process.
 
 Each millisecond the control box sends the state of the arm and takes one answer. pylibfranka
 holds the GIL while it waits, and a busy interpreter answers late: so nothing else runs in this
 process. Other processes communicate with it through shared memory; neither side ever waits.
 
-The wanted velocity passes the exported step (`VelocityStep`), which enforces the limits of
-position, velocity, acceleration, jerk and tool speed. In the first cycle and after each lost
+The wanted velocity passes through the exported step (`VelocityStep`), which enforces the limits
+of position, velocity, acceleration, jerk and tool speed. In the first cycle and after each lost
 one, the step starts from the commanded velocity and acceleration that the control box reports,
 because the box continues with a constant acceleration when an answer is missing.
 """
@@ -134,18 +134,18 @@ class Punctuality:
     """Detects answers that would be too late, from the clocks of this machine and the robot.
 
     After a delay, the process reads a state whose cycle is over. The box would drop an answer
-    or, worse, use it in another cycle: sending none is better. A simulator's clock may run
-    slower than real time on a busy machine; an answer is not late for this alone. Of two
-    successive states, at least one is answered, however late, so that the arm moves even if
-    each answer takes longer than a cycle.
+    or, worse, use it in another cycle. It is therefore better to send no answer. A simulator's
+    clock may run slower than real time on a busy machine; this alone does not make an answer
+    late. Of two successive states, at least one is answered, however late, so that the arm
+    moves even if each answer takes longer than a cycle.
     """
 
     def __init__(self, *, lockstep: bool = False):
         """Start before the first state.
 
         Args:
-            lockstep: True for a simulator that waits for each answer, so that none is late, and
-                may stand still in between.
+            lockstep: True for a simulator that waits for each answer, and whose clock may stand
+                still in between. No answer is then late.
         """
         self._lockstep = lockstep
         self._last = math.nan
@@ -245,8 +245,8 @@ class ControlLoop:
         return np.zeros(JOINTS) if self._idles() else self._orders.joint_velocity
 
     def _idles(self) -> bool:
-        """True without a current command: the last one is too old, was a stop, or came before
-        the last recovery.
+        """True if there is no current command: the last command is too old, was a stop, or came
+        before the last recovery.
         """
         stamp = self._orders.stamp
         silent = time.monotonic() - stamp >= self._config.timeout

@@ -1,7 +1,7 @@
 """Memory through which a Franka arm's 1 kHz loop and the process that commands it communicate.
 
-Orders go to the loop, and reports come back. A mailbox for the orders and one for the reports
-hold the newest values as a line of numbers, so that neither process waits for the other.
+Orders go to the loop, and reports come back. Two mailboxes hold the newest order and the newest
+report, each as a line of numbers. Neither process ever waits for the other.
 """
 
 from __future__ import annotations
@@ -132,11 +132,11 @@ class Report(Numbers):
     resting: bool = True
     """True if the velocity sent last is practically zero, or a fault has stopped the arm."""
     joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """[rad]"""
+    """Joint positions [rad]."""
     joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """[rad/s]"""
+    """Joint velocities [rad/s]."""
     external_torque: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """[N m]"""
+    """External torques at the joints, as the control box estimates them [N m]."""
 
 
 @final

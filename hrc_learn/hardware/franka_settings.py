@@ -131,13 +131,13 @@ class FrankaConfig(FrankyConfig):
     """Settings of an arm's 1 kHz loop.
 
     If an answer is late, the loop cannot know in which cycle the control box uses it. An answer
-    used in a wrong cycle adds a change of acceleration of up to the present acceleration. With
-    `dynamics` of 0.3, this stays within the jerk limit of an FR3, 5000 rad/s^3: a change of
-    3 rad/s^2 within 1 ms is a jerk of 3000 rad/s^3, and 1500 rad/s^3 are planned.
+    used in the wrong cycle changes the acceleration by up to its present value. With `dynamics`
+    of 0.3, this stays within the jerk limit of an FR3, 5000 rad/s^3: a change of 3 rad/s^2
+    within 1 ms adds a jerk of 3000 rad/s^3 to the planned 1500 rad/s^3.
 
     Without real-time scheduling, some answers are late; the control box tolerates up to 20
-    missing answers in a row. With `realtime=False`, too, the loop sets real-time priority if it
-    is allowed to.
+    missing answers in a row. The loop sets real-time priority whenever it is allowed to, even
+    with `realtime=False`.
     """
 
     grip_force: float = 40.0

@@ -151,7 +151,7 @@ class FrankyArm(Connected):
         self._fault, self._lost = "", False
 
     def move(self, width: float) -> None:
-        """Open the gripper to a width, or squeeze what is between its fingers [m].
+        """Open the gripper to a width [m], or squeeze what is between its fingers (below 5 mm).
 
         Does not wait. Failures appear on stderr and are raised by `gripper.check`.
         """

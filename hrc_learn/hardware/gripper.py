@@ -66,9 +66,9 @@ class GripperThread(Connected):
             gripper.check()  # raises what has failed since `move`
 
     One thread reads the width. Another thread executes the requests: after each request, it
-    continues with the newest. A lost connection is reopened. Failures are printed on stderr and
-    kept until the next move, so that a task can check for failures at a suitable moment while
-    the control loop continues.
+    continues with the newest one. A lost connection is reopened. Failures are printed on stderr
+    and kept until the next move, so that a task can check for failures at a suitable moment
+    while the control loop continues.
 
     Attributes:
         failure: Failure since the last new opening was requested; None if there was none.

@@ -31,8 +31,8 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
 _SLOPE = 5
-"""Number of readings whose slope is the velocity: with two readings at 50 Hz, one step of a
-12-bit encoder would be 0.08 rad/s."""
+"""Number of readings through which a line is fitted; its slope is the velocity. With only two
+readings at 50 Hz, one step of a 12-bit encoder would appear as 0.08 rad/s."""
 _STATUS = 0.5
 """Time between two readings of the servos' status [s]."""
 _CONFIRMED, _LATE = 3, 0.005
@@ -59,7 +59,7 @@ class LeRobotConfig:
     opening: float = 0.08
     """Opening of the gripper at LeRobot's 100 % [m]."""
     unit: Literal["", "deg", "rad"] = ""
-    """Unit of the joints. Empty: from the robot's calibration."""
+    """Unit of LeRobot's joint values. Empty: taken from the robot's calibration."""
     zeros: dict[str, float] = field(default_factory=dict)
     """Joint positions, in the arm's description, at which LeRobot's values are 0 [rad]."""
     reversed: tuple[str, ...] = ()
@@ -193,7 +193,7 @@ class LeRobotArm(Connected):
                 self._look()
                 fault = self._alarm()
                 bus = getattr(self._robot, "bus", None)
-                if bus is not None and not fault:  # a servo cuts its torque with an alarm
+                if bus is not None and not fault:  # a servo cuts its torque on an alarm
                     bus.enable_torque()
             except Exception as error:
                 fault = f"the bus does not answer ({in_words(error)}): check cable and power."
@@ -206,7 +206,9 @@ class LeRobotArm(Connected):
                 self._behind_since = math.inf
 
     def close(self) -> None:
-        """Stop the arm and disconnect; LeRobot's settings decide if the torque goes off."""
+        """Stop the arm and disconnect; LeRobot's settings decide whether the servos lose
+        torque.
+        """
         atexit.unregister(self.close)
         self._ended.set()
         self._thread.join(5.0)
@@ -252,7 +254,8 @@ class LeRobotArm(Connected):
         for _ in range(_CONFIRMED):
             if not any(alarms.values()):
                 return ""
-            # The SDK may have mistaken a late reply to another request for this one's.
+            # The SDK may have mistaken a late reply to an earlier request for the reply to this
+            # one.
             time.sleep(_LATE)
             forget_late_replies(self._robot)
             again = self.units.alarms(self._robot)
@@ -267,7 +270,9 @@ class LeRobotArm(Connected):
         return ""
 
     def _advance(self) -> None:
-        """Move the goal by the velocity, until now or until the velocity has expired."""
+        """Integrate the commanded velocity into the goal, up to now or until the velocity has
+        expired.
+        """
         now = time.monotonic()
         until = min(now, self._commanded_at + self.config.timeout)
         elapsed = max(0.0, until - self._moved_at)

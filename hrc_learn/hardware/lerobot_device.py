@@ -20,7 +20,7 @@ _ATTEMPTS = 3
 _LONG = {"robot": "robot", "teleop": "teleoperator"}
 """Prefix of an option -> word in the names of LeRobot's packages, classes and functions."""
 _STATUS_REGISTERS = ("Status", "Hardware_Error_Status")
-"""Registers of Feetech and Dynamixel servos, 0 without a fault."""
+"""Status registers of Feetech and Dynamixel servos; 0 means that there is no fault."""
 
 
 def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -> Any:

@@ -1,7 +1,7 @@
 """Use OpenCV's cameras, streams and video files as a `Camera`, and measure the delay of images.
 
-Neither lens nor camera pose has to be known. Each image has an age, from which the controller
-finds the arm's position at exposure.
+Neither the lens nor the pose of the camera has to be known. Each image has an age, from which
+the controller finds the position that the arm had at the exposure.
 
 The delay is measured by moving the robot: a joint turns back and forth, and the position of its
 marker in the images lags behind the joint. No calibration is needed: over such a small motion,
@@ -174,9 +174,9 @@ def taken_by(capture: Any, now: float, oldest: float) -> float:
     """Time at which the image just grabbed was taken, on `time.monotonic` [s].
 
     Linux drivers stamp their buffers with that clock, and OpenCV reports the stamp as the
-    position of the video (CAP_PROP_POS_MSEC, backend V4L2). Any other position, not
-    shortly before now, counts from the start of the stream or is undefined: then the time of
-    arrival is used.
+    position of the video (CAP_PROP_POS_MSEC, backend V4L2). A position that does not lie
+    shortly before now counts from the start of the stream or is undefined. In this case, the
+    time of arrival is used.
 
     Args:
         capture: OpenCV's capture.

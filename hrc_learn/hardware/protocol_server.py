@@ -1,10 +1,11 @@
 """Serve the simulated workplace over the network protocol of a Franka arm.
 
 A driver for the real arm connects over sockets and controls the simulated arm in cycles of
-1 ms. The package franky-sim implements the protocol, `World` the physics. The server reports a
-Franka Research 3 (server version 10), but the physics is a Panda with our limits. This does not
-affect joint velocities and positions, whose limits the driver enforces. Poses are those of the
-Research 3 model; dynamics are not reported, and torque commands have no effect.
+1 ms. The package franky-sim implements the protocol, and `World` simulates the physics. The
+server identifies itself as a Franka Research 3 (server version 10), but the simulated arm is a
+Panda with our limits. This does not affect joint velocities and positions, whose limits the
+driver enforces. Poses are those of the Research 3 model; dynamics are not reported, and torque
+commands have no effect.
 """
 
 import random
@@ -23,7 +24,7 @@ from hrc_learn.protocols import ArmState
 from hrc_learn.sim.world import World
 
 _LATE = 0.01
-"""Longest wait for the driver's answer in a cycle [s]: ten times what it takes on a busy
+"""Longest wait for the driver's answer in a cycle [s]: ten times the usual delay on a busy
 machine.
 """
 _SIGN_OF_LIFE = 0.05
@@ -43,10 +44,9 @@ class ArmServer:
                 arm.command(velocity)
             server.advance(0.01)
 
-    Time is the world's: within `advance`, each cycle waits for the driver's answer. Outside
-    `advance`, the world stands still so that it may be inspected, apart from rare cycles that
-    keep the connection alive. Driver calls that may wait for the next cycle belong within
-    `running`.
+    Time is simulated: within `advance`, each cycle waits for the driver's answer. Outside
+    `advance`, the world stands still so that it can be inspected; only rare cycles keep the
+    connection alive. Use `running` around driver calls that may wait for the next cycle.
 
     In a cycle without an answer, the arm keeps its acceleration, as with a real control box and
     velocity commands.

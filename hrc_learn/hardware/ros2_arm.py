@@ -28,8 +28,8 @@ from hrc_learn.protocols import ArmState
 from hrc_learn.watchdog import Watchdog
 
 _CLOCK_RESET = 1.0
-"""Backward step of the time stamps [s] above which the clock must have been reset. After a
-smaller step, the message was only reordered, unless no newer message comes for `silence`."""
+"""Backward step of the time stamps [s] above which the clock must have been reset. A smaller
+step means that the message was reordered, unless no newer message comes for `silence`."""
 _DRIFT = 5e-4
 """Fastest drift of the robot's clock against this machine's [s/s]: NTP slews a clock by 500 ppm
 at most. A difference that grows faster is a delay of the messages, unless the clock is that of
@@ -62,8 +62,8 @@ class Ros2Config:
     the end effector at the tool centre point, along the axes of its frame: `base` or
     `wrench_frame`."""
     wrench_frame: str = "tool0"
-    """Frame with the axes of the end effector; a wrench without a frame is taken to be in it. A
-    wrench in another frame stops the arm."""
+    """Frame with the axes of the end effector; a wrench without a frame is assumed to be in
+    this frame. A wrench in an unknown frame stops the arm."""
     gripper: str = ""
     """Topic of a gripper's position controller (Float64MultiArray); empty: no gripper."""
     gripper_joint: str = ""
@@ -88,15 +88,16 @@ class Ros2Arm(Connected):
     """An arm of ros2_control, or one with the same topics, driven by velocities.
 
     A velocity holds for at most the config's `timeout`. Reordered or incomplete joint states
-    are ignored; once the newest, or the newest wrench, is older than `silence`, `read` and
-    `command` raise `ArmFaultError` until new ones come. If this process dies, a trajectory ends
-    at rest by itself, and a position is held. A velocity controller would hold its last command
-    for ever: therefore, a guard in a process of its own then sends zeros.
+    are ignored; once the newest joint state or the newest wrench is older than `silence`,
+    `read` and `command` raise `ArmFaultError` until a new one arrives. If this process dies, a
+    trajectory ends at rest by itself, and a position is held. A velocity controller would hold
+    its last command for ever. In that case, a guard in a separate process therefore sends zero
+    velocities.
 
     Attributes:
         session: The node.
-        ignored: Number of joint states with all joints that were reordered, or lacked a finite
-            position of a joint.
+        ignored: Number of joint states that named all joints, but were ignored because they
+            were reordered or contained a position that is not finite.
         received: Arrival time of the newest joint state, by this machine's monotonic clock [s].
         answer: Called after each new joint state, in the thread that has received it.
     """
@@ -231,7 +232,7 @@ class Ros2Arm(Connected):
         )
         with self._changed:
             # The fastest message so far determines the offset of the robot's clock.
-            # 1: a clock of any speed, even one that stands still.
+            # A drift of 1 allows for a clock of any speed, even one that stands still.
             drift = 1.0 if self.session.node.count_publishers("/clock") else _DRIFT
             drifted = self._offset + drift * (now - self.received)
             self._offset = now - stamp if last is None else min(drifted, now - stamp)
@@ -282,7 +283,9 @@ class Ros2Arm(Connected):
             self._send(velocity, state)
 
     def _send(self, velocity: np.ndarray, state: ArmState) -> None:
-        """Send a velocity, starting from where the previous one has moved the goal by now."""
+        """Send a velocity, starting from the goal that the previous velocity has reached by
+        now.
+        """
         now, config, rest = time.monotonic(), self.config, self.config.timeout
         elapsed = now - self._moved_at
         # Distance that the goal has moved since, as a time at the previous velocity.

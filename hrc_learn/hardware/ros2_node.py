@@ -216,7 +216,7 @@ class ControllerNode:
     shutdown = cleanup
 
     def _watch(self, arm: Ros2Arm) -> None:
-        """Stop when joint states or heartbeats stay away, until deactivated."""
+        """Until deactivated, stop the arm as soon as joint states or heartbeats stay away."""
         while not self._inactive.wait(self._config.silence / 4):
             with self._stopping_faults():
                 arm.read()

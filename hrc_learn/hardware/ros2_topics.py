@@ -40,7 +40,7 @@ def ros2_origin() -> str:
 
 
 class Ros2Session:
-    """A node, and a thread of its own that receives the messages.
+    """A ROS 2 node, and the thread that receives its messages.
 
     Attributes:
         node: The node.
@@ -193,8 +193,8 @@ def guard_velocities(
         time.sleep(timeout / 5)
         if newest["moving"] and time.monotonic() - newest["time"] > timeout:
             zeros.publish(rest)
-    # That the guard receives its own zeros proves nothing: a controller that has not received
-    # them yet loses them when the publisher leaves the graph.
+    # The guard receives its own zeros, but a controller may not have received them yet. It
+    # would lose them if the publisher left the graph now.
     end = time.monotonic() + _FAREWELL
     while time.monotonic() < end:
         zeros.publish(rest)
