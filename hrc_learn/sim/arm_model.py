@@ -1,8 +1,8 @@
 """An arm in MuJoCo: model, gripper, marker plate and driver.
 
-Body frames come from the arm's own chain, so that simulator and controller share one table of
-numbers. Capsules and boxes follow the shapes of the links to a few centimetres: they are faster
-to simulate than meshes and make clean contacts.
+Body frames come from the arm's own chain, so that simulator and controller use the same
+numbers. Capsules and boxes approximate the shapes of the links within a few centimetres: they
+are faster to simulate than meshes and make clean contacts.
 """
 
 import math
@@ -106,7 +106,9 @@ def add_box(body, name: str, half_size, colour, **more):
 
 
 def add_capsule(body, name: str, capsule: Capsule, colour):
-    """Add a capsule to a body, or a sphere if its length is zero, which MuJoCo refuses."""
+    """Add a capsule to a body, or a sphere if the length is zero: MuJoCo refuses such
+    capsules.
+    """
     is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
     along = {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
     kind = mujoco.mjtGeom.mjGEOM_SPHERE if is_ball else mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -149,7 +151,7 @@ class ArmModelConfig:
         return stiffness, _DAMPING * stiffness
 
     def torque(self, joint: int) -> float:
-        """Largest torque of a joint [N m]; 50 where the description states none."""
+        """Largest torque of a joint [N m]; 50 if the description states none."""
         torque = float(self.robot.limits.torque[joint])
         return torque if math.isfinite(torque) else 50.0
 
@@ -200,7 +202,8 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     )
     _add_hand(spec, hand, config)
     names = {link: f"link{link}" for link in range(n + 1)} | {n + 2: _HAND}
-    # MuJoCo ignores contacts of neighbours, except with a static parent such as link0.
+    # MuJoCo ignores contacts between neighbouring bodies, except with a static parent such as
+    # link0.
     for a, b in ((0, 1), *robot.whole.overlapping):
         if a in names and b in names:
             spec.add_exclude(bodyname1=names[a], bodyname2=names[b])

@@ -56,7 +56,7 @@ class OffscreenRenderer:
         """Open an OpenGL context.
 
         Args:
-            world: World, which is rendered in its current state, or recording of a run.
+            world: World, rendered in its current state, or the recording of a run.
             width: Width of the images [px].
             height: Height of the images [px].
 
@@ -81,7 +81,7 @@ class OffscreenRenderer:
     def render(
         self, camera: CameraModel, lines: Sequence[Line] = ()
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of an undistorted camera of the renderer's size, RGB.
+        """RGB image from an undistorted camera with the renderer's image size.
 
         Args:
             camera: Camera to render.
@@ -178,7 +178,7 @@ class EGLCamera:
         self._rng = rng
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """The image now, RGB."""
+        """Current image, RGB."""
         ideal = self._renderer.render(self._lens.pinhole)
         return self._noise.degrade(self._lens.apply(ideal), self._rng)
 
@@ -218,7 +218,7 @@ def open_camera(
     Args:
         world: World to render.
         kind: "egl" renders everything; "synthetic" draws the markers only and needs no
-            OpenGL; "auto" renders where that is possible.
+            OpenGL; "auto" renders if this machine can.
         model: Camera to use instead of the world's own.
         rng: Source of the image noise.
         noise: Blur and noise of the sensor.
@@ -247,7 +247,8 @@ def open_camera(
     )
 
 
-# Distance of the board from the marker, towards the camera and clear of the gripper [m].
+# Distance of the occluding board from the marker, towards the camera [m]; it keeps the board
+# clear of the gripper.
 _BOARD_HEIGHT = 0.10
 
 
@@ -276,7 +277,7 @@ class CameraChange:
 
         Args:
             model: The camera before the change.
-            watched: Points that stay in its view [m].
+            watched: Points that must stay in view [m].
             rng: Source of the directions.
             attempts: Largest number of random directions to try.
 
@@ -332,7 +333,7 @@ class ChangingCamera:
         self.history.append((time, model))
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """The image now, RGB."""
+        """Current image, RGB."""
         return self._camera.read()
 
 
@@ -346,11 +347,11 @@ class OcclusionInterval:
     """An interval in which a marker is occluded."""
 
     start: float
-    """[s]"""
+    """Start of the interval [s]."""
     duration: float
-    """[s]"""
+    """Duration of the interval [s]."""
     marker: int = HAND_MARKER
-    """ArUco number."""
+    """ArUco number of the marker."""
 
     def __post_init__(self) -> None:
         check_settings(self, not_negative=["start", "duration"])
@@ -363,7 +364,9 @@ class ScriptedOcclusion:
         self._world, self._intervals = world, tuple(intervals)
 
     def update(self) -> None:
-        """Move the board in front of a marker that is occluded now, or out of the scene."""
+        """Move the board in front of the marker that is occluded now; if none is, out of the
+        scene.
+        """
         world, place = self._world, np.array(NOWHERE)
         for interval in self._intervals:
             if 0 <= world.time - interval.start < interval.duration:

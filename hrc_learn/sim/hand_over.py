@@ -58,9 +58,9 @@ class Reach(NamedTuple):
 
     kind: str
     begin: float
-    """[s]"""
+    """Start of the movement [s]."""
     end: float
-    """[s]"""
+    """End of the movement [s]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

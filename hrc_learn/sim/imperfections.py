@@ -19,9 +19,11 @@ from hrc_learn.vision import ImageNoise
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
-# Heights are always drawn for this many objects: later draws do not depend on the real number.
+# Heights are always drawn for this many objects, so that later draws do not depend on the
+# actual number of objects.
 _MOST_OBJECTS = 8
-# Constant lag of the simulated servos [s]: compensation reduces path errors from 1.5 to 0.4 mm.
+# Constant lag of the simulated servos [s]: compensating for it reduces path errors from 1.5 to
+# 0.4 mm.
 _SIMULATED_SERVOS = 0.01
 # `_RAMP`: time from a control step to full braking of the arm [s].
 # `_BEYOND_CAPSULES`: distance by which person and arm may protrude from their capsules [m],
@@ -56,7 +58,7 @@ class Imperfections:
     joint_friction: float = 1.0
     """Dry friction of every joint [N m]."""
     gravity_error: float = 0.02
-    """Range of the error of the arm's own gravity compensation, a fraction of its weight."""
+    """Range of the error of the arm's own gravity compensation, as a fraction of the weight."""
     payload: float = 0.5
     """Largest unknown mass at the hand [kg]."""
     torque_noise: float = 0.2
@@ -94,7 +96,7 @@ class Imperfections:
     person_delay: float = 0.080
     """Delay between exposure and the estimated body pose of a person [s]."""
     person_loss: float = 0.20
-    """Fraction of images in which a person present is missed."""
+    """Fraction of images in which a person is present but not detected."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -132,10 +134,10 @@ class Imperfections:
         )
 
     def plant(self, safety: SafetyConfig) -> SafetyConfig:
-        """Safety filter settings for the delays and limits of this arm's driver and person
-        tracker.
+        """Settings of the safety filter, adapted to the delays and limits of the arm's driver
+        and to the errors of the person tracker.
         """
-        # One in 700 normally distributed delays exceeds the mean by three deviations.
+        # One in 700 normally distributed delays exceeds the mean by more than three deviations.
         delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
         separation = replace(
             safety.separation,
@@ -271,7 +273,7 @@ class CommandChannel:
         self.velocity = np.zeros_like(self._limit)
 
     def send(self, time: float, joint_velocity: Float[np.ndarray, " joints"]) -> None:
-        """Send a command at a time [s, rad/s]."""
+        """Send joint velocities [rad/s] at a time [s]."""
         sizes = self._drawn.sizes
         jitter = sizes.command_jitter * self._drawn.rng.standard_normal()
         due = time + max(sizes.command_delay + jitter, 0.0)

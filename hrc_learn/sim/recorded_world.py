@@ -123,7 +123,7 @@ class WorkerDistance:
         self._worker = np.array([model.geom(name).id for name in WORKER_BODIES])
 
     def now(self, held: Collection[str] = ()) -> NearestPair:
-        """The nearest of all pairs of geoms.
+        """Nearest points over all pairs of geoms.
 
         Args:
             held: Names of the objects that the robot holds; they count as parts of the robot.

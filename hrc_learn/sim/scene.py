@@ -1,7 +1,7 @@
 """The workplace: arm, table with objects, a cabinet with three shelves, a fixed camera.
 
 The robot stands at the origin. To its left (+y) is the table, where people work too; to its
-right (-y) the cabinet, whose open door obstructs a careless elbow.
+right (-y) is the cabinet. The arm must keep its elbow away from the cabinet's open door.
 """
 
 from collections.abc import Mapping
@@ -111,7 +111,7 @@ class ObjectConfig:
     half_size: tuple[float, float, float] = (0.022, 0.040, 0.030)
     """Half edges [m]; the gripper closes along x of the box."""
     mass: float = 0.12
-    """[kg]"""
+    """Mass [kg]."""
     marker: Marker = field(default_factory=lambda: Marker(11, 0.030))
     colour: tuple[float, float, float, float] = (0.16, 0.44, 0.70, 1.0)
 
@@ -135,7 +135,7 @@ _TABLE = Box(
 
 
 def overhead_camera() -> CameraModel:
-    """The camera above the table: u increases along -x, v along +y; a little distortion."""
+    """Camera above the table, with slight lens distortion; u increases along -x, v along +y."""
     pose = np.eye(4)
     pose[:3, :3] = np.diag([-1.0, 1.0, -1.0])
     pose[:3, 3] = (0.24, 0.52, 1.55)
@@ -155,7 +155,8 @@ def marked_plate(size: float = 1.0, thickness: float = 0.0) -> Plate:
         thickness: Radius of the links above the hand, beyond which the plate sticks out [m].
     """
     # The plate sticks out sideways, so that the forearm does not hide it from above. The plate
-    # is as wide as objects and mounted off the middle, so that it does not touch boards first.
+    # is as wide as objects and mounted off the middle, so that it is not the first part to
+    # touch a board.
     return Plate(
         marker=Marker(HAND_MARKER, 0.048 * size),
         position=(-0.008 * size, max(0.145 * size, thickness + _BEYOND), 0.02 * size),
@@ -367,7 +368,7 @@ _FEELS_WORKER = 2
 
 def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig, ...]) -> None:
     """Add a worker. Contacts with the worker exert no force: bodies with a prescribed motion do
-    not yield, and would push with any force.
+    not yield, and would push with unlimited force.
     """
     for mover in ("link0", *(item.name for item in objects)):
         for geom in spec.body(mover).find_all(mujoco.mjtObj.mjOBJ_GEOM):

@@ -101,7 +101,8 @@ class ContactMonitor:
 class PhysicsError(RuntimeError):
     """A simulation diverged or was reset by MuJoCo: its measurements are invalid.
 
-    Skills do not retry, as the task did not fail; an experiment counts the run as failed.
+    Skills do not retry after this error, because it is not the task that failed. An experiment
+    counts the run as failed.
 
     Attributes:
         time: Simulated time of the detection [s].

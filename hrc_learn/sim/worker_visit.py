@@ -73,14 +73,14 @@ class WorkerCapsules(NamedTuple):
     ends: Float[np.ndarray, "*time parts 2 3"]
     """Ends of the axes of the capsules, in the base frame [m]."""
     radius: Float[np.ndarray, " parts"]
-    """[m]"""
+    """Radii of the capsules [m]."""
     velocity: Float[np.ndarray, "*time parts 2 3"]
     """Velocities of the ends [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorkerVisit:
-    """Key postures, joined by minimum-jerk motions."""
+    """A worker's visit: key postures, joined by minimum-jerk motions."""
 
     worker: Worker
     """Body of the worker."""
@@ -262,7 +262,7 @@ class BenchScript(PoseWriter):
             rng: Random generator.
             bench: The table, whose far side (+y) is free.
             across: Least and greatest x of the place to stand [m].
-            sway: Largest angle between the worker's heading there and the normal of the
+            sway: Largest angle between the worker's heading at the bench and the normal of the
                 bench's edge [rad].
         """
         self._worker, h = worker, worker.config.stature
@@ -367,8 +367,8 @@ def random_visit(
         under: Point below the arm's task, x and y [m]: markers lie around it.
         begin: Earliest and latest time of entering [s].
         reaches: Smallest and largest number of markers to reach for.
-        is_clear: Predicate on postures that is true if they touch nothing at the bench; the
-            worker reaches only for points that clear postures reach.
+        is_clear: Returns True if the body touches nothing at the bench in any of the given
+            postures. The worker reaches only for points for which this is so.
 
     Raises:
         ValueError: No marker under the arm is within reach.

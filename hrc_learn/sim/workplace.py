@@ -53,7 +53,8 @@ _SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (0
 _REACHES = (0.14, 0.1)
 # Shifts of the cabinet, along the base's x axis and upwards [m].
 _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
-# Upward shift for short arms with thick wrists, which reach down to their shelves [m].
+# Upward shift of the cabinet for short arms with thick wrists, negative because they reach down
+# to their shelves [m].
 _DOWN = -0.3
 # Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
@@ -99,7 +100,8 @@ class Workplace:
     """Joint positions of other arms above the table, the start of their inverse kinematics
     [rad]."""
     fingertip: float = 0.012
-    """Length of the fingers beyond the tool centre point, in the middle of the pads [m]."""
+    """Length of the fingers beyond the tool centre point, which is in the middle of the pads
+    [m]."""
     palm: float = 0.0374
     """Distance of the palm behind the tool centre point [m]."""
     hover_turns: tuple[float, float] = (np.deg2rad(-60.0), np.deg2rad(120.0))
@@ -420,7 +422,8 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
 
 
 def _beside(place: Workplace, home: float) -> Workplace:
-    """The workplace with cabinet and home in the tool's plane of an arm turned to the right.
+    """The workplace with cabinet and home in the plane in which an arm that is turned to the
+    right moves its tool.
 
     Args:
         place: Workplace with the cabinet to the right.
@@ -452,7 +455,9 @@ def _placed(
     depth: float,
     far: float = 1.0,
 ) -> Workplace:
-    """The usual workplace with distances times `scale`; the cabinet's also times `far`."""
+    """The usual workplace with all distances times `scale`, and the cabinet's distance also
+    times `far`.
+    """
     place, cabinet, table = Workplace(), usual.cabinet, usual.table
     size = usual.arm.robot.hand_size
     scale, along, higher, depth = (size * x for x in (scale, along, higher, depth))

@@ -328,7 +328,8 @@ class World:
     def collisions_along(
         self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> list[Touch]:
-        """Touches of arm and cabinet, table or itself along a path of joint positions.
+        """Touches of the arm with cabinet, table, obstacles or itself along a path of joint
+        positions.
 
         The test is purely geometric: nothing is simulated, and the world does not change. Times
         in the touches are sample numbers.
