@@ -37,12 +37,13 @@ LATE = 1.5
 """Action periods after which an action counts as late: its time is then nearer to the next
 frame."""
 PAUSE = 2.0
-"""Time without an action above which there is a pause instead of a late action [s], for example
-between two episodes."""
+"""Time without an action [s] after which there is a pause, for example between two episodes,
+and not just a late action."""
 TOLERATED = 0.02
 """Fraction of late actions that raises no warning."""
 EPISODE = 1.0
-"""Shortest sequence of actions that must show motion, as an episode does [s]."""
+"""Shortest sequence of actions that is long enough for an episode, and is therefore checked for
+motion [s]."""
 
 
 class Device:
@@ -95,7 +96,8 @@ class LoopWatch:
     LeRobot stamps each frame with its number divided by the rate, not with the time of the
     recording: if actions came late, the arm seems to have moved faster than it did. LeRobot
     does not report when it records, nor when an episode ends. Therefore a sequence of actions
-    ends with a pause, with the next reset of the scene, or when the robot is disconnected.
+    is assumed to end with a pause, with the next reset of the scene, or when the robot is
+    disconnected.
     """
 
     def __init__(
@@ -366,7 +368,7 @@ class ArmRobot(Device, Robot):
         return self.work_arm.whole.self_distance(joint_position)
 
     def _invite(self, config: PersonConfig) -> None:
-        """Connect the person that guides the body."""
+        """Connect the input device of the person that guides the body."""
         from hrc_learn.controller.null_space_motion import YieldingConfig, guided_elbow_speed
         from hrc_learn.skills.complementary_motion import ComplementaryMotion
 

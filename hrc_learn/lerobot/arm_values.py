@@ -73,8 +73,9 @@ class ArmValues:
     ) -> Float[np.ndarray, "6"]:
         """Position [m] and rotation vector [rad] of the end effector.
 
-        A gripper that points down is turned by half a turn from the base. There the shortest
-        rotation vector jumps from one side to the other; `near` [rad] picks the side.
+        The orientation of a gripper that points down is half a turn from that of the base.
+        There, the shortest rotation vector jumps from one side to the other; `near` [rad]
+        selects the side.
         """
         pose = self.chain.forward(torch.from_numpy(np.asarray(joints, dtype=float)))
         vector = pose.vector()

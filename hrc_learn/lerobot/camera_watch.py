@@ -46,7 +46,8 @@ CAMERA_WATCH = "hrc_learn_camera_watch"
 class CameraWatchStep(ProcessorStep):
     """Warns once per episode if the camera has moved since the demonstrations.
 
-    This step belongs at the beginning of the preprocessor, where state and pixels have units.
+    This step belongs at the beginning of the preprocessor, where state and pixels still have
+    their units.
     """
 
     reference: dict[str, Any]
@@ -60,11 +61,12 @@ class CameraWatchStep(ProcessorStep):
     correct: bool = False
     """Replace pixels by those that the camera would see from its original pose."""
     object_columns: list[int] | None = None
-    """Indices of the values `PIXELS` in the state, which are corrected, too; None: none."""
+    """Indices of the values `PIXELS` in the state, which are corrected, too; None: no object's
+    pixel is corrected."""
     object_height: float = 0.0
     """Height of the plane on which the object lies, from `jacobian.object_height` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
-    """Latest detected motion of the camera; None: none, or the alarm was false. `reset` clears
+    """Latest detected motion of the camera; None: no motion, or a false alarm. `reset` clears
     it unless pixels are corrected."""
 
     def __post_init__(self) -> None:

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 
 # Time from reading the joints until the arm follows [s], as in `Imperfections.nominal()`. With
-# franky and simulators, a command took 2 ms to the servos. The rest allows for the network, the
-# scheduling and the computation of a step, which the simulators do not include.
+# franky and simulators, a command took 2 ms to reach the servos. The rest allows for the
+# network, the scheduling and the computation of a step, which the simulators do not include.
 _DELAY = 0.030
 
 
@@ -141,7 +141,8 @@ class DrivenArm(ArmRobot):
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float
     ) -> Float[np.ndarray, " joints"]:
-        self._arm.feed()  # the answer reports a stop while the policy computed the action
+        # The answer reports whether the arm was stopped while the policy computed the action.
+        self._arm.feed()
         if self._arm.trips != self._trips:
             self._trips = self._arm.trips
             self._servo.restart()  # the arm is at rest, which the servo does not know

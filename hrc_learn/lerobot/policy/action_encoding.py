@@ -48,7 +48,9 @@ class ActionEncoding(nn.Module):
     def to_actions(
         self, coordinates: Float[Tensor, "*batch T A"]
     ) -> Float[Tensor, "*batch T A"]:
-        """Actions from coordinates, with the rotation vectors nearest to the reference's."""
+        """Actions from coordinates, with the rotation vectors nearest to that of the
+        reference.
+        """
         actions = coordinates * self.std + self.mean
         for triple, reference in zip(self.triples, self.reference, strict=True):
             q = orientation_error.to_orientation(actions[..., triple], reference)

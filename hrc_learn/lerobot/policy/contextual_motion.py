@@ -14,7 +14,7 @@ from hrc_learn.dmp import JointDMP, Response, fit_ridge
 HARMONICS = 4
 """Number of sines, and of cosines, of the phase among the inputs of the network."""
 DURATIONS = math.log(3)
-"""Largest deviation of the logarithm of a predicted duration from that of the fitted one."""
+"""Largest difference between the logarithms of a predicted duration and of the fitted one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,10 +41,11 @@ class ContextualMotion(nn.Module):
     x = a + B c + r(features, phase),   x = (weights, y_0', y_0, g) of each coordinate, log tau
 
     y_0' is the start velocity times the duration tau, y_0 the start and g the goal. The context
-    c holds the numbers measured at the start of the episode. a (`base`) and B (`slopes`) come
-    from a fit in closed form (`fit_closed_form`), and the network r starts at zero. Therefore
-    the policy works before any training, and training learns the residual. In x, weights are
-    divided by the spring's stiffness, which makes them about as large as the motion.
+    c holds the numbers measured at the start of the episode. The parameters a (`base`) and B
+    (`slopes`) come from a fit in closed form (`fit_closed_form`), and the network r starts at
+    zero. Therefore the policy works before any training, and training learns the residual. In
+    x, weights are divided by the spring's stiffness, which makes them about as large as the
+    motion.
     """
 
     def __init__(

@@ -39,16 +39,17 @@ from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfi
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
 MEASURED = 0.5
-"""A state counts as the measurement of the action of the same name if their root mean square
-difference, in spreads of the action, is not larger."""
+"""Largest root mean square difference, in spreads of the action, at which a value of the state
+counts as the measurement of the action's value of the same name."""
 UNKNOWN = 0.3
-"""Fraction of samples trained without the velocity of the state, as after a reset. It also
+"""Fraction of samples trained without the velocity of the state, as after a reset. This also
 keeps policies from relying on their own past motion regardless of observations.
 """
 VELOCITY_WEIGHT = 0.005
 """Weight of the velocity error, in spreads per second, relative to that of the position."""
 SCORE_WEIGHT = 0.1
-"""Weight of the plan scores relative to the plans: a classification learns faster."""
+"""Weight of the error of the plan scores, relative to the error of the plans; it is small
+because a classification learns faster."""
 SAME_WAY = 3.0
 """Distance from which plans count as distinct, relative to the error of the nearest plan. The
 mean of closer plans is nearer to the demonstration than any of them; the mean of distinct plans
@@ -95,7 +96,7 @@ class MotionChunkConfig(MotionPolicyConfig):
     """
     n_plans: int = 3
     """Number of plans for each observation. From one state, the demonstrations may continue in
-    at most as many distinct motions. The most likely plan is executed."""
+    at most this many distinct motions. The most likely plan is executed."""
     two_level_actions: list[int] | None = None
     """Indices of the action's components that jump between two levels, such as a gripper that
     is open or closed; None: detected from the dataset's statistics."""
@@ -314,7 +315,9 @@ class MotionChunkPolicy(MotionPolicy):
         return moved / (self.config.history * self._step * self.velocity_spread)
 
     def _now(self, batch: Mapping[str, Any]) -> tuple[dict[str, Any], Tensor, Tensor]:
-        """Present observations, encoded; velocities of the states; 1 where these are known."""
+        """Encoded present observations, velocities of the states, and 1 where they are
+        known.
+        """
         now = dict(self._turned(batch))
         velocity = batch[ACTION].new_zeros(len(batch[ACTION]), len(self.velocity_spread))
         known = velocity.new_zeros(len(velocity))

@@ -21,7 +21,7 @@ BASIS, ACTIONS_EACH = 10, 2.5
 """`BASIS`: largest default number of basis functions of a chunk. `ACTIONS_EACH`: fewest actions
 per basis function by default."""
 BLEND_TIME = 0.05
-"""Longest default blend time [s]; one action period if that is longer."""
+"""Default blend time [s], or one action period if that is longer; limited by `BLEND_SHARE`."""
 BLEND_SHARE = 0.3
 """Largest default blend time, as a fraction of the spacing h of basis functions. A plan with
 error e has an acceleration error of about 20 e / h^2, which displaces the motion by
@@ -117,8 +117,8 @@ class ChunkDecoder(nn.Module):
     ) -> Float[Tensor, "*batch D M"]:
         """Coefficients of a motion that passes through a state and then soon joins the plan.
 
-        Among all changes d of the motion that lead exactly through the state, this one has the
-        smallest  sum_t d(t)^2 + blend_time^6 d'''(t)^2  from that action on.
+        Among all changes d of the motion that lead exactly through the state, this change has
+        the smallest  sum_t d(t)^2 + blend_time^6 d'''(t)^2  over the actions from `index` on.
 
         Args:
             coefficients: Planned coefficients.

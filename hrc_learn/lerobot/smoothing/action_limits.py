@@ -90,7 +90,7 @@ class ActionLimits:
 
         Args:
             ranges: Lowest and highest positions, by name of the value.
-            velocities: Highest velocities by name [1/s]; one applies only if it is lower than
+            velocities: Highest velocities by name [1/s]; each applies only if it is lower than
                 the present limit.
         """
         pairs = [
@@ -185,7 +185,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
 
     Raises:
         FileNotFoundError: There is no dataset.
-        ValueError: It cannot be read, or its actions are constant.
+        ValueError: The dataset cannot be read, or its actions are constant.
     """
     folder = open_folder(dataset)
     features, fps = folder.features, folder.fps

@@ -27,7 +27,7 @@ _LATE = 2.0
 _WAIT = 0.5
 """Action periods to wait for a late action before the motion comes to rest."""
 _BEHIND = 1.0
-"""Total duration of waiting actions above which a warning is given [s]."""
+"""Total duration of queued actions above which a warning is given [s]."""
 _FOLLOW = 0.1
 """Fraction of an action's lateness by which later actions are postponed. A small fraction
 suppresses the jitter of the loop, but follows its drift.
@@ -239,7 +239,7 @@ class SmoothRobot(Robot):
     name = SMOOTH_ROBOT
 
     def __init__(self, config: SmoothRobotConfig):
-        """Make both robots.
+        """Make the wrapped robot and the upsampler.
 
         Raises:
             ValueError: There is no such robot, or its actions are not those of the limits.
