@@ -1,7 +1,7 @@
 """The command `hrc`, and the common code of programs with a command line.
 
-`main()` runs the typed command, `main("record", "placing")` runs this command. Other
-programs declare a dataclass as their command line and call `run`. Importing this package
+`main()` runs the typed command, and `main("record", "placing")` runs `hrc record placing`.
+Other programs declare a dataclass as their command line and call `run`. Importing this package
 imports no large library.
 """
 

@@ -1,8 +1,10 @@
-"""Frame of a command: command line, settings, exit status, error messages, JSON values.
+"""Common frame of all commands: command line, settings, exit status, error messages, JSON
+values.
 
 Exit status: 0 done, 1 the work failed, 2 bad input, 143 ended by SIGTERM. Bad input is reported
-in one line on stderr. Other settings are fields of configuration dataclasses, given as TOML:
-`--config site.speed=0.1 cell.toml` sets a field and reads a file; the last value counts.
+in one line on stderr. Settings without an option of their own are fields of configuration
+dataclasses, given as TOML: `--config site.speed=0.1 cell.toml` sets a field and reads a file;
+the last value counts.
 """
 
 import dataclasses
@@ -188,9 +190,9 @@ def _wrapped(text: str) -> str:
 def gathered_settings(words: Sequence[str]) -> list[str]:
     """Command line with all settings after one `--config`, in their order.
 
-    Settings are the values of every `--config`, of which the parser would keep only the last,
-    and LeRobot's options for a device: `--robot.port=/dev/ttyACM0` and
-    `--robot.port /dev/ttyACM0` become `site.device.port=/dev/ttyACM0`.
+    Settings are the values of every `--config` (the parser would keep only the last one) and
+    LeRobot's options for a device. Both `--robot.port=/dev/ttyACM0` and `--robot.port
+    /dev/ttyACM0` become `site.device.port=/dev/ttyACM0`.
     """
     rest, settings, in_settings, remaining = [], [], False, iter(words)
     for word in remaining:
@@ -229,7 +231,7 @@ def _complaint(box: str) -> str:
             return f"unknown options: {names}{hint}"
     if missing := re.findall(r"^ {4}(\S+)", said, re.MULTILINE):
         return f"missing: {', '.join(missing)}"
-    # The reasons why each member of a union failed help programmers only.
+    # The reasons why each member of a union type failed are of use to programmers only.
     return " ".join(said.split()).split(" Got errors")[0].rstrip(".")
 
 
@@ -298,8 +300,8 @@ def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings
     """Settings with the given values in place of their defaults.
 
     Args:
-        texts: `NAME.FIELD=VALUE`, the value as in TOML or a plain word, or paths of TOML files.
-            "help" prints all settings and exits.
+        texts: `NAME.FIELD=VALUE`, with the value in TOML or as a plain word, or paths of TOML
+            files. "help" prints all settings and exits.
         default: Dataclass of configuration dataclasses.
 
     Raises:

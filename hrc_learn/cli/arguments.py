@@ -88,8 +88,9 @@ class Columns:
     """Meaning of columns of a dataset, for columns whose meaning cannot be detected."""
 
     units: dict[str, str] = field(default_factory=dict)
-    """Units on disk by quantity, such as: joint_position deg position mm. For -100..100 of
-    LeRobot: joint_position CALIBRATION.json; hrc repair converts these to degrees."""
+    """Units on disk by quantity, such as: joint_position deg position mm. For LeRobot's values
+    of -100 to 100, give the calibration: joint_position CALIBRATION.json; hrc repair converts
+    them to degrees."""
     mapping: dict[str, str] = field(default_factory=dict)
     """Columns by quantity, such as: joint_position "observation.state[0:7]" gripper none."""
 
@@ -347,9 +348,10 @@ class FitPrimitives(Columns, Fit):
     """Channels to learn. Default: joint and pose, if the dataset has them."""
     several: Literal["best", "mean", "distribution", "contextual", "streamed"] = "best"
     """Common model of several demonstrations. best: the model that predicts held-out
-    demonstrations best, such as the mean, the nearest or contextual. mean: their mean.
-    distribution: their mean and all primitives (for a ProbabilisticDMP). contextual: a function
-    of the context. streamed: one primitive, fitted in a single pass over the data."""
+    demonstrations best, such as the mean, the nearest demonstration or the contextual model.
+    mean: their mean. distribution: their mean and the primitive of each (for a
+    ProbabilisticDMP). contextual: a function of the context. streamed: one primitive, fitted in
+    a single pass over the data."""
     context: tuple[str, ...] = ()
     """Columns whose values in the first frame are the context. Default: start and goal."""
     n_basis: int | None = 60
@@ -369,10 +371,11 @@ class FitPrimitives(Columns, Fit):
 class FitImageJacobian(Fit):
     """Fit the image Jacobian of an uncalibrated camera to a dataset.
 
-    Learns how the marker moves in the image when the end effector moves, with the uncertainty,
-    and the target in the image if an object was observed. --marker first searches the videos
-    for the marker: its pixels are stored in DATASET.features, so that an interrupted search can
-    be resumed. Under torchrun, each process reads a part of the demonstrations.
+    Learns how the marker moves in the image when the end effector moves, and how uncertain this
+    is. If an object was observed, the target in the image is learned, too. --marker first
+    searches the videos for the marker: its pixels are stored in DATASET.features, so that an
+    interrupted search can be resumed. Under torchrun, each process reads a part of the
+    demonstrations.
 
         hrc fit image-jacobian grasping --marker 3 --camera front
         hrc fit image-jacobian --dataset grasping --markerless
@@ -390,7 +393,8 @@ class FitImageJacobian(Fit):
     """around: thirteen neurons around the demonstrated poses. grid: the paper's grid over x and
     y."""
     learn: bool = True
-    """Learn neurons, noise and prior by the gradient of the evidence."""
+    """Learn neurons, noise and prior by gradient ascent on the evidence (marginal
+    likelihood)."""
     config: tuple[str, ...] = ()
     """Settings of `learning` (EvidenceConfig) and `fit` (ImageJacobianFitConfig), as NAME=VALUE
     or TOML files."""
@@ -632,13 +636,13 @@ class Run(WithImperfections, WithDriver, Written):
     markerless: bool = False
     """Detect gripper and object without any marker, among clutter and shadows; needs EGL."""
     shelf: tuple[Shelf, ...] = ("middle",)
-    """Shelf for the object. With two or three shelves, as many objects are placed."""
+    """Shelf for the object. With two or three shelves, one object is placed on each."""
     pulls: Literal["scripted", "random", "none"] = "scripted"
     """Pulls at the elbow: while the arm waits for a pull, at random moments, or never."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     worker: bool = False
-    """Simulate a worker, putting an object on the table and reaching under the arm."""
+    """Simulate a worker that puts an object on the table and reaches under the arm."""
     handover: bool = False
     """Let a simulated person hand over the last object."""
     page: bool = False

@@ -70,7 +70,7 @@ def _open(recordings: Sequence[Path], web: bool) -> int:
 _SHOWN, _SHOWN_FRAMES = 200, 1_000_000
 """Largest number of demonstrations and frames shown by default, limited by the viewer."""
 _VIDEO_BYTES = 300_000_000
-"""Total size of the images shown, after which those of further episodes are left out."""
+"""Total size of the images shown, above which the images of further episodes are left out."""
 
 
 def _record(args: Show, out: Path) -> int:

@@ -97,7 +97,9 @@ search."""
 
 
 def _demonstrations(args: FitImageJacobian, console: Console, rank: int) -> _Searched:
-    """Demonstrations with their own pixels, those of `--marker`, or those of `--markerless`."""
+    """Demonstrations with pixels from the dataset, from the search for a marker, or from the
+    markerless search.
+    """
     demos = open_demos(args.dataset, episodes=args.episodes or None)
     if args.markerless:
         refuse_given(args, ["marker"], "is not used by --markerless")

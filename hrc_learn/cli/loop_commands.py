@@ -59,7 +59,7 @@ from hrc_learn.vision import CameraModel
 SWITCH_INTERVAL = 0.0005
 """Longest time for which a thread of the page holds the interpreter [s]."""
 MARKER = (0.05, 0.0, -0.08)
-"""Marker of the gripper in the frame of the tool, as `hrc serve` simulates it [m]."""
+"""Position of the gripper's marker in the tool's frame, as `hrc serve` simulates it [m]."""
 FRAME_TIME = 0.032
 """Time between images of `hrc serve` [s]."""
 CENTRE = (0.35, 0.35, 0.35)
@@ -68,7 +68,7 @@ PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
 def _arm_of(args: WithDriver, site: ArmSite) -> Arm:
-    """The arm, which `--robot` or, for a Franka arm, `site.robot` names."""
+    """The arm that `--robot` names, or `site.robot` if `--robot` is the default (Panda)."""
     named = site.robot if args.robot == "panda" else found_description(args.robot)
     return ArmChoice(named).work_arm()
 
@@ -287,8 +287,8 @@ def _report(args: Serve, figures: Mapping[str, float | int]) -> None:
 def _camera(centre: Float[np.ndarray, "3"]) -> CameraModel:
     """Camera 1.1 m from the centre of the motion, looking down at 0.2 rad from the vertical.
 
-    Its image is turned by half a radian from that of the paper's camera; the controller starts
-    with the image Jacobian of the latter.
+    The controller starts with the image Jacobian of the paper's camera, whose image is turned
+    by half a radian from the image of this camera.
     """
     lean, turn = 0.2, 1.0
     towards = np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)

@@ -178,7 +178,7 @@ def fitted_from(model: Path) -> dict[str, Any]:
 
 
 _ROWS = 8
-"""Number of demonstrations in a table, the worst ones."""
+"""Number of demonstrations in a table, which lists the worst ones."""
 
 
 def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> Table:

@@ -30,7 +30,7 @@ from hrc_learn.teleoperation.scenarios import SCENARIOS, SHELVES, make_scenario
 
 # Number of motions that are made at once.
 _CHUNK = 50
-# After this number of attempts, a smaller fraction of successes ends the run.
+# After `_ENOUGH` attempts, a fraction of successes below `_FEW` ends the run.
 _ENOUGH, _FEW = 100, 0.02
 
 
@@ -45,11 +45,11 @@ class ObjectConfig:
     pose: tuple[float, ...] = ()
     """Its pose in all demonstrations, if no column holds it."""
     x: tuple[float, float] | None = None
-    """Range of its position in new scenes [m]. Default: that of the demonstrations."""
+    """Range of its position along x in new scenes [m]. Default: that of the demonstrations."""
     y: tuple[float, float] | None = None
-    """[m]"""
+    """Range along y, like `x` [m]."""
     z: tuple[float, float] | None = None
-    """[m]"""
+    """Range along z, like `x` [m]."""
     yaw: tuple[float, float] = (0.0, 0.0)
     """Range of its rotation about the vertical, from the demonstrated orientation [rad]."""
 

@@ -233,7 +233,8 @@ class _LeaderConfig:
     task: str = "follow the leader"
     """Task in words."""
     duration: float = 20.0
-    """Duration of a demonstration [s]; Ctrl-C ends the recording and keeps the saved ones."""
+    """Duration of a demonstration [s]; Ctrl-C ends the recording and keeps the saved
+    demonstrations."""
     pause: float = 5.0
     """Time before each demonstration, in which the arm already follows [s]."""
     fps: int = 50
