@@ -1,1 +1,3 @@
-"""Dashboards, figures, films and reports; they import Rerun and Matplotlib themselves."""
+"""Dashboards, figures, films and reports. Only modules that need Rerun or Matplotlib import
+it.
+"""

@@ -22,11 +22,12 @@ class Clause:
     kept: str
     """Description of how the package meets it."""
     parameters: Sequence[Any]
-    """Ends of the names of settings. On a page, the settings with their values in the runs."""
+    """In the file: ends of the names of settings. On a page: these settings with their values
+    in the runs."""
     test: str
     """File of the test that checks it."""
     measured: Sequence[Any]
-    """Names of the metrics. On a page, the measurements of each run."""
+    """In the file: names of the metrics. On a page: the measurements of each run."""
     outside: str
     """Part of the requirement that this package cannot meet."""
 
@@ -82,7 +83,9 @@ def _filled(clause: Clause, reports: Sequence[Report]) -> Clause:
 
 
 def _ending(settings: dict[str, Any], name: str) -> list[Any]:
-    """Values of the settings whose names end in `name`, only of the work cell if it has any."""
+    """Values of the settings whose names end in `name`. If the work cell has such settings,
+    only their values are returned.
+    """
     found = {key: value for key, value in settings.items() if f".{key}".endswith(f".{name}")}
     cell = [value for key, value in found.items() if "cell." in key]
     return cell or list(found.values())

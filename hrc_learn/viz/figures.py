@@ -75,7 +75,7 @@ def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
     """Show the surroundings of some points, with the same scale on every axis."""
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    # Labels of all three axes stay inside at this zoom, on a phone, too.
+    # At this zoom, the labels of all three axes stay inside the figure, also on a phone.
     axes.set_box_aspect(tuple(high - low), zoom=0.77)  # pyright: ignore[reportArgumentType]
 
 

@@ -30,7 +30,8 @@ _SHADE = (24, 26, 30, 200)
 _SKY = (228, 233, 238)
 _OUTLINE = 0.35  # brightness of outlines
 
-# A film of 16 s at 720 x 450 px then takes 0.3 MB, so that a report with it can be mailed.
+# With these settings, a film of 16 s at 720 x 450 px takes 0.3 MB, so that a report with it can
+# be mailed.
 _CODEC = {"preset": "veryfast", "crf": "27"}
 
 
@@ -44,7 +45,8 @@ def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
     import av
 
     stream = None
-    # A file, not memory: its index can then be moved to the front, to play while loading.
+    # Write to a file, not to memory: its index can then be moved to the front, so that a
+    # browser can play the film while loading it.
     with TemporaryDirectory(prefix="hrc_film_") as folder:
         path = Path(folder) / "film.mp4"
         with av.open(path, "w", options={"movflags": "+faststart"}) as container:
@@ -103,7 +105,8 @@ def annotated(
 
 
 def camera_inset(camera: CameraRecording, width: int) -> Callable[[int, float], Picture]:
-    """Function of a step and its time [s]: the camera's image with the marker and its target.
+    """Function that returns the camera's image at a step and its time [s], with marks on the
+    feature and its target.
 
     Args:
         camera: Recording with images.

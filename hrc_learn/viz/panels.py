@@ -15,7 +15,7 @@ Colour = tuple[int, int, int, int]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curves:
-    """Curves over time with a common entity and unit."""
+    """Curves over time with a common entity of Rerun and a common unit."""
 
     path: str
     names: tuple[str, ...]
@@ -177,7 +177,7 @@ def worker_plots(run: RunRecording) -> list[Plot]:
         return []
     values = 1e3 * np.column_stack(list(run.worker_distance.values()))
     distance = several("worker/distance", run.worker_distance, values)
-    # The last few centimetres matter.
+    # The second plot is enlarged, because the last few centimetres matter.
     near = several("worker/near", run.worker_distance, np.where(values < 300, values, np.nan))
     return [
         Plot(title=_WORKER, curves=(distance,), legend=True),

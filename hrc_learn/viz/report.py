@@ -213,7 +213,7 @@ def leading(
 
     Args:
         table: All measurements.
-        count: Number of measurements shown first, unless more missed.
+        count: Number of measurements shown first, unless more have missed their targets.
     """
     ranks = {False: 0, True: 1, None: 2}
     order = sorted(range(len(table)), key=lambda i: ranks[table[i].ok])

@@ -1,4 +1,4 @@
-"""Sending to Rerun: complete .rrd files, columns instead of single values, and layouts."""
+"""Send data to Rerun: complete .rrd files, columns instead of single values, and layouts."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -214,7 +214,8 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     length = np.linalg.norm(axis, axis=1)
     direction = axis / np.maximum(length, 1e-12)[:, None]
     # A rotation by pi about the bisector of z and the axis maps z to the axis: the quaternion
-    # is (0, bisector). The small x component chooses the bisector x if both are opposite.
+    # is (0, bisector). The small x component makes x the bisector if z and the axis are
+    # opposite.
     half = direction + np.array([1e-9, 0.0, 1.0])
     normal = half / np.linalg.norm(half, axis=1, keepdims=True)
     return rr.Capsules3D(
@@ -342,7 +343,7 @@ class CameraStream:
         """Send to a recording stream.
 
         Args:
-            stream: Into a file or to a viewer.
+            stream: Recording stream into a file or to a viewer.
             still: Sender of the static shapes.
         """
         self._stream, self._still, self._images = stream, still, 0
@@ -408,7 +409,7 @@ class CameraStream:
         strips: list[list[Float[np.ndarray, "_ 2"]]],
         colour: str,
     ) -> None:
-        """Lines over the image, any number of them at each sample."""
+        """Send lines over the image, any number of them at each sample."""
         colours = [palette.rgba(colour)]
         look = rr.LineStrips2D.from_fields(radii=[-2.0], colors=colours, draw_order=20.0)
         self._still.send(path, look)

@@ -90,7 +90,7 @@ class RunStream:
         """Send to a recording stream.
 
         Args:
-            stream: Into a file or to a viewer.
+            stream: Recording stream into a file or to a viewer.
             finished: The run is over, so that plots show all of it.
         """
         self._stream, self._still, self._finished = stream, StaticShapes(stream), finished
@@ -186,7 +186,7 @@ class RunStream:
         region: Float[np.ndarray, "samples 6"],
         drawn: Bool[np.ndarray, " samples"],
     ) -> None:
-        """Send the controller's region, with another colour for drawn ones."""
+        """Send the controller's region, with another colour if a person has drawn it."""
         path, known = "world/active_region", np.isfinite(region).all(axis=1)
         self._still.send(path, rr.Boxes3D.from_fields(radii=[0.002]))
         colours = [palette.rgba(palette.PERSON if d else palette.TARGET) for d in drawn[known]]
