@@ -42,18 +42,18 @@ def export_step(
     The machine code comes from LLVM, so no compiler needs to be installed. It runs only on
     processors like the one that built it. Next to it are `step.h`, a header for C and C++, and
     `step.json`, a description for other languages. The name of their folder is a hash of
-    torch's version, of the processor, of the parts of this library that a step uses
-    (`_PARTS`), of all settings and weights of the controller, and of the example: names,
-    shapes and dtypes of its fields, and its constants. A controller that holds functions, or
-    objects of classes outside this library, is hashed by its traced step instead. Tracing takes
-    seconds.
+    everything that determines the code: torch's version, the processor, the parts of this
+    library that a step uses (`_PARTS`), all settings and weights of the controller, and the
+    example (names, shapes and dtypes of its fields, and its constants). A controller that holds
+    functions, or objects of classes outside this library, is hashed by its traced step instead.
+    Tracing takes seconds.
 
     Args:
         controller: Controller with the step.
         observation: An example with exactly the fields of later observations. Missing fields,
             and a `dt` that is a number, become constants; so do the controller's goals if the
             example has none. The step takes batch dimensions and dtype from the example. In
-            float32, the count of interventions ends at 16 million.
+            float32, the counts of interventions stop at 16 million.
         folder: Folder of the compiled steps; default: the user's cache.
 
     Returns:

@@ -46,7 +46,8 @@ ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.
 
 The function takes a step for the first `count` arms; `count` is a multiple of `lanes`.
-Successive rows of a vector are `stride` numbers apart in memory. With one lane, both are 1."""
+Successive rows of a vector are `stride` numbers apart in memory. With one lane, `stride` and
+`count` are 1."""
 
 
 @final
@@ -113,7 +114,9 @@ class NativeCode:
         builder.ret_void()
 
     def _part(self, index: int, chunk: Sequence[Unit]) -> ir.Function:
-        """Function that executes a chunk of instructions and stores values for later ones."""
+        """Function that executes a chunk of instructions, and stores the values that later
+        functions need.
+        """
         builder, made = self._begun_part(f"part{index}"), {}
         for unit in chunk:
             names, *parts = zip(*(self._program.instructions[x] for x in unit), strict=True)
@@ -147,7 +150,7 @@ class NativeCode:
         return builder
 
     def _row(self, builder: ir.IRBuilder, vector: str, row: int) -> ir.Value:
-        """Address of the present arms' numbers in a row of a vector."""
+        """Address of the numbers of the arms being computed, in a row of a vector."""
         first, offset = builder.function.args[self._vectors.index(vector)], ir.IntType(64)(row)
         if self.lanes > 1:
             offset = builder.mul(builder.function.args[-1], offset)
@@ -182,7 +185,7 @@ class NativeCode:
             return kind(values if len(xs) > 1 else values[0])
         if name == "input" and _fixed(self._program, xs):
             return builder.load(self._row(builder, *where[:2]), align=self._size, typ=kind)
-        # Only one or two different values, each several times.
+        # The operands have only one or two different values, each of them repeated.
         order = ir.VectorType(_INDEX, len(xs))([0] * len(xs))
         repeated = []
         for value in [self._value(builder, made, (x,)) for x in dict.fromkeys(xs)]:

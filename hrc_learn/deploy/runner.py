@@ -233,7 +233,8 @@ class Rate:
         while (rest := self._next - self._clock()) > 0:
             if rest > _SPIN:
                 self._sleep(min(rest - _SPIN, longest))
-            longest = _SPIN  # from now on, the clock advances in steps, as an arm's does
+            # After the first sleep, sleep briefly: a clock such as an arm's advances in steps.
+            longest = _SPIN
         late = -rest
         skipped = int(late / self._period)
         self.ticks += 1
