@@ -11,9 +11,9 @@ A folder replaces another in three steps, each on disk before the next: `owned.j
 NAME is renamed to `old`, `new` is renamed to NAME. The content of a workspace therefore shows
 how far a killed process got, and the next writer of NAME, or `recover`, cleans up:
 
-    new          unfinished: removed
-    old and new  between the two renames, so `new` is complete: renamed to NAME
-    old          after both renames: the owned parts of `old` are removed
+    new          killed before `new` was complete: `new` is removed
+    old and new  killed between the two renames: `new` is complete and is renamed to NAME
+    old          killed after both renames: the owned parts of `old` are removed
 
 Two renames are used instead of an exchange because every file system supports them.
 

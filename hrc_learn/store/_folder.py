@@ -53,7 +53,7 @@ def try_lock(file: TextIO) -> bool:
 def sign(file: TextIO) -> None:
     """Write the ID and host of this process into a locked file."""
     os.truncate(file.fileno(), 0)
-    # Unbuffered, so that on a full disk closing the file cannot fail, too.
+    # Unbuffered, so that closing the file cannot fail as well if the disk is full.
     os.write(file.fileno(), f"{os.getpid()} {socket.gethostname()}\n".encode())
 
 
