@@ -49,8 +49,8 @@ class ControllerConfig:
     """Cap on the angular part of the twist [rad/s]."""
     vision_rate: float = 4.0
     """Fastest decay of the pixel error [1/s], as predicted by the estimated image Jacobian. The
-    gain of the law grows with the square of the image Jacobian: without a cap it can exceed the
-    gain that is stable with images at 15 to 30 Hz and a delay of one frame or more."""
+    gain of the law grows with the square of the image Jacobian. Without a cap, it can be too
+    high for stability with images at 15 to 30 Hz and a delay of one frame or more."""
     approach_linear_speed: float = 0.5
     """Cap on the linear speed of the tool while it approaches `Goals.posture` [m/s]."""
     approach_angular_speed: float = 2.0
@@ -62,17 +62,18 @@ class ControllerConfig:
     """c_d [N m s/rad]: a null-space input d requests the null-space velocity d/c_d."""
     yields_to_limits: bool = True
     """True: near joint limits, free joints take over the motion that limited joints cannot make
-    (saturation in the null space). The task slows down where a joint at its limit no longer
-    cancels the motion of another, so that the tool would move faster than requested. The
-    null-space motion is scaled as a whole. False: only the safety filter keeps the limits."""
+    (saturation in the null space). A joint at its limit may no longer cancel the motion of
+    another joint; where the tool would then move faster than requested, the task slows down.
+    Null-space motion is scaled down in proportion for all joints. False: only the safety filter
+    keeps the limits."""
     drift_compensation_rate: float = 2.0
     """Decay rate of the tool's pose drift under a null-space input [1/s]; 0: no
     compensation."""
     blending: BlendingConfig = field(default_factory=BlendingConfig)
     """Blending of vision feedback."""
     way_making: WayMakingConfig | None = None
-    """Null-space motion away from the people and objects of `Observation.distances`; None: only
-    the null-space input of a person moves the null space."""
+    """Null-space motion away from the people and objects of `Observation.distances`; None: the
+    input of a person is the only null-space input."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter."""
 
@@ -188,8 +189,8 @@ class AdaptiveController(nn.Module):
             joint_region: Region within the joint limits; default: from the arm's limits.
 
         Raises:
-            ValueError: The arm has too few joints for the goals, or the estimator's feature has
-                another number of points than the goals' target.
+            ValueError: The arm has too few joints for the goals, or the estimator's feature and
+                the goals' target differ in their number of points.
         """
         super().__init__()
         self.chain = arm
@@ -297,9 +298,9 @@ class AdaptiveController(nn.Module):
             The command and the next state.
 
         Raises:
-            ValueError: The joint positions do not fit the arm; a number dt is outside the range
-                (0, `longest_step`] of the safety settings; or the goals of the observation need
-                more joints than the arm has.
+            ValueError: The joint positions do not fit the arm; `dt` is a number outside the
+                range (0, `longest_step`] of the safety settings; or the goals of the
+                observation need more joints than the arm has.
         """
         given_safety, state = state.safety, self._restored(state)
         self.safety.joint_vector(observation.joint_position, "joint_position")
@@ -324,7 +325,7 @@ class AdaptiveController(nn.Module):
         motion = self._motion(state, given, task_level, feedback.s)
         numbers = (motion.joint_velocity, feedback.xi_x, feedback.xi_r)
         sound = timed & is_number(torch.cat(numbers, dim=-1)).all(-1)
-        # The filter checks its state itself, and brakes where it is invalid.
+        # The filter checks its own state, and brakes the arm where this state is invalid.
         v, safety, report = self._filtered(given_safety, given, motion, stop, stale | ~sound)
         pose_drift = self._next_drift(state.pose_drift, motion, v, dt, sound, safety)
         moved = torch.linalg.vecdot(J, v.unsqueeze(-2))
@@ -508,7 +509,8 @@ class AdaptiveController(nn.Module):
         observation, pose = given.observation, given.pose
         q = observation.image_joint_position
         if q is not None:
-            # Estimators compute with the pose even where they must not learn from it.
+            # Estimators compute with the pose even where they must not learn from it, so it
+            # must be finite.
             known = is_number(q).all(-1)
             pose = self.chain.forward(
                 torch.where(known.unsqueeze(-1), q, state.safety.position)

@@ -3,7 +3,7 @@
 A step is a pure function `(state, reading, request) -> (command, state, report)`:
 
 1. *Observe* a reading: the null-space push is smoothed, and the joint path advances, waits or
-   is retraced, depending on how the arm tracks it and on people.
+   is retraced, depending on people near the arm and on how well the arm tracks the path.
 2. *Act* on a request: a joint path, a pose of the end effector, a joint velocity, or a command
    of the adaptive controller becomes a joint velocity; the null space yields to the push; the
    safety filter has the last word; and the pace of the task drops by the fraction of the motion
@@ -161,9 +161,9 @@ class ArmLoop:
         return self._filtered(state, reading, wanted)
 
     def _known(self, state: ArmLoopState, reading: ArmReading) -> ArmReading:
-        """The reading, with invalid values replaced and `stop` set where there were any. The
-        positions predicted from the commands replace joint positions that are not finite; zero
-        replaces a push that is not finite.
+        """The reading, with invalid values replaced and `stop` set where there were any. Joint
+        positions that are not finite are replaced by the positions predicted from the commands;
+        a push that is not finite is replaced by zero.
         """
         q, push = reading.joint_position, reading.nullspace_input
         located, felt = (is_number(x).all(-1, keepdim=True) for x in (q, push))
@@ -300,7 +300,8 @@ class ArmLoop:
             return slowed
         slowed = slowed | (people.speed_scale < 1)
         if (layer := report.constraints) is not None:
-            # Slowing down for the arm's own limits does not count; a path could wait for ever.
+            # Slowing down for the arm's own limits does not count: otherwise a path could wait
+            # forever.
             given_up = (layer.slowed > _SLOWED) & closes_in(
                 people.distances, sent, self.safety.config
             )

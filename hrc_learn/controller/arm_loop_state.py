@@ -37,12 +37,12 @@ class ArmLoopConfig(YieldingConfig):
     """Time from a command until the arm follows it, including servo lag [s]. The default is the
     lag of the simulated servos; on real arms, networks and schedulers add to it."""
     limit_margin: float = 0.1
-    """Range before the joint limits that is reserved for the task and closed to pushes, in
-    addition to the margin of the safety filter [rad]. Motion over this range moves the end
-    effector by some centimetres."""
+    """Range next to each joint limit into which the task may move a joint, but a push may not
+    [rad]. It adds to the margin of the safety filter. A joint that crosses this range moves the
+    end effector by a few centimetres."""
     speed: float = 1.0
-    """Speed of the task relative to its planned speed, in (0, 1]; for example low for a first
-    run on a real arm. Null-space motions off a path are not slowed down."""
+    """Speed of the task relative to its planned speed, in (0, 1]. Use a low value for the first
+    run on a real arm. Null-space motion off a path is not slowed down."""
     longest_wait: float = 300.0
     """Longest time for which people may block or displace the arm before the task fails [s]."""
     back_after: float = 2.0
@@ -69,9 +69,10 @@ class WatchedPeople:
     """Distances of the arm from people near it, and the speed limits that result."""
 
     distances: Distances
-    """Distances of the most urgent pairs of an arm capsule and a body capsule, reduced by the
-    distance that people may have moved since the observation. NaN (the arm brakes) if there is
-    no observation, or if people are close enough for a contact that is not allowed."""
+    """Distances of the most urgent pairs; each pair is a capsule of the arm and a capsule of a
+    body. The distances are reduced by the distance that people may have moved since the
+    observation. They are NaN, and the arm brakes, if there is no observation or if people are
+    close enough for a contact that is not allowed."""
     nearest: Float[Tensor, "*batch"]
     """Smallest distance between the observed people and the arm at its present joints [m]."""
     age: Float[Tensor, "*batch"]
@@ -79,7 +80,7 @@ class WatchedPeople:
     speed_scale: Float[Tensor, "*batch"]
     """Speed scale of the arm in every direction, 0 to 1."""
     speed_cap: Float[Tensor, "*batch"]
-    """Cap on the speed of all parts of the arm [m/s]; infinite: none."""
+    """Cap on the speed of all parts of the arm [m/s]; infinite: no cap."""
 
 
 @pytree
@@ -116,7 +117,7 @@ class PathState:
     """Progress along a joint path, and how the last step tracked it."""
 
     progress: Float[Tensor, "*batch"]
-    """Number of the path sample to track; a fraction lies between two samples."""
+    """Index of the path sample to track; a fractional index lies between two samples."""
     rate: Float[Tensor, "*batch"]
     """Speed along the path, relative to the path's own speed, -1 (backwards) to 1."""
     last: Float[Tensor, "*batch"]
@@ -132,8 +133,8 @@ class PathState:
     blocked: Bool[Tensor, "*batch"]
     """True if the arm is off its path and would collide if the path advanced."""
     narrow_ahead: Bool[Tensor, "*batch"]
-    """True if the path comes near a singularity within its stopping distance. The joints cannot
-    leave the path near a singularity."""
+    """True if the path comes near a singularity within its stopping distance. Near a
+    singularity, the joints cannot leave the path."""
     waited: Float[Tensor, "*batch"]
     """Waiting time in which the joints came no nearer to the path [s]."""
     nearest: Float[Tensor, "*batch"]

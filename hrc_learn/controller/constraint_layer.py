@@ -1,14 +1,14 @@
-"""Joint velocities that keep joint limits and distances together, by a quadratic program.
+"""Joint velocities that keep joint limits and distances at once, from a quadratic program.
 
 The program finds the joint velocity nearest to a wanted one, with priority for the task. It has
-two unknowns more than the arm has joints: the speed of the task, and the excess of the closing
-speed where distances conflict. The arm keeps distances from itself, from objects and from
-people (`SeparationConfig`).
+two unknowns more than the arm has joints: the speed of the task, and the amount by which
+closing speeds exceed their limits where distances conflict. The arm keeps distances from
+itself, from objects and from people (`SeparationConfig`).
 
 The solver is the dual active-set method of Goldfarb and Idnani (1983), batched, with a fixed
 limit on the number of steps. It starts at the optimum without limits and adds one limit at a
-time to the active set, so a program with few active limits is solved exactly in as few steps.
-Each step adds or drops one limit, separately for each element of a batch: the operations do not
+time to the active set, so a program with few active limits is solved exactly in few steps. Each
+step adds or drops one limit, separately for each element of a batch: the operations do not
 depend on the data, so they compile and export.
 """
 
@@ -35,9 +35,9 @@ from hrc_learn.pytree import pytree, zero_where
 
 # Violations of a limit up to this size count as rounding.
 _TOLERANCE = 1e-10
-# The row of a limit counts as linearly dependent on the active rows if its part in their null
-# space is shorter than this fraction of the row. Rounding leaves 1e-16; with weights of 1e7, a
-# fraction of 1e-7 of a row is significant.
+# The row of a limit counts as linearly dependent on the active rows if its projection onto
+# their null space is shorter than this fraction of the row. Rounding leaves 1e-16; with weights
+# of 1e7, a fraction of 1e-7 of a row is significant.
 _DEPENDENT = 1e-12
 
 
@@ -53,7 +53,10 @@ class LeastChange(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _Step:
-    """Nearest point within the active limits in a step of the method; shapes in parentheses."""
+    """State of the method after a step: nearest point within the active limits.
+
+    Shapes are given in parentheses.
+    """
 
     y: Tensor
     """The point (p)."""
@@ -88,8 +91,8 @@ def least_change(
     Args:
         rows: C^T, with a column for each limit. In this layout sums run over the first axis,
             and compiled code works on vectors of limits.
-        lower: Lower limits, not above `upper`; minus infinity: none.
-        upper: Upper limits; infinity: none.
+        lower: Lower limits, not above `upper`; minus infinity: no limit.
+        upper: Upper limits; infinity: no limit.
         steps: Number of steps. Each active limit takes one step, and each limit that is added
             and dropped again takes two.
     """
@@ -196,7 +199,7 @@ def _column(matrix: Tensor, index: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class ConstraintConfig:
-    """Distances to keep, and the priorities with which the motion yields to them."""
+    """Distances to keep, and the costs that decide which motion yields first."""
 
     clearance: float = 0.03
     """Distance kept from objects and from the arm itself [m]: three times the calibration error
@@ -205,17 +208,17 @@ class ConstraintConfig:
     """Fastest decay of a distance towards the clearance [1/s], as for joints towards their
     limits; at most 1/dt."""
     task_weight: float = 100.0
-    """Cost of stopping the task, relative to 1 rad/s of null-space motion: the null space
-    changes by up to 1 rad/s to save a hundredth of the task's speed."""
+    """Cost of stopping the task, relative to 1 rad/s of null-space motion. With 100, a change
+    of the null-space velocity by 1 rad/s costs as much as a hundredth of the task's speed."""
     path_weight: float = 1e3
     """Cost of leaving the path of the task by 1 rad/s, relative to stopping it."""
     distance_weight: float = 1e2
     """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2,
     the violation of conflicting distances exceeds the least possible one by 1 part in 1e4."""
     steps: int = 16
-    """Steps of the solver; the arm brakes where they are not enough. Arms approached by a
-    person never needed more than 12; random limits need more than 16 in 4 % of the states, and
-    more than 24 in 0.1 %. Each step of the solver takes about 3 % of the time of a compiled
+    """Steps of the solver; the arm brakes where they are not enough. An arm that a person
+    approached never needed more than 12; random limits need more than 16 in 4 % of the states,
+    and more than 24 in 0.1 %. Each step of the solver takes about 3 % of the time of a compiled
     control step."""
 
     def __post_init__(self):
@@ -235,12 +238,13 @@ class ConstraintConfig:
 
 @pytree
 class Distances:
-    """Distances between pairs of bodies to keep: the arm itself, the scene, a person."""
+    """Distances to keep: between the arm and itself, the scene, or a person."""
 
     distance: Float[Tensor, "*batch pairs"]
     """Distance of each pair [m]."""
     gradient: Float[Tensor, "*batch pairs n"]
-    """Gradient over the joint positions [m/rad]; zero for a pair that the arm does not move."""
+    """Gradient with respect to the joint positions [m/rad]; zero for a pair that the arm does
+    not move."""
     approach_speed: Float[Tensor, "*batch pairs"]
     """Rate at which the distance shrinks while the arm rests [m/s]: the speed of the other body
     towards the arm, along the line between both."""
@@ -289,10 +293,10 @@ class ConstraintReport:
     slowed: Float[Tensor, "*batch"]
     """Fraction of the task velocity given up, 0 to 1."""
     violation: Float[Tensor, "*batch"]
-    """Excess of the fastest closing speed over the allowed one [m/s]; above zero where joint
+    """Largest excess of a closing speed over the allowed one [m/s]; above zero where joint
     limits or other distances permit no better solution."""
     solved: Bool[Tensor, "*batch"]
-    """False: the arm brakes, because the solver needed more steps."""
+    """False where the arm brakes because the solver needed more steps than allowed."""
 
 
 def constrained_velocity(
@@ -313,7 +317,7 @@ def constrained_velocity(
 
         u = wanted + sigma t + N z + P e,
 
-    and the returned one solves
+    and the returned velocity solves
 
         min  |z|^2 + W_t^2 sigma^2 + W_p^2 |e|^2 + W_d^2 delta^2
         s.t. lower <= u <= upper,   -task_fraction <= sigma <= 0,
@@ -325,25 +329,25 @@ def constrained_velocity(
     The weights are far apart (W_t `task_weight`, W_p `path_cost`, W_d `slack_cost` of
     `ConstraintConfig`), which makes them priorities. Joint limits hold exactly. Distances
     hold, or are violated by the least possible excess `delta`, equal for all pairs. The tool
-    stays on the path of the task, J u = J wanted + sigma J t, if any motion on it is allowed.
-    The task keeps as much of its speed as possible. The null space yields first. Where no limit
-    binds, the result is the wanted velocity.
+    stays on the path of the task, J u = J wanted + sigma J t, if the limits allow any motion on
+    it. The task keeps as much of its speed as possible. The null space yields first. Where no
+    limit binds, the result is the wanted velocity.
 
     On the path, the tool never moves faster than wanted, whatever the null space does. To cap
     the speed of the tool, cap the wanted velocity.
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
-        task: Joint velocity of the task, along which it may slow down [rad/s]. A component that
-            does not move the tool counts as null-space motion.
+        task: Joint velocity of the task [rad/s]; the task may slow down, but keeps this
+            direction. A component that does not move the tool counts as null-space motion.
         jacobian: Jacobian of the tool, with at most as many rows as joints; may be singular.
         lower: Lowest joint velocity allowed by the limits of position, velocity, acceleration
             and jerk [rad/s]. Not above `upper`.
         upper: Highest joint velocity allowed [rad/s].
         distances: Distances to keep; None: none.
         config: Weights and clearance; default: the recommended settings.
-        task_fraction: Fraction of the task contained in the wanted velocity, 0 to 1, below 1
-            while the arm accelerates; None: 1.
+        task_fraction: Fraction of `task` that `wanted` contains, 0 to 1; it is below 1 while
+            the arm accelerates. None: 1.
         separation: Protective distance from people; default: the recommended settings.
 
     Returns:

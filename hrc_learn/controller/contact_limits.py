@@ -9,13 +9,13 @@ of the arm at its posture is given by
     1/m_R = n^T J M^-1 J^T n
 
 with the direction n of approach, the Jacobian J of the contact point and the mass matrix M. A
-part of the body between the arm and furniture cannot yield: there we also assume that the arm
-pushes on until it has stopped.
+part of the body between the arm and furniture cannot yield: in this case we also assume that
+the arm keeps pushing until it has stopped.
 
-The values are those of ISO/TS 15066:2016, tables A.2 and A.3, as commonly quoted; secondary
-sources confirm the spring constants and masses, and that the edition of 2025 kept the tables.
-Compare forces and pressures with the standard before you rely on them. None of this is a
-certified safety function.
+The values are those of ISO/TS 15066:2016, tables A.2 and A.3, as commonly quoted. Secondary
+sources confirm the spring constants and masses, and state that the edition of 2025 kept the
+tables. Compare the forces and pressures with the standard before you rely on them. None of this
+is a certified safety function.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hrc_learn.kinematics.inertia import MassMatrix
 
 PersonMode = Literal["ssm", "pfl", "ssm+pfl"]
 """Reaction to people: speed and separation monitoring, power and force limiting wherever
-contact is allowed, or the one of the two that allows the higher speed."""
+contact is allowed, or whichever of the two allows the higher speed."""
 
 
 class BodyRegion(NamedTuple):
@@ -79,9 +79,9 @@ class ContactConfig:
     area: float = 1.0
     """Smallest contact area [cm^2], as in the examples of ISO/TS 15066, table A.4."""
     padding: float = math.inf
-    """Stiffness of a padding [N/mm]; infinite: none."""
+    """Stiffness of a padding [N/mm]; infinite: no padding."""
     used: float = 0.9
-    """Fraction of the limits that is used; the rest allows for errors of the masses of arm and
+    """Fraction of the limits that is used; the rest allows for errors in the masses of arm and
     load."""
     rotor_inertia: float = 0.1
     """Inertia of motor and gear at each joint [kg m^2]: the value of MuJoCo's Panda."""
@@ -117,8 +117,8 @@ class SeparationConfig:
     distance that is left when the arm has stopped."""
     mode: PersonMode = "ssm"
     """Speed and separation monitoring ("ssm"), power and force limiting wherever contact is
-    allowed ("pfl"), or the one that allows the higher speed ("ssm+pfl"). Body regions that must
-    not be touched are kept at the protective distance in all modes."""
+    allowed ("pfl"), or whichever of the two allows the higher speed ("ssm+pfl"). Body regions
+    that must not be touched are kept at the protective distance in all modes."""
     contact: ContactConfig = field(default_factory=ContactConfig)
     """Surface and inertia of the arm, for power and force limiting."""
 
@@ -148,8 +148,8 @@ class SeparationConfig:
     ) -> Float[Tensor, "*batch"]:
         """Speed towards a person that keeps the protective separation distance [m/s].
 
-        The root v of  d = S_p(v),  see `protective_distance`; zero where the person is too
-        close for any motion. An unknown distance (NaN) counts as zero.
+        The speed v solves d = S_p(v), see `protective_distance`; it is zero where the person is
+        too close for any motion. An unknown distance (NaN) counts as zero.
 
         Args:
             distance: Distance between person and arm [m]; infinite: no person is near.
@@ -191,7 +191,7 @@ class SeparationConfig:
         human_speed: Float[Tensor, "*batch"],
         contact_speed: Float[Tensor, "*batch"] | None,
     ) -> Bool[Tensor, "*batch"]:
-        """True where a contact at these speeds is allowed, so that no distance is needed.
+        """True where a contact at these speeds is allowed, so that no distance has to be kept.
 
         Args:
             speed: Closing speed of the arm [m/s].
@@ -283,7 +283,7 @@ class ContactLimits:
         regions: Int[Tensor, "*#batch H"],
         holds: bool,
     ) -> ContactSpeeds:
-        """`contact_speed` of all parts of the arm with all parts of a person.
+        """`contact_speed` for each pair of a part of the arm and a part of a person.
 
         Args:
             found: Distances between arm and person.

@@ -28,7 +28,8 @@ from hrc_learn.regions import (
 
 _LIMITS = ("velocity", "position", "acceleration", "jerk", "tcp_speed", "separation")
 INTERVENTIONS = (*_LIMITS, "invalid", "stopped", "start")
-"""Kinds of interventions, in the order of the last axis of their flags and counts."""
+"""Kinds of interventions, in the order of the last axis of `SafetyReport.flags` and
+`SafetyState.counts`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,8 @@ class SafetyConfig:
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
     braking: float = 1.0
     """Fraction of the acceleration and jerk limits that the arm's driver uses, in (0, 1].
-    franky plans with its `dynamics` factor, 0.3 by default in our adapter."""
+    The driver franky plans motions with its `dynamics` factor, 0.3 by default in our
+    adapter."""
     delay: float = 0.0
     """Longest time from a joint position reading to the motion that results from it [s]."""
     jitter: float = 0.0
@@ -53,8 +55,9 @@ class SafetyConfig:
     tcp_speed: float = 1.0
     """Highest speed of the tool centre point, the elbow and the far end of a load [m/s]."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
-    """Protective distance from people. It lowers the tool-speed cap where `human_distance` is
-    given, and limits all links where `distances` to a person are given."""
+    """Protective distance from people. It lowers the cap on the tool's speed where
+    `human_distance` is given, and limits the speed of all links where `distances` to a person
+    are given."""
     constraints: ConstraintConfig | None = None
     """Settings of the quadratic program that keeps limits and distances; in this program, the
     null space yields to the task. None: each joint brakes by itself before its limits, and no
@@ -186,8 +189,9 @@ class Goals:
             centre: Centre of the box for the tool centre point [m].
             orientation: Orientation of the tool, a unit quaternion (w, x, y, z).
             target: Target of the feature in the image [px]: u and v of each point. None: a
-                feature of one point, with vision feedback switched off. To switch it off for
-                several points, pass a target and call `with_vision(False)`.
+                feature of one point, with vision feedback switched off. To switch vision
+                feedback off for a feature of several points, pass a target and call
+                `with_vision(False)`.
             half_size: Half edges of the box [m].
             image_size: Width and height of the image [px].
             task: Controlled part of the tool pose: all of it, position and z axis, or position.
@@ -262,7 +266,7 @@ class Observation:
     """Measured joint positions [rad]."""
     feature: Float[Tensor, "*batch rows"]
     """Measured feature (u, v) [px], or u and v of several points in turn, such as the corners
-    of a marker; any value, also NaN, where it is not visible."""
+    of a marker; any value, even NaN, where the feature is not visible."""
     feature_visible: Bool[Tensor, "*batch"]
     """True if the feature was found in the image."""
     dt: float | Float[Tensor, ""]
@@ -284,30 +288,30 @@ class Observation:
     joint_state_stale: Bool[Tensor, "*batch"] | None = None
     """True if the joint position is too old to be used; None counts as False."""
     human_distance: Float[Tensor, "*batch"] | None = None
-    """Distance of the nearest person from the tool [m]; a short one slows down or stops the
-    arm. NaN (unknown): stop. None: no person is monitored."""
+    """Distance of the nearest person from the tool [m]; a short distance slows down or stops
+    the arm. NaN (unknown): stop. None: no person is monitored."""
     load: Float[Tensor, "*batch 3"] | None = None
     """Far end of a load in the frame of the tool centre point [m]. The cap on the tool's speed
     also applies to this point. None: no load."""
     distances: Distances | None = None
     """Distances of the arm from itself, the scene and people, kept by
-    `SafetyConfig.constraints`; None: none."""
+    `SafetyConfig.constraints`; None: no distances are kept."""
     stop: Bool[Tensor, "*batch"] | None = None
-    """True to brake to rest and stay there, for a watchdog or a person; None counts as
-    False."""
+    """True: brake to rest and stay there, as requested by a watchdog or a person. None counts
+    as False."""
 
     @classmethod
     def unseen(
         cls, joint_position: Float[Tensor, " n"], target: Float[Tensor, " rows"], dt: float
     ) -> Observation:
-        """Observation of an arm at rest before the first image, with every field that the loop
-        of an arm and a camera sets.
+        """Observation of an arm at rest before the first image. It has values in all fields
+        that a loop with an arm and a camera sets.
 
         Args:
             joint_position: Joint positions [rad].
             target: Image position that stands for the unseen feature [px].
-            dt: Time until the next step [s]; a tensor in the observation, so that one compiled
-                step serves all rates.
+            dt: Time until the next step [s]; the observation stores it as a tensor, so that one
+                compiled step serves all rates.
         """
         return cls(
             joint_position=joint_position,
@@ -349,9 +353,9 @@ class Command:
     scaled by the blending. It is the part of the Lyapunov function that does not depend on the
     unknown true weights of the estimator."""
     potential_rate: Float[Tensor, "*batch"]
-    """s^T J u, the rate of the potential predicted with the estimated image Jacobian [1/s]. It
-    is at most zero, unless a limit or a person moves the tool away from its goals. If the
-    measured potential falls more slowly than predicted, the image Jacobian has an error."""
+    """s^T J u: rate of the potential, predicted with the estimated image Jacobian [1/s]. It is
+    at most zero, unless a limit or a person moves the tool away from its goals. If the measured
+    potential falls more slowly than predicted, the image Jacobian has an error."""
     safety: SafetyReport
     """Interventions of the safety filter."""
 
@@ -365,4 +369,5 @@ INITIAL_IMAGE_JACOBIAN = (
     (-1500.0, 0.0, 0.0, 0.0, -200.0, 60.0),
     (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
 )
-"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above the table, u increasing along -x."""
+"""J_s_hat at t = 0 (equation eq_js0) [px/m, px/rad]: the camera is above the table, and u
+increases along -x."""

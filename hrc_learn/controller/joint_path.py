@@ -1,8 +1,8 @@
-"""Joint paths that the null space may leave: slowing down, waiting and retracing.
+"""Joint paths that a pushed arm may leave: rules for slowing down, waiting and retracing.
 
 While a person pushes the joints off their path, the end effector keeps to the poses of the
 path. The rules here decide whether the joints are off the path, how far a push may take them,
-when the path waits for them, and how they return. All of them are batched and stateless.
+when the path waits for them, and how they return. All functions are batched and stateless.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree
 
 CHANGE_OF_RATE = 0.2
-"""Time in which a path comes to rest, or to its full speed [s]."""
+"""Time in which the motion along a path stops, or reaches its full speed [s]."""
 FAR_ASIDE = 1.8
 """Largest distance of the joints from their path at which the path still advances [rad]. In
 simulation, arms always returned to their path from 1.4 rad, where the elbow is about 0.2 m off
@@ -63,7 +63,7 @@ class JointPaths:
     narrow: Bool[Tensor, "paths samples"]
     """True near a singularity, where the joints cannot leave the path."""
     narrow_ahead: Bool[Tensor, "paths samples"]
-    """True where the path is narrow within the distance in which it stops."""
+    """True where the path becomes narrow within its stopping distance."""
     last: Int[Tensor, " paths"]
     """Index of the last sample of each path."""
 
@@ -167,9 +167,9 @@ def nears_singularity(
     joint_position: Float[Tensor, "*batch n"],
     joint_velocity: Float[Tensor, "*batch n"],
 ) -> Bool[Tensor, "*batch"]:
-    """True if joints off their path are near a singularity, or will be before the path stops.
+    """True if joints off their path are near a singularity, or will be before they stop.
 
-    Near a singularity, the end effector could not be kept on the path.
+    Near a singularity, joints off their path cannot keep the end effector on the path.
 
     Args:
         chain: Kinematics of the arm.
@@ -202,7 +202,7 @@ def changed_rate(
 def deviation_ratio(
     error: Float[Tensor, "*batch 6"], twist: Float[Tensor, "*batch 6"]
 ) -> Float[Tensor, "*batch"]:
-    """Distance of the end effector from its path, relative to the tolerated one.
+    """Distance of the end effector from its path, relative to the tolerated distance.
 
     Args:
         error: Motion of the end effector to its pose on the path (linear [m], angular [rad]).
@@ -216,7 +216,7 @@ def _length(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
     return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)
 
 
-# `_RETURN_GOALS`: least number of samples of a long path among which a direct return chooses.
+# `_RETURN_GOALS`: a direct return to a long path chooses among at least this many samples.
 # `_CHECKED`: number of postures checked on the way to each of these samples.
 _RETURN_GOALS, _CHECKED = 20, 51
 
@@ -260,8 +260,8 @@ class DirectReturn:
         config: YieldingConfig,
         clearance: Clearance | None,
     ) -> DirectReturn:
-        """Plan a return to the sample at which the path waits. If the arm would collide on this
-        way, plan a return to the nearest sample that it reaches without contact.
+        """Plan a return to the sample at which the path waits. If the arm would collide during
+        this return, plan a return to the nearest sample that it reaches without contact.
 
         Args:
             paths: Table of paths.
@@ -282,7 +282,7 @@ class DirectReturn:
             distance = clearance(torch.lerp(start, goals, fraction))
             ends = distance[[0, -1]].amin(0)
             clear = (distance >= ends.clamp(max=config.clearance)).all(0)
-        # The first candidate with a return that is clear.
+        # The first candidate that the arm reaches without a collision.
         chosen = clear.to(torch.int64).argmax(0, keepdim=True)
         goal = goals.gather(0, chosen.unsqueeze(-1).expand_as(goals[:1])).squeeze(0)
         # A minimum-jerk motion peaks at 1.875 times its mean speed.
@@ -309,8 +309,8 @@ def _return_goals(
     progress: Float[Tensor, "*batch"],
     joint_position: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "goals *batch n"], Float[Tensor, "goals *batch"]]:
-    """Possible goals of a direct return [rad], and their numbers on the path: first the sample
-    at which the path waits, then others by distance.
+    """Possible goals of a direct return [rad], and their sample numbers on the path: first the
+    sample at which the path waits, then other samples by increasing distance.
     """
     last = paths.last[path]
     stride = ((last + 1) // _RETURN_GOALS).clamp(min=1)

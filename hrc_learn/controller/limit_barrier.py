@@ -27,8 +27,8 @@ class LimitBarrier(nn.Module):
         c = A / rate     <=>     Q(v_hat) = v_hat^2/(2 A) + v_hat/rate <= delta
 
     To brake, a joint ramps its acceleration a down to -A. Braking with A *without a ramp*, but
-    from v_hat instead of v, takes a distance that is longer by (a + A)^3/(6 j^2). So one curve
-    h is safe for every a.
+    from v_hat instead of v, takes a distance that is longer than with the ramp, by
+    (a + A)^3/(6 j^2). So one curve h is safe for every a.
 
     The set is invariant in discrete time. Assume that step k starts with v_hat_k inside the
     set, that the joint moves by v_k dt, and that the next acceleration is max(a_k - j dt, -A).
@@ -50,8 +50,8 @@ class LimitBarrier(nn.Module):
     *Starts outside.* A joint may start at rest with a smaller delta, or beyond the limit. Such
     a joint never moves outwards, and may stay at rest; the set is then
     v_hat <= max(h(delta), A^2/(2 j)). A joint that comes to rest within its margin then stops
-    at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. This set is also
-    invariant, because braking lowers v_hat.
+    at most A^2/(2 j) (A/j + dt) past the wall delta = 0, which is 0.2 mrad for a Panda at
+    125 Hz. This set is also invariant, because braking lowers v_hat.
 
     *Delay and jitter.* If joints follow a command after a delay T, their speed while braking is
     at most v + A T. To compensate, the barrier moves the wall inwards by T v_hat. Each braking
@@ -67,8 +67,8 @@ class LimitBarrier(nn.Module):
     The right-hand side decreases with o, and for A = d and o = c it equals h. h increases
     with A. So the limits hold at every position, and joints brake in time, on two conditions:
     in Q, min(A, d) replaces A and max(1/rate, o/d) replaces 1/rate; and m satisfies the
-    inequality above. Here o includes the margin that libfranka subtracts. For the margin,
-    A^2/(2 j) is added to o, because a joint may come to rest within the margin. All of these
+    inequality above. Here o includes the margin that libfranka subtracts. In the inequality for
+    m, A^2/(2 j) is added to o, because a joint may come to rest within the margin. All of these
     values are constants, so they do not add computation to a step.
     """
 
@@ -115,14 +115,14 @@ class LimitBarrier(nn.Module):
         self.knee_square = nn.Buffer(self.knee**2)
         """c^2."""
         self.twice_acceleration = nn.Buffer(2 * slowest)
-        """2 A of Q [rad/s^2]."""
+        """2 A in Q [rad/s^2]."""
         self.reserve = nn.Buffer(reserve)
         """v_hat - v at a = 0, which is A^2/(2 j) [rad/s]."""
 
     def usable(
         self, dt: float | Float[Tensor, "*#batch 1"]
     ) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
-        """Limits of acceleration and jerk less the rounding of the velocities sent.
+        """Limits of acceleration and jerk, less the effect of rounding the sent velocities.
 
         A velocity is rounded by at most r = 2 eps v_max, which changes the acceleration by
         2 r/dt and the jerk by 4 r/dt^2. In float32 at 1 kHz that is 1e-4 of a Panda's limits.
@@ -141,7 +141,8 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
         delta = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
-        # v_hat = v + A^2/(2 j) at a = 0. Past its wall a joint may rest, as at the wall.
+        # v_hat = v + A^2/(2 j) at a = 0. A joint past its wall may rest, like a joint at its
+        # wall.
         square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.clamp(min=0))
         speed = (square.sqrt() - self.knee - self.reserve).clamp(min=0)
         most = (1 - 2 * _ROUNDING * torch.finfo(self.velocity.dtype).eps) * self.velocity
@@ -156,7 +157,7 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest acceleration [rad/s^2] that stay inside the set.
 
-        The roots a of v + a dt + (a + A)^2/(2 j) = bound + A^2/(2 j), for both limits.
+        The bounds are the roots a of v + a dt + (a + A)^2/(2 j) = bound + A^2/(2 j).
 
         Args:
             velocity: Velocity of the last step [rad/s].
@@ -189,7 +190,7 @@ class LimitBarrier(nn.Module):
             velocity: Velocity of the last step [rad/s].
             bounds: `velocity_bounds` now.
             dt: Step [s], one for all arms or one for each.
-            usable: The limits `usable(dt)`, if they are at hand.
+            usable: The result of `usable(dt)`; None: it is computed here.
         """
         A, jerk = self.usable(dt) if usable is None else usable
         inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
@@ -204,8 +205,8 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity of the next step that keep all limits [rad/s].
 
-        If the acceleration and jerk limits do not permit a velocity that the position and
-        velocity limits require, the bounds are the nearest velocity that they permit.
+        If the acceleration and jerk limits do not permit the velocity that the position and
+        velocity limits require, both bounds are the nearest permitted velocity.
 
         Args:
             velocity: Velocity of the last step [rad/s].
@@ -223,9 +224,9 @@ class LimitBarrier(nn.Module):
 def _reachable(wanted: Tensor, last: Tensor, limit: Tensor, reach: Tensor) -> Tensor:
     """The acceleration within its limit and within reach of the last one [rad/s^2].
 
-    The reach, which the jerk limit sets, comes last: outside the set the barrier may require an
-    acceleration beyond it, and at the start the acceleration may be so far outside its limit
-    that one step does not return it.
+    The clamp to the reach, which the jerk limit sets, comes last: outside the set, the barrier
+    may require an acceleration beyond the reach; and at the start, the acceleration may be so
+    far outside its limit that one step cannot bring it back.
     """
     return wanted.clamp(-limit, limit).clamp(last - reach, last + reach)
 
@@ -238,17 +239,17 @@ _RAMP = 0.005
 
 @final
 class SpeedBarrier(nn.Module):
-    """The invariant set of joint states from which speeds of points stay below a cap.
+    """The invariant set of joint states from which speeds of points can be kept below a cap.
 
     Let J be the linear Jacobian of a point, v and a the joint velocity and acceleration. The
-    speed |J v| changes although v rests, because J turns with the joints. The set therefore
+    speed |J v| changes even at constant v, because J turns with the joints. The set therefore
     bounds the speed throughout one braking motion to rest, v(t) = y v, in which y falls from 1
     to 0 with dy/dt = -1/T. For the present v, T = max(kappa |v_i|/A_i) + tau, with the limits
     A_i of the acceleration, a factor kappa >= 1, and a time tau in which the braking fades out.
 
-    *Turning.* For joints i, j of a chain, d^2 p/dq_i dq_j = z_min(i,j) x J_max(i,j), at most as
-    long as the column J_max(i,j). Let R_i be the longest column from joint i on, and x = |v|.
-    After the joints have moved by d,
+    *Turning.* For joints i, j of a chain, d^2 p/dq_i dq_j = z_min(i,j) x J_max(i,j), which is
+    at most as long as the column J_max(i,j). Let R_i be the longest column from joint i on, and
+    x = |v|. After the joints have moved by d,
 
         |J(q + d) v - J(q) v| <= sum_ij R_max(i,j) d_j x_i,
 
@@ -258,9 +259,10 @@ class SpeedBarrier(nn.Module):
 
         y (|J v| + dt B + Gamma (1 - y^2)),    Gamma = B (T + tau)/2.
 
-    The largest value over y is |J v| + dt B if this sum exceeds 2 Gamma: braking outruns the
-    turning. The bound is a barrier, because one step of braking, of any length, does not
-    increase it. The columns R_i also grow, by a factor of at most exp(sum of all d).
+    The largest value over y is |J v| + dt B if this sum exceeds 2 Gamma: braking then lowers
+    the speed faster than turning raises it. The bound is a barrier, because one step of
+    braking, of any length, does not increase it. The columns R_i also grow, by a factor of at
+    most exp(sum of all d).
 
     *Jerk.* While its acceleration a ramps down, a joint is faster than y v by at most
     (a + b)^2/(2 j), where b = |v|/T is its deceleration. A large kappa keeps these ramps small.
@@ -318,7 +320,7 @@ class SpeedBarrier(nn.Module):
         """Bound on the speed of all points during a step and the braking after it [m/s].
 
         Args:
-            points: Linear Jacobians of the points at the positions read last.
+            points: Linear Jacobians of the points at the joint positions read last.
             velocity: Joint velocity of the step [rad/s].
             acceleration: Acceleration with which this velocity is reached [rad/s^2].
             dt: The step [s].

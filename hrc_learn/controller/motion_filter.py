@@ -24,7 +24,7 @@ _LARGEST_VALID = 1e50
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionState:
-    """State of the motion, carried from one position to the next."""
+    """State of the motion, passed from one step to the next."""
 
     position: Float[np.ndarray, "*batch D"]
     """Last position returned."""
@@ -73,7 +73,7 @@ class MotionState:
 class MotionFilter:
     """Filter that follows positions within limits of position, velocity, acceleration and jerk.
 
-    Positions that keep the limits and continue the previous ones are returned unchanged.
+    Positions that keep the limits and continue the previous motion are returned unchanged.
     Otherwise the motion departs from them and returns later. With the position error e, its
     rate e' and the requested acceleration a_r,
 
@@ -141,8 +141,8 @@ class MotionFilter:
 
         Args:
             state: State after the previous step.
-            asked: Requested position. NaN and absurdly large values are replaced by the
-                previous request.
+            asked: Requested position. NaN and values from 1e50 on are replaced by the previous
+                request.
         """
         dt = self.dt
         asked = np.where(np.abs(asked) < _LARGEST_VALID, asked, state.reference)
@@ -167,7 +167,7 @@ class MotionFilter:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Velocity and acceleration of the requested motion, without its jumps. Where the
         request breaks a limit, the velocity approaches the slope of the request within the
-        acceleration limit, which nearly ignores single jumps but follows a new slope; the
+        acceleration limit, so that it nearly ignores single jumps but follows a new slope; the
         returned acceleration is then zero.
         """
         dt, A = self.dt, self.acceleration

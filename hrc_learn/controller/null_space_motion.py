@@ -1,8 +1,9 @@
 """Null-space motions that an arm can follow without moving its end effector.
 
 A person, or the repulsion from nearby bodies, requests a motion of the null space. The
-functions here reduce it to what the arm can do: slow enough for the end effector to be kept in
-place, away from singularities, within the joint limits, clear of obstacles, and without jumps.
+functions here reduce this motion until the arm can follow it: slow enough to keep the end
+effector in place, away from singularities, within the joint limits, clear of obstacles, and
+without jumps.
 """
 
 from __future__ import annotations
@@ -48,12 +49,13 @@ _PUSH_EFFORT, _STOP_EFFORT = 0.3, 0.6
 # Lower bound on the null-space speed with which the arm looks ahead for singularities [rad/s].
 _SLOW = 0.2
 # The null-space part of a correction counts as zero if it is shorter than this [rad/s]. A joint
-# takes no part in a correction if its entry is smaller than this, relative to the largest one.
+# takes no part in a correction if its entry is smaller than this, relative to the largest
+# entry.
 _NEGLIGIBLE = 1e-6
 # `_SLIDING_SPEED`: closing speed allowed at the clearance margin [m/s].
 # `_DEEPEST`: depth inside the margin at which this allowed speed has fallen to zero [m].
-# Without them, an arm that slides along a surface would stop and start with every reading, and
-# so would its task.
+# Without these tolerances, an arm that slides along a surface would stop and start with every
+# reading, and so would its task.
 _SLIDING_SPEED, _DEEPEST = 0.002, 0.005
 # Null-space fraction of a push below which the push counts as a push on the end effector.
 _ACROSS = 0.1
@@ -69,13 +71,14 @@ class YieldingConfig:
     damping: float = 3.0
     """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
     nullspace_rise: float = 0.15
-    """Time constant of the null-space velocity when a push begins or grows, and on the return
-    [s]."""
+    """Time constant of the null-space velocity when a push begins or grows, and when the joints
+    return [s]."""
     pose_gain: float = 4.0
-    """Decay rate of the pose error on prescribed motions [1/s]."""
+    """Decay rate of the pose error while a pose or a joint path is tracked [1/s]."""
     after_push: Literal["return", "stay"] = "return"
-    """Behaviour after a push: the joints return to their planned path (a servoed arm to its
-    posture), or they stay off it until the path waits for them."""
+    """Behaviour after a push. "return": the joints return to their planned path, or under
+    visual servoing to their posture. "stay": they stay off the path until the path waits for
+    them."""
     elbow_speed: float = _GUIDED_SPEED
     """Highest speed of the elbow in null-space motions [m/s], at most `guided_elbow_speed` of
     the cap on the arm's speed."""
@@ -97,7 +100,7 @@ def guided_elbow_speed(cap: float) -> float:
     An arm that lags behind a curved null-space motion moves its end effector.
 
     Args:
-        cap: Cap on the speed of the arm's points [m/s]; infinity: none.
+        cap: Cap on the speed of the arm's points [m/s]; infinity: no cap.
     """
     return min(_GUIDED_SPEED, _GUIDED_FRACTION * cap)
 
@@ -301,11 +304,11 @@ def kept_clear(
         joint_position: Joint positions [rad].
         task: Joint velocity of the task, which is not changed [rad/s].
         null: Null-space velocity [rad/s].
-        clearance: Function for the distance from obstacles. It is called once, for all
-            postures to compare, along a new first axis.
-        margin: Clearance to keep [m]. Where the task alone results in less, the null space
-            reduces it further by at most 2 mm/s, and not at all if it is 5 mm or more below the
-            margin.
+        clearance: Function for the distance from obstacles. It is called once, with all
+            postures to compare along a new first axis.
+        margin: Clearance to keep [m]. Where the task alone results in less, null-space motion
+            reduces the clearance further by at most 2 mm/s, and not at all if it is 5 mm or
+            more below the margin.
     """
     ahead = joint_position + LOOK_AHEAD * (task + _fractions_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))

@@ -94,13 +94,13 @@ class OffPath(NamedTuple):
 class PathLaw:
     """Joint velocities for poses of the end effector and along joint paths.
 
-    Where the null space yields to a push,
+    Where the null space yields to a push, the joint velocity is
 
-        u = J^+ (twist + gain error) + N w,
+        u = J^+ (twist + gain error) + N w
 
-    where u is the joint velocity, `error` the pose error and w the joint velocity of the push,
-    reduced until the arm can keep the pose, stays clear of obstacles, and leaves the task a
-    margin before the joint limits. In this way, joints off their path track its poses.
+    with the pose error `error` and the joint velocity w of the push. The law reduces w until
+    the arm keeps the pose, stays clear of obstacles, and leaves the task a margin before the
+    joint limits. In this way, joints off their path track its poses.
     """
 
     def __init__(self, chain: SerialChain, config: ArmLoopConfig, clearance: Clearance | None):
@@ -109,7 +109,7 @@ class PathLaw:
         Args:
             chain: Kinematics and limits of the arm.
             config: Settings of the loop.
-            clearance: Distance of the arm from obstacles; None: there are none.
+            clearance: Distance of the arm from obstacles; None: there are no obstacles.
         """
         self.chain, self.config, self.clearance = chain, config, clearance
         self.safety = SafetyFilter(chain, config.safety)
@@ -136,8 +136,9 @@ class PathLaw:
             twist: Velocity of that pose.
             null_velocity: Joint velocity whose null-space part is wanted [rad/s].
             which: Elements of the batch that track the pose; the others get a velocity of zero.
-            slows: True to limit the null-space velocity by `null_space_slowdown`: a push alone
-                is limited already, but not the sum of a push and a path.
+            slows: True to limit the null-space velocity by `null_space_slowdown`: the velocity
+                of a push alone is already limited, but its sum with the velocity of a path is
+                not.
         """
         q, config = reading.joint_position, self.config
         zero = q.new_zeros(q.shape[:-1])
@@ -260,7 +261,7 @@ class PathLaw:
     def follow(
         self, state: ArmLoopState, reading: ArmReading, request: FollowPath
     ) -> tuple[WantedMotion, ArmLoopState]:
-        """Joint velocity along joint paths, off them, or directly back to them."""
+        """Joint velocity on a joint path, off the path, or directly back to it."""
         q, config = reading.joint_position, self.config
         path = self._returning(state.path, q, request)
         direct = path.direct_return
@@ -313,8 +314,8 @@ class PathLaw:
         )
 
     def _target_motion(self, target: PathTarget, aside: Tensor) -> tuple[Pose, Tensor]:
-        """Pose of the end effector on the path, and its twist along the path, which is zero for
-        arms on their path.
+        """Pose of the end effector on the path, and its twist along the path. The twist is zero
+        for arms on their path.
         """
         ahead = target.goal + self.config.command_delay * target.velocity
         twist = apply_where(

@@ -63,14 +63,14 @@ def task_descent(
     """Twist along which a task of fewer than six dimensions descends the potentials.
 
     With J_t = B J and a motion y of the task, the joints move by J_t^+ y, and the tool moves by
-    J J_t^+ y, which includes rotations outside the task. So the gradient of the potentials over
-    y is g = (J J_t^+)^T s. A motion along -g lowers them at the rate |g|^2. If s lies in the
-    task, g = B s.
+    J J_t^+ y, which includes rotations outside the task. So the gradient of the potentials with
+    respect to y is g = (J J_t^+)^T s. A motion along -g lowers the potentials at the rate
+    |g|^2. If s lies in the task, g = B s.
 
     Args:
         J: Geometric Jacobian.
         basis: B, orthonormal twists of the task (`task_basis`).
-        gradient: s, gradient of the potentials over small motions of the tool.
+        gradient: s, gradient of the potentials with respect to small motions of the tool.
 
     Returns:
         The twist B^T g.
@@ -98,8 +98,8 @@ def resolved_rate(
     and the kept ones may change from one step to the next. The safety filter limits the
     resulting acceleration.
 
-    An arm with fewer joints than rows has no null space: its position follows the twist, its
-    rotation as nearly as possible (`position_first`).
+    An arm with fewer joints than rows has no null space. The position of its tool follows the
+    twist, and the rotation follows as closely as possible (`position_first`).
 
     Args:
         J: Geometric Jacobian, or its rows in the task: at most 6.
@@ -149,8 +149,8 @@ def saturate_in_null_space(
     Joints that would exceed a limit move at the limit, and the other joints make up for the
     rest of the twist: one iteration of the saturation in the null space (Flacco, De Luca and
     Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015). Without it,
-    an arm may stop short of its goal: this happens where the smallest joint velocity would move
-    only a joint that is at its limit.
+    an arm may stop short of its goal: this happens where the smallest joint velocity for the
+    twist would move only a joint that is at its limit.
 
     Args:
         task: Joint velocity of the task, by `resolved_rate` [rad/s].
@@ -242,8 +242,8 @@ def scale_null_space(
     both = task + null
     if everywhere(both.clamp(lower, upper) == both):
         return null
-    # A joint without null-space motion does not bound the factor: divided by the smallest
-    # number, its bounds become infinite, or of the wrong sign where the task alone is too fast.
+    # A joint without null-space motion does not bound the factor: its bounds, divided by the
+    # smallest number, become infinite, or get the wrong sign where the task alone is too fast.
     null_or_tiny = torch.where(null == 0, torch.finfo(null.dtype).tiny, null)
     at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
     least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
@@ -289,7 +289,7 @@ def measure_drift(
     jacobian: Float[Tensor, "*batch 6 n"],
     active: Bool[Tensor, "*batch"],
 ) -> PoseDrift:
-    """Add the drift of the last step: planned motion minus motion of the tool.
+    """Add the drift of the last step: planned motion minus measured motion of the tool.
 
     With the Jacobians J_0 before and J_1 after the step dq of the joints, the tool moves by
     (J_0 + J_1)/2 dq, up to an error of third order in the step. The motion was planned as
@@ -342,8 +342,8 @@ def planned_motion(
 
 
 # Value of the posture's region function above which a joint-space approach starts again. With
-# the default tolerance of 0.5 rad, this value is reached at a distance of 1.5 rad, to which
-# persons do not pull the elbow.
+# the default tolerance of 0.5 rad, this value is reached at a distance of 1.5 rad. People do
+# not pull the elbow that far.
 _FAR_FROM_POSTURE = 2.0
 
 
@@ -355,7 +355,7 @@ class BlendingConfig:
     """Width and height of the image [px]; default: the paper's camera."""
     hysteresis: float = 40.0
     """Distance from the image border at which a new feature is first used [px]; from then on it
-    is used up to the border. Without hysteresis the blending chatters there."""
+    is used up to the border. Without hysteresis, the blending would chatter at the border."""
     blend_time: float = 0.3
     """Time in which vision feedback fades in and out [s]; 0: it switches without fading."""
     max_feature_age: float = 0.25
@@ -415,7 +415,7 @@ class VisionBlending(nn.Module):
         return ~(age.abs() <= self.config.max_feature_age)
 
     def inside(self, feature: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*batch"]:
-        """Distance to the nearest image border [px], negative outside; NaN for NaN."""
+        """Distance to the nearest image border [px], negative outside; NaN if unknown."""
         points = feature.shape[-1] // 2
         centre = self.centre if points == 1 else self.centre.repeat(points)
         return (centre - (feature - centre).abs()).amin(-1)

@@ -87,17 +87,17 @@ class SafetyFilter(nn.Module):
     stored: neither a command nor a state is ever NaN or infinite.
 
     Velocity, speed, acceleration and jerk are limited by scaling the whole vector, which keeps
-    its direction; only the barrier of the joint limits cuts single joints. The acceleration
-    fades out early enough for the velocity to arrive without overshoot, so the arm stops and
-    starts smoothly.
+    its direction; only the barrier of the joint limits clips single joints. The acceleration
+    fades out early enough for the velocity to reach its target without overshoot, so the arm
+    stops and starts smoothly.
     """
 
     def __init__(self, limits: MotionLimits | SerialChain, config: SafetyConfig | None = None):
         """Prepare the filter.
 
         Args:
-            limits: The arm or chain, for which the speed of the elbow is capped as well; or
-                joint limits alone.
+            limits: The arm or its chain, so that the speed of the elbow is capped as well; or
+                the joint limits alone.
             config: Margins and caps; default: the recommended ones.
         """
         super().__init__()
@@ -231,19 +231,19 @@ class SafetyFilter(nn.Module):
             load: Vector from the tool centre point to the far end of a load, in the base frame
                 [m]; needs all six rows of the Jacobian. Not finite: brake to rest.
             joint_velocity: Measured joint velocities [rad/s]. If they differ from the initial
-                state in the first step, the filter continues from the measured ones.
-            human_distance: Distance of the tool from the nearest person [m]; a short one slows
-                down or stops the arm. NaN (unknown): stop. None: no person is monitored.
+                state in the first step, the filter continues from the measured velocities.
+            human_distance: Distance of the tool from the nearest person [m]; a short distance
+                slows down or stops the arm. NaN (unknown): stop. None: no person is monitored.
             stop: True where the arm has to brake to rest for another reason.
-            distances: Distances to keep, by `SafetyConfig.constraints`. Not finite: brake to
+            distances: Distances that `SafetyConfig.constraints` keep. Not finite: brake to
                 rest.
 
         Returns:
             The velocity (*batch, n) [rad/s], the next state, and the interventions.
 
         Raises:
-            ValueError: A vector does not have one value for each joint; a number dt is not in
-                (0, longest_step]; a distance is given without a Jacobian or without the
+            ValueError: A vector does not have one value for each joint; `dt` is a number
+                outside (0, longest_step]; a distance is given without a Jacobian or without the
                 constraints that would keep it; or constraints are set without a Jacobian.
         """
         self._check_arguments(jacobian, human_distance, distances)
@@ -391,8 +391,8 @@ class SafetyFilter(nn.Module):
             u = u / excess.clamp(min=1)
         inside = u.clamp(*given.bounds)
         cut = (inside - u).abs().amax(-1, keepdim=True) > _REPORTED
-        # With constraints, no single joint is cut: the null space can give way to the whole
-        # task.
+        # With constraints, no single joint is limited here: the null space can give way to the
+        # whole task.
         return inside if self.config.constraints is None else u, _acts(excess), cut
 
     def _cap_speed(
@@ -418,9 +418,9 @@ class SafetyFilter(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The velocity nearest to a target within limits of acceleration and jerk.
 
-        The wanted acceleration is the largest fraction of change/dt, the same for all joints,
-        with which every joint keeps its acceleration limit and can still fade its acceleration
-        out in time: a dt + a^2/(2 j) <= change.
+        The wanted acceleration is a fraction of change/dt, the same fraction for all joints. It
+        is as large as possible while every joint keeps its acceleration limit and can still
+        fade its acceleration out in time: a dt + a^2/(2 j) <= change.
 
         Args:
             given: Arguments of the step.
@@ -453,7 +453,8 @@ class SafetyFilter(nn.Module):
         """The velocity after one step of gentle braking, as in the speed barrier [rad/s]."""
         v, dt = given.state.velocity, given.dt
         T = self.speed_barrier.braking_time(v).clamp(min=dt)
-        # Each joint ramps as fast as it can: a common ramp would last as long as the longest.
+        # Each joint ramps as fast as it can: a common ramp would last as long as the longest
+        # ramp.
         acceleration = self.barrier.nearest_acceleration(
             -v / T, given.state.acceleration, v, given.bounds, dt
         )

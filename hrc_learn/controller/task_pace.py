@@ -1,4 +1,4 @@
-"""Response of an arm to people near it: the pace of its task, and way-making of its elbow."""
+"""Response of an arm to nearby people: pace of the task, and null-space motion to make way."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class TaskPace:
     """Speed of the task relative to its planned speed, and a clock that runs at this speed."""
 
     time: Float[Tensor, "*batch"]
-    """Task time: the clock without the time lost to people near the arm and to pauses [s]."""
+    """Task time [s]: the time of the clock, less the time lost to people near the arm and to
+    pauses."""
     people_scale: Float[Tensor, "*batch"]
     """Speed scale imposed by people near the arm, 0 to 1."""
     speed_override: Float[Tensor, "*batch"]
@@ -96,14 +97,14 @@ def capped_scale(
     velocity: Float[Tensor, "*batch n"],
     cap: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch"]:
-    """Scale with which the tool and all joints keep a cap on their speed, 0 to 1.
+    """Speed scale with which the tool and all joints keep a cap on their speed, 0 to 1.
 
     Args:
         chain: Kinematics of the arm.
         q: Joint positions [rad].
         jacobian: Jacobian of the tool.
         velocity: Joint velocity to scale [rad/s].
-        cap: Cap on the speed [m/s]; infinite: none.
+        cap: Cap on the speed [m/s]; infinite: no cap.
     """
     moved = chain.joint_origins(q + _STEP * velocity) - chain.joint_origins(q)
     joints = torch.linalg.vector_norm(moved, dim=-1).amax(-1) / _STEP
@@ -135,7 +136,7 @@ WayMaking = Literal["none", "expert", "automatic", "both"]
 
 @dataclass(frozen=True, kw_only=True)
 class WayMakingConfig:
-    """Source of null-space motion, and the repulsion from nearby bodies."""
+    """Settings of way-making: source of null-space motion, and repulsion from nearby bodies."""
 
     mode: WayMaking = "both"
     """Source of null-space motion: none, the null-space input of a person, the repulsion from
@@ -149,7 +150,7 @@ class WayMakingConfig:
     """Joint velocity at the largest repulsion [rad/s]; only its null-space part acts."""
     smoothing: float = 0.02
     """Difference of distances below which pairs count about equally [m]. Without smoothing, the
-    direction would jump where another pair becomes the nearest."""
+    direction of the repulsion would jump where another pair becomes the nearest."""
 
     def __post_init__(self):
         if not self.near < self.far:
