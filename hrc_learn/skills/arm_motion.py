@@ -82,7 +82,8 @@ def joints_near(
         chain: Kinematics of the arm.
         pose: Pose of the end effector. If it is out of reach, the joint positions only bring
             the end effector closer to it.
-        near: Joint positions with the end effector about a centimetre from the pose [rad].
+        near: Joint positions that place the end effector about a centimetre from the pose
+            [rad].
     """
     q = near
     for _ in range(_ITERATIONS):
@@ -98,8 +99,8 @@ class PositionServoConfig:
     gain: float = 8.0
     """Decay rate of the tracking error [1/s]."""
     lag: float = 0.1
-    """If the tracking error of a joint is larger, the motion restarts from the arm's present
-    position [rad]."""
+    """Largest tracking error of a joint [rad]. If the error is larger, the motion restarts from
+    the arm's present position."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter applied to every velocity."""
 

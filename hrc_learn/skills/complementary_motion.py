@@ -39,8 +39,8 @@ _EFFORT = 0.9
 _DIRECT_RETURN_AFTER = 5.0
 # Joints within this distance of the policy's posture count as being in that posture [rad].
 _SAME = 1e-6
-# If the policy's newest posture is within this distance of the present one, the policy counts
-# as having waited, too [rad].
+# While postures are queued, the policy counts as having waited, too, if its newest posture is
+# within this distance of its present one [rad].
 _MET_AGAIN = 0.02
 # Reduction of the clearance in one step that counts as rounding [m].
 _ROUNDING = 1e-3
@@ -224,7 +224,8 @@ class ComplementaryMotion:
         queue = deque(self._wishes), self._progress
         self._go_on(float(state.path.progress) / self._steps)
         if not state.path.direct_return.active:
-            # The loop corrects the end effector over several steps. An ideal arm can be exact.
+            # The loop corrects the end effector over several steps. For an ideal arm, the
+            # correction can be exact.
             q = joints_near(self._chain, self._chain.forward(self._wished()[0]), q)
         if self._comes_too_near(joints, q):
             (self._wishes, self._progress), q = queue, joints
@@ -271,7 +272,7 @@ class ComplementaryMotion:
     def _comes_too_near(
         self, joints: Float[Tensor, " joints"], reached: Float[Tensor, " joints"]
     ) -> bool:
-        """True if a step reduces the clearance, and the new one is below the configured one.
+        """True if a step reduces the clearance to less than the configured clearance.
 
         Args:
             joints: Joint positions before the step [rad].

@@ -1,8 +1,8 @@
 """Goals from a person's drawing: a region or a target for the end effector, and a turn.
 
 The paper's expert draws the Cartesian region in the AR interface and adjusts the coarse
-orientation (section VII). As in the paper (CaFun), the region is a box, given by the walls that
-the person drew.
+orientation (section VII). As in the paper (equation CaFun), the region is a box, given by the
+walls that the person drew.
 """
 
 import math
@@ -26,20 +26,21 @@ class DrawnGoalsConfig:
     """Effect of a person's drawing on the goals."""
 
     rate: float = 4.0
-    """Rate at which the end effector returns into a region [1/s], equal to that of the planned
-    box. Arms with a delay of 30 ms return without overshoot."""
+    """Rate at which the end effector returns into a region [1/s], equal to the rate of the
+    planned box. Arms with a delay of 30 ms return without overshoot."""
     target_half_size: float = 0.003
     """Half edge of the box around a drawn target [m], equal to the half height of the planned
     box."""
     wall: float = 0.02
     """Depth inside the walls of a region over which vision feedback fades in [m]: the distance
-    covered at full speed, 0.25 m/s, during the delay of images and servos, 80 ms."""
+    that the arm covers at its full speed of 0.25 m/s during the 80 ms delay of images and
+    servos."""
     largest_turn: float = 0.5
     """Largest turn relative to the planned orientation [rad]. The marker on the end effector is
-    detected up to about twice that tilt."""
+    detected up to about twice this tilt."""
     settling: float = 0.15
     """A changed drawing is applied after this time without further changes [s]: a dragged
-    pointer changes the drawing 25 times a second, and an applied change has to be checked."""
+    pointer changes the drawing 25 times a second, and each applied change has to be checked."""
 
     __post_init__ = check_positive
 
@@ -153,7 +154,8 @@ class DrawnGoals:
 
         Args:
             config: Effect of drawings.
-            refusal: Function that returns why the arm cannot go to a pose; empty if it can.
+            refusal: Function that returns the reason why the arm cannot go to a pose, or an
+                empty text if it can.
         """
         self._config, self._refusal = config, refusal
 
@@ -177,7 +179,7 @@ class DrawnGoals:
             time: Present time [s].
 
         Returns:
-            The next state, and a message to the person; empty: none.
+            The next state, and a message to the person; empty: no message.
         """
         drawing = Drawing(human.region, human.target)
         waited = time - state.changed >= self._config.settling
@@ -229,7 +231,7 @@ class DrawnGoals:
 
         Args:
             state: State after the last step.
-            requested: Rotation vector [rad]; None: none.
+            requested: Rotation vector [rad]; None: no rotation.
             most: Largest angle of this step [rad].
         """
         vector = state.turn.new_tensor(requested or (0.0, 0.0, 0.0))

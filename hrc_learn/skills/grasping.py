@@ -70,7 +70,8 @@ _LONGEST_FINGER_MOTION = 4.0
 # count as at rest if the opening changes by less than a tenth of `_FINGERS_MOVED` within
 # `_FINGERS_REST` [s]. Grippers report the opening at 50 Hz.
 _FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
-# Clearance to keep from objects, since the marker plate protrudes from the arm's capsules [m].
+# Clearance to keep from objects [m]. It allows for the marker plate, which protrudes from the
+# arm's capsules.
 _PLATE_CLEARANCE = 0.06
 # The clearance is checked at every fifth sample of a path: at `JOINT_SPEED`, the arm moves 3 cm
 # between the checked samples.
@@ -80,14 +81,16 @@ _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
 UNMARKED = CameraConfig(pixel_noise=1.0, min_step=0.012, bump=6.0)
-"""Settings for a tool without markers: its reference point is found within 1 px, and errors
-of neighbouring images are alike. With less noise, the predicted error above the object was
-three times the true one."""
-# Settings of servoing with such a tool. Its reference point may be 0.4 m above the object, so
-# the predicted error is larger than with a marker; open fingers leave 15 mm on either side.
+"""Settings for a tool without markers: its reference point is found within 1 px, and errors of
+neighbouring images are alike. With a lower noise setting, the predicted error above the object
+was three times the true one."""
+# Settings of visual servoing for a tool without markers. Its reference point may be 0.4 m above
+# the object, so the predicted error is larger than with a marker. Larger errors are allowed,
+# since open fingers leave 15 mm on either side.
 _UNMARKED_SERVO = {"tolerance": 3.0, "object_error": 0.004, "probe_aside": 120.0}
-# `_PROBE_FRACTIONS`: fractions of the probe height to try. `_PROBE_MARGIN`: required distance
-# of the joints from their limits [rad], since the arm is slow close to a limit.
+# `_PROBE_FRACTIONS`: fractions of the probe height (`VisualServoConfig.probe`) to try.
+# `_PROBE_MARGIN`: required distance of the joints from their limits [rad], since the arm is
+# slow close to a limit.
 _PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
 # `_TABLE_RANGE`: uncertainty of the table height before the fingers touch the table [m].
 # `_OBJECT_RANGE`: uncertainty after the touch [m].
@@ -112,7 +115,7 @@ class GraspingConfig:
     lift: float = 0.20
     """Height by which the Franka hand lifts an object [m]; it is scaled to other hands."""
     attempts: int = 3
-    """Largest number of starts, including starts that fail before the fingers close."""
+    """Largest number of attempts, including attempts that fail before the fingers close."""
 
     unbounded = ("detection_timeout",)
 
@@ -147,7 +150,7 @@ class GraspJob:
     picked_up: Pose | None = None
     """Pose of the end effector at the grasp."""
     attempts: int = 1
-    """Number of starts."""
+    """Number of attempts so far."""
     recoveries: list[Recovery] = field(default_factory=list)
     """Recoveries from failures."""
 
@@ -157,7 +160,7 @@ class UndetectedObjectError(TaskFailedError):
 
 
 class Grasping:
-    """Grasps objects: `grasp` runs the whole sequence, the other methods are its steps.
+    """Grasps objects: `grasp` runs the whole sequence, and the other methods are its steps.
 
     Attributes:
         servo: Visual servoing; its estimate of the image Jacobian persists between grasps.
@@ -216,7 +219,7 @@ class Grasping:
         self.servo = VisualServo(cell, law)
 
     def grasp(self, job: GraspJob) -> None:
-        """Grasp an object and lift it; start over after a failure, up to `attempts` starts.
+        """Grasp an object and lift it, in at most `attempts` attempts.
 
         Args:
             job: Object, and record of the grasp.
@@ -321,8 +324,9 @@ class Grasping:
     def _posture(self) -> Float[Tensor, " joints"]:
         """Joint positions above the table, with free paths to them and from them to home [rad].
 
-        If there are none, the arm goes home first. The positions of objects on the table are
-        not known yet, so the path to the posture avoids the whole region of the objects.
+        If there are no such positions, the arm goes home first. The positions of objects on the
+        table are not known yet, so the path to the posture avoids the whole region of the
+        objects.
         """
         posture = self._via(self._size * _PLATE_CLEARANCE)
         if posture is None:
@@ -388,9 +392,9 @@ class Grasping:
     def _touch_table(self, item: GraspObject) -> None:
         """Touch the table with the fingers around an object, and update the table height.
 
-        If the object is taller than expected, the palm touches it and the table seems higher:
-        the object is then grasped at about the right distance below its top. Without contact,
-        the estimate does not change.
+        If the object is taller than expected, the palm touches the object, and the table seems
+        higher than it is: the object is then grasped at about the right distance below its top.
+        Without contact, the estimate does not change.
         """
         # Either the fingers meet the table first, or the palm meets the top of a tall object.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
@@ -479,10 +483,11 @@ class Grasping:
 
 
 def _reachable_probe(workplace: Workplace, probe: float) -> float:
-    """Largest height of a probe at which the arm reaches the whole region of the objects [m].
+    """Largest height of a probe (`VisualServoConfig`) at which the arm reaches the whole region
+    of the objects [m].
 
-    Fractions of the wanted height are tried. If the arm reaches the region at none of them, the
-    smallest is returned.
+    Fractions of the wanted height are tried. If the arm reaches the region at none of these
+    heights, the smallest height is returned.
 
     Args:
         workplace: Workplace with the region of the objects.
@@ -512,7 +517,7 @@ def joint_plan(
 
 
 def as_load(item: GraspObject) -> GraspedBox:
-    """Load for a grasped object; the fingers grip its x faces, its top points to the palm."""
+    """Load for a grasped object: the fingers grip its x faces; its top points to the palm."""
     x, y, z = item.half_size
     return GraspedBox(half_size=(y, x, z))
 

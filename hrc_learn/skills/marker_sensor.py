@@ -32,13 +32,13 @@ class SeenFeature(NamedTuple):
     """Place of a tool or an object in an image."""
 
     pixel: Float[np.ndarray, "2"]
-    """(u, v) [px]."""
+    """Image position (u, v) [px]."""
     angle: float
-    """Direction in the image [rad]; NaN: none."""
+    """Direction in the image [rad]; NaN: no direction."""
 
 
 class FeatureSensor(ABC):
-    """Camera that finds tool and objects; each has a marker number, even without a marker."""
+    """Camera that finds tool and objects; each has a number, even if it carries no marker."""
 
     def __init__(self, camera: Camera):
         """Take images from a camera."""
@@ -164,9 +164,9 @@ class LatencyConfig:
     """Delay and loss of images between the camera and the controller."""
 
     delay: float = 0.0
-    """Time from the exposure of an image until its markers are available [s]. Markers detected
-    in a shorter time are delayed. The age that a `TimedCamera` reports is a part of this
-    time."""
+    """Time from the exposure of an image until its markers are available [s]. Markers that are
+    detected sooner are held back until then. The age that a `TimedCamera` reports is a part of
+    this time."""
     frame_loss: float = 0.0
     """Fraction of lost images."""
 
@@ -174,9 +174,9 @@ class LatencyConfig:
         check_settings(self, not_negative=["delay"], below_one=["frame_loss"])
 
 
-# `_SAME_IMAGE`: two images whose times differ by less are the same image [s]. The age of an
-# image comes from another clock, and the arm's time advances in steps of up to 8 ms (125 Hz).
-# A camera of 120 Hz takes an image every 8.3 ms.
+# `_SAME_IMAGE`: two images count as the same image if their times differ by at most this [s].
+# The age of an image comes from another clock, and the arm's time advances in steps of up to
+# 8 ms (125 Hz). A camera of 120 Hz takes an image every 8.3 ms.
 # `_REMEMBERED`: time for which joint positions are stored, longer than the delay of any camera
 # [s].
 _SAME_IMAGE, _REMEMBERED = 8.2e-3, 1.0
@@ -253,7 +253,7 @@ class DelayedDetection:
     def _joints_at(
         self, time: float, now: float, joints: Float[Tensor, " joints"]
     ) -> Float[Tensor, " joints"]:
-        """Joint positions at a time [rad]; the oldest stored ones if that time is earlier.
+        """Joint positions at a time [rad]; before the oldest stored time, the oldest positions.
 
         Args:
             time: Time of the wanted positions [s].
@@ -273,7 +273,7 @@ _OVER_TABLE = 0.22
 
 
 def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialChain) -> float:
-    """Longest time with the end effector over the table, but without a detection [s].
+    """Longest time for which the end effector was over the table without a detection [s].
 
     Args:
         log: Log of a work cell.

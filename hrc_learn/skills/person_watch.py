@@ -34,8 +34,8 @@ _COMING_TO_REST = 0.15
 NEAR_PEOPLE = ConstraintConfig(distance_weight=0.1)
 """Constraint layer of an arm near people. The path has priority over the distance: the arm need
 not leave its path, since it can brake on the path within the reaction time that the protective
-distance includes. The end effector then deviates from its path by 0.5 mm; if the distance had
-priority, by 6 mm."""
+distance includes. The end effector then deviates from its path by 0.5 mm; with priority for the
+distance, it would deviate by 6 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +51,12 @@ class PersonWatchConfig:
     urgent pairs are chosen."""
     contact: float = 0.03
     """Observed distance below which a person may already touch the arm [m]: three standard
-    deviations of a tracker's noise. The arm stops, as the direction away from the person is
-    unknown. Where contact is allowed, only the limits of lasting contacts apply."""
+    deviations of a tracker's noise. The arm then stops, because the direction away from the
+    person is unknown. Where contact is allowed, the arm does not stop, but the limits of
+    lasting contacts apply."""
     fastest: float = 0.5
-    """Speed of the arm from which it is assumed to need 0.15 s to come to rest [m/s]. The speed
-    cap follows from this assumption."""
+    """Speed from which the arm is assumed to come to rest within 0.15 s [m/s]. The speed cap
+    follows from this assumption."""
 
     def __post_init__(self) -> None:
         if math.isnan(self.contact):
@@ -95,14 +96,15 @@ class PersonWatch:
             self._limits = ContactLimits(arm, self._separation, furniture)
 
     def watchful(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that keeps these distances."""
+        """Settings of a safety filter, changed so that it keeps the distances from people."""
         constraints = safety.constraints or NEAR_PEOPLE
         return replace(safety, constraints=constraints, separation=self._separation)
 
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
     ) -> WatchedPeople:
-        """People near the arm now; the arm brakes without a valid observation and valid joints.
+        """People near the arm now. If the observation or the joint positions are not valid, the
+        distances are NaN, and the arm brakes.
 
         Args:
             time: Reading of the clock [s].
@@ -153,9 +155,9 @@ def watched_people(
 
     The protective distance limits only the speed towards people. An arm that moves past people
     or makes way for them could still move when they reach it. Therefore a speed scale brings
-    the arm to rest before accelerating people can touch any part of it. People moving away
-    count as at rest: a tracker averages over several images, and a hand can reverse its motion
-    faster than the tracker shows.
+    the arm to rest before people can touch any part of it, even if they accelerate. People
+    moving away count as at rest: a tracker averages over several images, and a hand can reverse
+    its motion faster than the tracker shows.
 
     Where contact is allowed, a speed cap replaces the speed scale: before people can touch the
     arm, it is at rest or slow enough for a contact in any direction.

@@ -10,7 +10,7 @@ phase. In addition to the recoveries of grasping, these recoveries are noted in 
 
 - dropped object: the arm starts over from home, up to a number of attempts;
 - blocked path: the arm tries another height, via point or arm angle, then waits; finally it
-puts the object back.
+  puts the object back.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -82,7 +82,7 @@ class PickAndPlaceConfig:
     interaction: float = 11.0
     """Time for which the robot keeps servoing while a person pulls its elbow [s]."""
     interactions: int = 1
-    """Number of objects, counted from the first, with such an interaction."""
+    """Number of objects, counted from the first, at which a person may pull the elbow."""
     speed: float = 1.5
     """Speed of the transfer relative to the demonstration."""
     waits: int = 3
@@ -305,7 +305,7 @@ class PickAndPlace:
                 try:
                     self._check(plan)
                 except BlockedPathError as error:
-                    if number == 0:  # as learned
+                    if number == 0:  # the learned plan
                         self._grasping.note(job, "blocked path", str(error))
                 else:
                     return plan

@@ -1,4 +1,4 @@
-"""A workplace with shelves, and plans to place an object there by a learned motion.
+"""A workplace with shelves, and plans to place an object on a shelf by a learned motion.
 
 The motion was demonstrated for one shelf. For another shelf it is planned in one of two spaces.
 In joint space, the goal of the joint primitive is shifted, as in the paper; the path into the
@@ -92,7 +92,7 @@ class Workplace(Protocol):
     def lowering(self, half_size: tuple[float, float, float]) -> float:
         """Largest distance by which an object may be lowered at its release [m].
 
-        Lowered further, the gripper itself would touch the shelf.
+        If the object were lowered further, the gripper itself would touch the shelf.
 
         Args:
             half_size: Half edges of the object [m].
@@ -191,7 +191,7 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlaceCorrection:
-    """Corrects poses by the difference between a known pose and the arm's reading there.
+    """Corrects poses by the difference between a known pose and the arm's reading at this pose.
 
     Errors of base, tool and encoders are nearly equal at all poses with the same orientation of
     the tool. A person guides the arm to one known pose, and the difference measured there
@@ -315,8 +315,8 @@ def follow_pose(
 
     Here J^+ is the pseudo-inverse of the Jacobian, e the pose error, N the projector on the
     null space, n the joint motion that turns the arm angle at unit rate, and xi_q the gradient
-    of the joint-limit region. The poses are tracked exactly, the arm angle as closely as null
-    space and joint limits permit.
+    of the joint-limit region. The poses are tracked exactly, and the arm angle is tracked as
+    closely as null space and joint limits permit.
 
     Args:
         chain: Kinematics of the arm.

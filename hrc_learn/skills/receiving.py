@@ -37,9 +37,10 @@ class ReceivingConfig:
     window: float = 0.3
     """Time window over which motion of a hand is detected [s]: nine images."""
     motion_threshold: float = 0.06
-    """The hand counts as moving if its displacement within the window is larger, and the body
-    counts as standing if its displacement is smaller [m]. With a tracker noise of 1 cm, a hand
-    at rest seems to be displaced by a quarter of this threshold."""
+    """The hand counts as moving if its displacement within the window is larger than this
+    threshold, and the body counts as standing if its displacement is smaller [m]. With a
+    tracker noise of 1 cm, a hand at rest seems to be displaced by a quarter of this
+    threshold."""
     noise: float = 0.012
     """Standard deviation of each coordinate of the hand [m]: tracker noise and human
     variation."""

@@ -45,7 +45,7 @@ _INTERVENTIONS: Mapping[str, Hindrance] = _TABLES["interventions"]
 
 
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
-    """Reason why a safety filter may have reduced a motion; None: it caused at most a delay."""
+    """Reason why a safety filter may have reduced a motion; None: it was delayed at most."""
     acted = {INTERVENTIONS[int(k)] for k in report.flags.nonzero()}
     return next((cause for kind, cause in _INTERVENTIONS.items() if kind in acted), None)
 
@@ -237,7 +237,7 @@ def vision_columns(
     Args:
         command: Command of the controller.
         goals: Goals of the controller.
-        feature: Pixel of the marker that was used; NaN: none [px].
+        feature: Pixel of the marker used in this step [px]; NaN: no pixel.
         approach: Fraction of a joint-space approach in the command, 0 to 1.
         drawn: A person's drawing and turn.
     """

@@ -1,8 +1,8 @@
 """Image-based visual servoing to an object with an uncalibrated camera.
 
 `ServoTarget` determines the goals of the adaptive controller. `ServoStep` is a pure step
-`(state, reading, target) -> (command, state)` that calls the controller. `VisualServo` runs it
-in a work cell until the marker is at its target.
+`(state, reading, target) -> (command, state)` that calls the controller. `VisualServo` repeats
+this step in a work cell until the end effector's marker is at its target pixel.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ class VisualServoConfig:
     """Tolerances, time limits and regions of visual servoing.
 
     The end effector moves in a flat box above the table. A probe is a motion from above the box
-    down into the box; it is made while the camera is uncertain.
+    down into the box; the end effector probes while the estimate of the camera is uncertain.
     """
 
     tolerance: float = 1.5
@@ -88,15 +88,15 @@ class VisualServoConfig:
     """Smallest distance of the target from the border of the image [px]; a marker closer than
     50 px is cut off."""
     turn_border: float = 60.0
-    """Distance of the marker from the border below which the gripper does not turn if the turn
-    would reduce the distance [px]."""
+    """If the marker is closer than this to the border of the image, the gripper does not turn
+    in a way that would move the marker even closer [px]."""
     turn_rate: float = 0.8
     """Highest angular speed at which the gripper turns to align with the object [rad/s]. A turn
     moves the marker by 0.15 m per radian. At this speed, the marker stays within 10 px of its
     target even with delayed images."""
     marker_tolerance: float = 1.5
-    """Deviation of the marker from its predicted pixel, while the end effector is held, above
-    which it counts as half hidden [px]: three times the noise of pixel and prediction."""
+    """While the end effector is held, the marker counts as half hidden if it deviates from its
+    predicted pixel by more than this [px]: three times the noise of pixel and prediction."""
     lost_after: float = 1.0
     """Time without detection after which a marker last seen near the border counts as out of
     view, not as occluded [s]. The end effector then returns to the middle of the box."""
@@ -182,7 +182,7 @@ class VisualServoConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoTarget:
-    """Pose that the end effector servos to, with the quantities that determine its pixel."""
+    """Pose that the end effector servos to, and the data that determine its marker's pixel."""
 
     config: VisualServoConfig
     above: Pose
@@ -199,19 +199,21 @@ class ServoTarget:
     turn_range: tuple[float, float] = (0.0, 0.0)
     """Smallest and largest turn of the gripper about the vertical [rad]."""
     orientation: Float[Tensor, "4"] | None = None
-    """Orientation of the end effector, aligned with the object; None: that of `above`."""
+    """Orientation of the end effector, aligned with the object; None: the orientation of
+    `above`."""
     rest: Float[Tensor, " joints"] | None = None
     """Posture to which the null space returns [rad]; None: the null space does not return."""
     raised: float = 0.0
     """Height of the goal above the box [m], for probes."""
     kept_camera: Float[Tensor, "13"] | None = None
-    """Camera that determines the target pixel. It keeps the target in place while the estimate
-    of the camera changes. None: the present estimate determines the target pixel."""
+    """Fixed estimate of the camera that determines the target pixel, so that the target stays
+    in place while the estimate changes. None: the present estimate determines the target
+    pixel."""
 
     def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool) -> Goals:
         """Goals from an estimate of the camera, for the present pose of the end effector."""
-        # A camera that was moved may not see above the box: do not raise the goal until the
-        # marker is detected.
+        # A camera that was moved may not see the space above the box: do not raise the goal
+        # until the marker is detected.
         offset = torch.tensor([0.0, 0.0, self.raised if detected else 0.0], dtype=torch.float64)
         above = Pose(self.above.position + offset, self.tool_orientation)
         goals = self.config.goals(above, self.pixel(camera, pose), detected=detected)
@@ -247,7 +249,7 @@ class ServoTarget:
 
     @property
     def demonstrated(self) -> Pose:
-        """Height at which demonstrations end, and present orientation of the end effector."""
+        """Pose at the height where demonstrations end, with the `tool_orientation`."""
         return Pose(self.above.position, self.tool_orientation)
 
     @property
@@ -265,7 +267,8 @@ class ServoState:
     drawn: DrawnGoalsState
     """A person's drawing and turn."""
     camera: Float[Tensor, "13"]
-    """Estimate of the camera and its marker (see `jacobian.perspective`)."""
+    """Estimate of the camera and of the marker's position on the tool (see
+    `jacobian.perspective`)."""
     image_jacobian: Float[np.ndarray, "2 6"]
     """Estimated image Jacobian at the pose of the newest image [px/m, px/rad]."""
     chosen_turn: float | None = None
@@ -287,7 +290,8 @@ class ServoState:
     arrived: bool = False
     """True once the joint-space approach is over."""
     held: MarkerConsistency | None = None
-    """Test that the marker moves with the held end effector; None: servoing does not hold."""
+    """Test that the marker moves with the held end effector; None: the end effector is not
+    held."""
     posture_gain_scale: float = 1.0
     """Scale of the speed at which the null space returns, 0 while a person pushes it."""
 
@@ -300,11 +304,11 @@ class ServoCommand(NamedTuple):
     goals: Goals
     """Goals of the controller."""
     feature: Float[np.ndarray, "2"]
-    """Pixel of the marker that was used; NaN: none [px]."""
+    """Pixel of the marker used in this step [px]; NaN: no pixel."""
     approach: float
     """Fraction of a joint-space approach in the command, 0 to 1."""
     remark: str
-    """Message to the person; empty: none."""
+    """Message to the person; empty: no message."""
 
 
 class ServoStep:
@@ -325,8 +329,8 @@ class ServoStep:
             marker: ArUco number of the end effector's marker.
             config: Tolerances and regions.
             angle: Demonstrated turn relative to the object; None: the gripper does not turn.
-            refusal: Function that returns why the arm cannot go to a pose requested by a
-                person, as a text for that person; empty if it can.
+            refusal: Function that returns the reason why the arm cannot go to a pose requested
+                by a person, as a text for that person; the text is empty if the arm can.
 
         Raises:
             ValueError: The controller estimates no camera.
@@ -540,7 +544,7 @@ class ServoStep:
     def _goals(
         self, state: ServoState, reading: CellReading, target: ServoTarget
     ) -> tuple[Goals, ServoState, str]:
-        """Goals of the controller, next state, and message to the person (empty: none).
+        """Goals of the controller, next state, and message to the person (empty: no message).
 
         The goals combine the target, the resting posture and the drawing of the person.
         """
@@ -577,7 +581,7 @@ class ServoStep:
 
 
 def _towards_middle(pixel: Float[np.ndarray, "2"], side: float) -> Float[np.ndarray, "2"]:
-    """Direction 40 degrees to one side (1 or -1) of the direction to the image's middle."""
+    """Image direction 40 degrees to one side (1 or -1) of the direction to the middle."""
     u, v = np.array(IMAGE_SIZE) / 2 - pixel
     angle = np.arctan2(v, u) + 0.7 * side
     return np.array([np.cos(angle), np.sin(angle)])

@@ -38,7 +38,7 @@ _KEPT = 0.15
 class MarkerAngle:
     """Demonstrated turn of the end effector relative to the object's marker.
 
-    The JSON file of `save` has the same fields.
+    The JSON file that `save` writes has the same fields.
     """
 
     version: Literal[2] = 2
@@ -90,11 +90,12 @@ class MarkerAngle:
             reference: Orientation of a tool that is not turned.
             now: Present turn of the tool [rad].
             turn_range: Smallest and largest turn [rad]. Turns that differ by half turns are
-                equivalent. The equivalent turn nearest to `now` in the range is chosen; if none
-                is in the range, the end of the range nearest to an equivalent turn.
-            chosen: Turn chosen before [rad]; None: none. Its equivalent is kept until it is
-                well outside the range: otherwise noise would turn the tool back and forth near
-                an end of the range.
+                equivalent. Among the equivalent turns in the range, the one nearest to `now` is
+                chosen. If none is in the range, the end of the range nearest to an equivalent
+                turn is chosen.
+            chosen: Turn chosen before [rad]; None: no turn. The turn equivalent to it is kept
+                until it is well outside the range: otherwise noise would turn the tool back and
+                forth near an end of the range.
         """
         turn, (low, high) = heading + self.offset_rad - _heading(reference), turn_range
         candidates = [turn + k * HALF_TURN for k in range(-3, 4)]

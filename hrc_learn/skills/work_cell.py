@@ -168,10 +168,10 @@ class WorkCell:
         human_input: Newest input of the person, with a smoothed null-space effort.
         observation: Newest detection of markers that has arrived.
         load: Object in the gripper; it keeps its distance from people, too. None: no object.
-        tracked_markers: Markers detected every `detect_every` steps; empty: none.
+        tracked_markers: Markers detected every `detect_every` steps; empty: no markers.
         region: Position region of the last command, if it came from the adaptive controller;
             else None.
-        plan: Joint path being followed [rad]; None: none.
+        plan: Joint path being followed [rad]; None: no path.
         log: Columns of every step so far, and the phases of the task.
         remarks: Messages to the person, with their times [s].
         images: Images kept for the recording.
@@ -204,9 +204,10 @@ class WorkCell:
             gripper: Driver of its gripper.
             sensor: Fixed camera with its marker detector; None if the task needs no camera.
             human: Person near the arm.
-            advance: Lets a given time pass [s].
+            advance: Function that lets a given time pass [s].
             config: Settings of the loop.
-            on_phase: Called with the name of each phase of the task and its start time [s].
+            on_phase: Function that is called with the name of each phase of the task and its
+                start time [s].
             rng: Random generator that decides which images are lost.
             clearance: Function from joint positions [rad] to the distance of the arm from
                 itself and its surroundings [m]; None: a push can move the arm anywhere within
@@ -271,7 +272,7 @@ class WorkCell:
 
     @property
     def reading(self) -> CellReading:
-        """Measurements and requests that a law with a camera needs for its next step."""
+        """Measurements and requests that a camera-based control law needs for its next step."""
         return CellReading(
             time=self.time,
             dt=self.config.dt,
@@ -294,7 +295,7 @@ class WorkCell:
         return float(self.pace.time)
 
     def watchful(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that keeps the distance from the tracked people."""
+        """Settings of a safety filter, changed to keep the distance from tracked people."""
         return safety if self._watch is None else self._watch.watchful(safety)
 
     # Messages and images.
@@ -390,7 +391,7 @@ class WorkCell:
         """Move on a straight line until the end effector meets something.
 
         The motion waits while a person pushes the null space: friction then changes with the
-        direction of the joints, and would look like a contact.
+        direction of the joint motion, and the change would look like a contact.
 
         Args:
             goal: Pose at the end, if nothing is met.
@@ -420,7 +421,7 @@ class WorkCell:
                 self.track_pose(line.at(passed)[0], _STILL)
                 begun, moving = self.task_time - passed, 0
                 waited += self.config.dt
-                busy = "while the gripper felt for a contact, the null space was pushed"
+                busy = "while the gripper searched for a contact, the null space was pushed"
                 self._give_up_after(waited, busy, "release the arm")
                 continue
             self._track_line(line, passed)
