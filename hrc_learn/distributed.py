@@ -21,8 +21,8 @@ from torch import Tensor, nn
 class ByValue:
     """Argument for another process, which receives a copy.
 
-    Without this, `multiprocessing` moves each tensor of an argument to shared memory and frees
-    the old memory, although NumPy views of the tensor still use it.
+    Without this class, `multiprocessing` moves each tensor of an argument to shared memory and
+    frees the old memory, although NumPy views of the tensor still use it.
     """
 
     def __init__(self, value: object):
@@ -40,7 +40,8 @@ def worker_pool(
     """Pool of new processes, initialised by `begin(*given)`; the end of the block cancels
     pending work.
 
-    The processes are spawned: forked ones would inherit locks of threads that they lack.
+    The processes are spawned: a forked process would inherit the locks, but not the threads
+    that hold them.
     """
     context, sent = multiprocessing.get_context("spawn"), tuple(map(ByValue, given))
     with ProcessPoolExecutor(number, context, initializer=begin, initargs=sent) as pool:

@@ -33,7 +33,7 @@ def write_model(
     Raises:
         InTheWayError: `folder` holds something other than a saved model and is left unchanged.
             The error is a ValueError.
-        BusyError: Another process is writing there.
+        BusyError: Another process is writing to `folder`.
     """
     # Clones, because safetensors refuses tensors that use the same memory.
     tensors = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
@@ -61,7 +61,7 @@ class SavedModel:
         self.tensors = self._read_tensors()
 
     def get(self, field: str, *types: type) -> Any:
-        """Value of a config field, which must have one of these types."""
+        """Value of a config field, which must have one of the given types."""
         if field not in self.config:
             raise ValueError(f"{self.folder / CONFIG}: field {field!r} is missing")
         value = self.config[field]
@@ -74,7 +74,7 @@ class SavedModel:
         return value
 
     def part[T](self, field: str, kind: type, make: Callable[[Any], T]) -> T:
-        """Object made from a config field, which must have this type.
+        """Object made from a config field, which must have the type `kind`.
 
         Raises:
             ValueError: The field, which the message names, is missing or wrong.

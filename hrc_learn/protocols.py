@@ -57,7 +57,7 @@ class OpenedArm:
     arm: Arm
     gripper: Gripper
     advance: Callable[[float], None]
-    """Waits for a duration [s], or steps a simulation by it."""
+    """Function that waits for a duration [s], or advances a simulation by this duration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class Touch:
     second: str
     """Geom that the moving side touched."""
     start: float
-    """[s]"""
+    """Time of the first step in contact [s]."""
     end: float
     """Time of the last step in contact [s]."""
     depth: float
@@ -152,7 +152,7 @@ class HumanInput:
             joints: Number of joints of the arm.
 
         Raises:
-            ValueError: The requested effort is for another number of joints.
+            ValueError: The requested effort is for an arm with another number of joints.
         """
         if self.nullspace_input is None:
             return np.zeros(joints)
@@ -208,8 +208,8 @@ class Feedback:
     """True while the person requests a motion."""
     followed: float = 1.0
     """Fraction of the requested motion that the arm follows, 0 to 1; 1 while no motion is
-    requested. For a push, this is the null-space motion that the push requests. An arm that is
-    still accelerating does not lower the fraction.
+    requested. For a push, the requested motion is a null-space motion. An arm that is still
+    accelerating does not lower the fraction.
     """
     reasons: tuple[Reason, ...] = ()
     """Reasons why `followed` is below 1, the strongest first; empty while no motion is
@@ -260,8 +260,8 @@ class PersonObservation:
     velocity: Float[np.ndarray, "parts 2 3"]
     """Velocities of the ends [m/s]; zero in the first observation."""
     regions: tuple[str, ...] = ()
-    """Body region of each capsule (`hrc_learn.controller.BODY_REGIONS`); empty: unknown, and
-    the arm may touch none of them."""
+    """Body region of each capsule (`hrc_learn.controller.BODY_REGIONS`); empty: the regions are
+    unknown, and the arm may touch none of them."""
 
 
 @runtime_checkable
@@ -269,8 +269,8 @@ class PersonTracker(Protocol):
     """Tracks the people near an arm."""
 
     def read(self) -> PersonObservation | None:
-        """Return the newest observation that has arrived; None if there is none for any reason.
-        An observation without capsules means that no person is near the arm.
+        """Return the newest observation that has arrived; None if there is no observation, for
+        any reason. An observation without capsules means that no person is near the arm.
 
         Callers must allow for the largest motion of a person since the time of exposure.
         """

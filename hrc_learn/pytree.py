@@ -1,4 +1,4 @@
-"""Dataclasses of tensors that are PyTorch pytrees, and selection from their batches."""
+"""Dataclasses of tensors that are PyTorch pytrees, and selection of their batch elements."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,11 +27,11 @@ def pytree[T](cls: type[T]) -> type[T]:
 
 
 def registered[T](cls: type[T]) -> type[T]:
-    """Register a dataclass as a pytree: `static` fields are structure, other fields children.
+    """Register a dataclass as a pytree: `static` fields are structure, others are children.
 
-    A field that is None has no child, so an optional tensor may be absent. Unlike
-    `torch.export.register_dataclass`, this function supports static fields, which floats need:
-    `vmap` refuses floats as leaves.
+    A field that is None adds no child, so an optional tensor may be absent. Unlike
+    `torch.export.register_dataclass`, this function supports static fields. Fields with floats
+    have to be static, because `vmap` refuses floats as leaves.
     """
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     children = [f.name for f in fields if not f.metadata.get("static")]

@@ -23,7 +23,7 @@ def bring_to_rest(stop: Callable[[], object], timeout: float) -> bool:
     """Stop an arm, retrying with growing pauses.
 
     Args:
-        stop: Brings the arm to rest.
+        stop: Function that brings the arm to rest.
         timeout: Time for which to retry [s].
 
     Returns:
@@ -85,7 +85,8 @@ class Watchdog:
         Args:
             timeout: Longest silence [s]. A longer silence is detected with a delay of at most a
                 quarter of this time.
-            stop: Brings the arm to rest. Called once for every silence, and again if it fails.
+            stop: Function that brings the arm to rest. It is called once for every silence, and
+                again if it fails.
             clock: Current time [s].
 
         Raises:

@@ -23,7 +23,7 @@ class Event(NamedTuple):
     """Event with a line of text, such as the start of a phase of the task."""
 
     time: float
-    """[s]"""
+    """Time of the event [s]."""
     text: str
 
 
@@ -120,7 +120,7 @@ class StepLog(LoggedSteps):
     def snapshot(self, rows: int | None = None) -> LoggedSteps:
         """View of the present rows, which does not grow.
 
-        Another thread may take it while the loop appends.
+        Another thread may take a snapshot while the loop appends.
 
         Args:
             rows: Number of rows; None: all.
@@ -132,7 +132,8 @@ class StepLog(LoggedSteps):
         """Add a row.
 
         Raises:
-            ValueError: The row lacks a column, has a new column, or a value of another shape.
+            ValueError: The row lacks a column, has a new column, or has a value of another
+                shape.
         """
         if self._dtype is None:
             self._open(values)
@@ -189,9 +190,9 @@ class JointRanges:
     """Ranges of the joints, drawn together with the joint positions."""
 
     lower: Float[np.ndarray, " joints"]
-    """[rad]"""
+    """Lower position limits [rad]."""
     upper: Float[np.ndarray, " joints"]
-    """[rad]"""
+    """Upper position limits [rad]."""
     velocity: Float[np.ndarray, " joints"] | None = None
     """Largest speeds [rad/s]."""
 
@@ -213,7 +214,7 @@ class CameraRecording:
     target: Float[np.ndarray, "time 2"]
     """Target of the feature [px]; NaN without a target."""
     image_time: Float[np.ndarray, " images"] = field(default_factory=lambda: np.empty(0))
-    """[s]"""
+    """Times of the images [s]."""
     images: tuple[UInt8[np.ndarray, "h w 3"], ...] = ()
     """RGB images, a few per second."""
 
@@ -234,18 +235,18 @@ class RunRecording:
     """One run of a task, sampled at every control step.
 
     Raises:
-        ValueError: If a field has another number of samples than `time`.
+        ValueError: The number of samples of a field differs from the length of `time`.
     """
 
     title: str
     time: Float[np.ndarray, " time"]
-    """[s], increasing."""
+    """Times of the samples [s], increasing."""
 
     joint_names: tuple[str, ...]
     joint_position: Float[np.ndarray, "time joints"]
-    """[rad]"""
+    """Joint positions [rad]."""
     joint_velocity: Float[np.ndarray, "time joints"] | None = None
-    """[rad/s]"""
+    """Joint velocities [rad/s]."""
     joint_limits: JointRanges | None = None
     demo_joint_position: Float[np.ndarray, "time joints"] | None = None
     """Demonstrated joint positions at the same fraction of the motion [rad]; NaN at steps
@@ -291,7 +292,7 @@ class RunRecording:
     followed: Float[np.ndarray, " time"] | None = None
     """Fraction of the push that the arm follows, 0 to 1; NaN without a push."""
     hindered: Mapping[str, Bool[np.ndarray, " time"]] = field(default_factory=dict)
-    """True while a hindrance keeps the arm from following, by name."""
+    """For each hindrance, by name: true while it keeps the arm from following the push."""
     elbow_motion: Float[np.ndarray, " time"] | None = None
     """Distance of the elbow from its undisturbed position [m]."""
     position_deviation: Float[np.ndarray, " time"] | None = None
@@ -309,7 +310,7 @@ class RunRecording:
     safety: Mapping[str, Float[np.ndarray, " time"] | Bool[np.ndarray, " time"]] = field(
         default_factory=dict
     )
-    """Intervention of each guard of the safety filter, by name: a flag or a strength."""
+    """Interventions of the safety filter, by name of their kind: a flag or a strength."""
     phases: tuple[Event, ...] = ()
     """Start of each phase of the task."""
     remarks: tuple[Event, ...] = ()
