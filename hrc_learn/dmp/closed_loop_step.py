@@ -24,7 +24,7 @@ RESONANCE = 1e-3
 ratio is near zero, the rate is near a mode of the spring: the particular solution gets so large
 that digits are lost."""
 _FULL_PACE = torch.ones((), dtype=torch.float64)
-"""Pace of an undisturbed motion, made once because making a tensor takes longer than a sum."""
+"""Pace of an undisturbed motion; one tensor, because making a tensor is slower than a sum."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -238,7 +238,7 @@ def _filtered(
 
 
 def host_value(time: Tensor) -> Tensor | float:
-    """Time as a number if it is a plain scalar that is not differentiated or traced."""
+    """Time as a number if the tensor is a scalar that is neither differentiated nor traced."""
     if not readable(time) or time.ndim or type(time) is not Tensor or time.requires_grad:
         return time
     # Reading from another device would wait for all work queued there.

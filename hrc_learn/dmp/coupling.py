@@ -3,22 +3,24 @@
 Terms are passed to `step` of a primitive as `phase_stopping` or as `coupling`. An obstacle is
 described by the nearest point on its surface, so the terms need no shapes.
 
-Errors of force, and of the distance to a second arm, act on the velocity (Gams et al. 2014,
+Errors of a force, or of the distance to a second arm, act on the velocity (Gams et al. 2014,
 "Coupling movement primitives: interaction with the environment and bimanual tasks"). The spring
-would oppose a term in the acceleration. A term C in the velocity moves the whole primitive:
+would oppose a term in the acceleration, whereas a term C in the velocity moves the whole
+primitive:
 
     tau z_dot = alpha (beta (g - y) - z) + f + lead tau C_dot,   tau y_dot = z + C
 
-Here f is the forcing term, z the scaled velocity, and C = tau gain error. If the wanted force
-cannot be reached at the goal g, the spring still pulls towards g. At rest, feedback alone then
-leaves the fraction 1 / (1 + K gain) of the error. K is k tau / beta in contact with a surface
-of stiffness k, and 2 tau / beta between two arms. If the next repetition of the motion applies
-this feedback as feed-forward, the error decreases by the same factor again. A coupling is
-constant over each step, which causes an error of first order in the length of the step.
+Here f is the forcing term, z the scaled velocity, and C = tau gain error; `lead` adds damping
+(see `velocity_coupling`). If the wanted force cannot be reached at the goal g, the spring still
+pulls towards g. At rest, feedback alone then leaves the fraction 1 / (1 + K gain) of the error.
+K is k tau / beta in contact with a surface of stiffness k, and 2 tau / beta between two arms.
+If the next repetition of the motion applies this feedback as feed-forward, the error decreases
+by the same factor again. A coupling is constant over each step, which causes an error of first
+order in the length of the step.
 
-Two arms keep an offset if the arm at `position` receives minus the error and the other arm plus
-the error, with error = wanted - (other - position). To follow a leader, the follower receives
-the whole error.
+To keep two arms at the positions `position` and `other` a wanted offset apart, the error is
+wanted - (other - position). The first arm receives minus the error, the
+second arm plus the error. If one arm follows the other, only the follower receives the error.
 """
 
 import torch
@@ -37,14 +39,14 @@ def phase_stopping(
     """Slow-down p for a robot that is held back: gain |planned - measured|^2.
 
     The clock of the primitive runs slower by the factor 1 + p (Ijspeert et al. 2013, "Dynamical
-    movement primitives", section 2.5; here p slows the whole system instead of the phase alone,
-    so that the motion waits on its path).
+    movement primitives", section 2.5). There, p slows the phase alone. Here it slows the whole
+    system, so that the motion waits on its path.
 
     Args:
         planned: Position of the primitive [rad] or [m].
         measured: Position of the robot, in the same units.
-        gain: [1/rad^2] or [1/m^2]; at a distance of 1 / sqrt(gain) the clock runs at half
-            speed.
+        gain: Gain [1/rad^2] or [1/m^2]; at a distance of 1 / sqrt(gain) the clock runs at
+            half speed.
     """
     return gain * (planned - measured).square().sum(-1)
 

@@ -1,11 +1,14 @@
 """The dynamics of a primitive: spring-damper, phase, and basis functions of the forcing term.
 
-If only the spring reacts to a new goal, the acceleration jumps at the start, and the velocity
-towards the goal peaks more than twice as high as in a minimum-jerk motion. With a minimum-jerk
-approach, the forcing term contains a part proportional to goal - start. With all weights zero,
-the motion is then y_0 + (g - y_0) m(s), with the minimum-jerk curve m from 0 to 1: the
-elementary trajectory of Zhou et al. 2019, "Learning via-movement primitives", in a second-order
-system. The weights describe how a motion deviates from this trajectory.
+A primitive adapts to a new goal in one of two ways. If only the spring reacts to the goal, the
+acceleration jumps at the start, and the velocity towards the goal peaks more than twice as high
+as in a minimum-jerk motion. With an approach (`approach_curve`), the forcing term also contains
+a part proportional to goal - start. With all weights zero, the motion is then
+y_0 + (g - y_0) m(s), with the minimum-jerk curve m from 0 to 1. This is the elementary
+trajectory of Zhou et al. 2019, "Learning via-movement primitives", in a second-order system.
+The weights describe how a motion deviates from this trajectory.
+
+Labels such as (eq_tf) are those of the paper by Yan et al.; see `docs/concepts/paper.md`.
 """
 
 import math
@@ -21,11 +24,13 @@ from hrc_learn.geometry.numerics import cached_tensors, check_settings, polynomi
 
 CRITICAL = 1e-12
 """Bound on |1 - 4 beta / alpha| below which the damping counts as critical. At smaller
-values, sinh(r s) / r would lose more than six digits to cancellation."""
+values, sinh(r s) / r in `SpringDamper.modes` would lose more than six digits to
+cancellation."""
 ROUNDING = 38.0
-"""Decay exponent beyond which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
+"""Exponent from which a decaying factor is lost in float64 rounding: exp(-38) = 3e-17."""
 DEGREE = 3
-"""Degree of the splines: the lowest that gives a forcing with continuous second derivative."""
+"""Degree of the splines: the lowest for which the forcing has a continuous second
+derivative."""
 
 
 def check_count(count: int) -> None:
@@ -38,8 +43,8 @@ def check_count(count: int) -> None:
 class SpringDamper:
     """y'' = alpha (beta (g - y) - y'), solved exactly for any gains.
 
-    (paper eq. (eq_tf)); primes are derivatives with respect to s = t / tau. With
-    x = (y - g, y') this is x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
+    This is the unforced equation (eq_tf) of the paper; primes are derivatives with respect to
+    s = t / tau. With x = (y - g, y') it reads x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
     """
 
     alpha: float = 25.0
@@ -139,8 +144,8 @@ class ExponentialPhase:
 
     dz/ds = -alpha_z z,  z(0) = 1,  so  z(s) = exp(-alpha_z s),  s = t / tau
 
-    (paper eq. (eq_cs)), with s = 0 at the start of the motion and 1 at its end. The forcing
-    term keeps fading after the end.
+    This is equation (eq_cs) of the paper, with s = 0 at the start of the motion and 1 at its
+    end. The forcing term keeps fading after the end.
     """
 
     decay: float = 4.0
@@ -171,7 +176,7 @@ class GaussianBasis:
     psi_i(x) = exp(-(x - c_i)^2 / (2 sigma_i^2)),  phi_i = psi_i z / sum_j psi_j
 
     Centres are equally spaced in time, s_i = (i - 1) / (N - 1), so that early and late detail
-    is resolved alike; sigma_i is `width` times the distance to the next centre.
+    is resolved equally well; sigma_i is `width` times the distance to the next centre.
 
     In the domain `"time"`, x = s, and one more Gaussian without a weight follows the last one.
     After the end it dominates the sum, so the forcing term vanishes and the motion settles at
@@ -260,7 +265,7 @@ class PeriodicBasis:
     horizon = 1.0
     """The period."""
     knot_spacing = 1.0
-    """The period: a whole number of pieces of the response's table then covers one period."""
+    """The period, so that a whole number of polynomial pieces of the `Response` covers it."""
 
     def __post_init__(self):
         check_count(self.count)
@@ -356,12 +361,12 @@ def cubic_spline(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 type Basis = GaussianBasis | PeriodicBasis | SplineBasis
-"""Functions that the weights of a forcing term multiply; frozen and hashable.
+"""Basis functions of a forcing term, each multiplied by one weight; frozen and hashable.
 
 `horizon` is the normalised time after which the forcing is lost in rounding, or the period.
 `smooth_interval` is the time over which the forcing, between knots, is nearly a polynomial of
-low degree. `knot_spacing` is the distance between points where the forcing is not smooth, None
-if there are none.
+low degree. `knot_spacing` is the distance between points where the forcing is not smooth, or
+None if it is smooth everywhere.
 """
 BASES: dict[str, type[Any]] = {
     kind.__name__: kind for kind in (GaussianBasis, PeriodicBasis, SplineBasis)

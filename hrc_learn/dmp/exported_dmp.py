@@ -61,7 +61,8 @@ class ExportedDMP:
         """Write the primitive and `step.pt2` into `folder`, replacing an older export.
 
         Raises:
-            InTheWayError: `folder` holds something else, which stays unchanged (a ValueError).
+            InTheWayError: Something else is at `folder`, and stays unchanged. This error is a
+                ValueError.
             BusyError: Another process is writing there.
         """
         with store.replacing(folder, store.EXPORT, overwrite=True) as new:

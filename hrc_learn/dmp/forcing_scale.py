@@ -4,9 +4,9 @@ With the start y_0 and the goal g:
 
 - `"none"`: no scaling. Weights are accelerations; a new goal shifts the motion smoothly.
   This is the default, because it is defined for every start and goal.
-- `"paper"`: factor g - y_0, as printed in the paper. The motion grows with the distance to the
-  goal, and is mirrored if the goal lies on the other side. The scaling is undefined for
-  demonstrations with g = y_0.
+- `"paper"`: factor g - y_0, as printed in the paper (Yan et al.). The motion grows with the
+  distance to the goal, and is mirrored if the goal lies on the other side. The scaling is
+  undefined for demonstrations with g = y_0.
 - `"amplitude"`: factor equal to the range of each coordinate in the demonstration. Weights are
   dimensionless, so a scaled demonstration has the same weights; also defined for g = y_0.
 - `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
@@ -24,8 +24,8 @@ from torch import Tensor
 from hrc_learn.dmp.samples import demo_label
 
 MINIMUM_DISPLACEMENT = 1e-3
-"""Smallest |g - y_0| that may divide weights, relative to the range. A smaller divisor would
-give weights over a thousand times as large as division by the range."""
+"""Smallest |g - y_0|, relative to the range, by which weights may be divided. Division by less
+would give weights more than a thousand times as large as division by the range."""
 HALF_TURN = 1e-3
 """Difference [rad] from half a turn below which a rotation counts as half a turn."""
 NO_DIRECTION = 1e-24
@@ -43,7 +43,7 @@ class Demonstrated:
     """Range of each coordinate."""
 
     def leading(self, columns: int | None) -> "Demonstrated":
-        """Start, goal and range of the first `columns` coordinates; None: of all."""
+        """Start, goal and range of the first `columns` coordinates; None selects all."""
         return Demonstrated(**{k: values[..., :columns] for k, values in vars(self).items()})
 
 
@@ -68,7 +68,10 @@ class Scaling:
 
     @property
     def depends_on_boundary(self) -> bool:
-        """True if a new start or goal changes the map, which makes the motion nonlinear."""
+        """True if a new start or goal changes the map.
+
+        The motion is then not linear in weights, start and goal together.
+        """
         return self.name in ("paper", "rotation")
 
     @property
@@ -115,10 +118,10 @@ class Scaling:
     def check(
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
-        """Check that demonstrations, on a flat batch, can be scaled.
+        """Check that demonstrations can be scaled.
 
         Args:
-            reference: (B, D) each.
+            reference: Start, goal and range of B demonstrations on a flat batch, (B, D) each.
             batch: Batch shape that was flattened to B.
             names: Names of the coordinates, for error messages.
 
@@ -149,11 +152,12 @@ class Scaling:
 def _rotated(values: Any, displacement: Any, reference: Demonstrated, xp: ModuleType) -> Any:
     """Rotation and dilation with the displacement from start to goal, in 2 dimensions or more.
 
-    Values are multiplied by c R with c = |g - y_0| / |g_0 - y_0|. The rotation R turns a, the
-    direction of the demonstrated displacement g_0 - y_0, to b, the direction of the new one, in
-    their common plane (Hoffmann et al. 2009 do this in space). It consists of two reflections,
-    R = H(a + b) H(a), H(x) v = v - 2 x (x'v) / x'x. The start velocity is scaled too, so that
-    the whole motion turns and grows with its ends.
+    Values are multiplied by c R. The dilation c is the ratio of the lengths of the new and the
+    demonstrated displacement from start to goal. The rotation R turns the direction a of the
+    demonstrated displacement to the direction b of the new displacement, in their common plane
+    (Hoffmann et al. 2009, in space). R consists of two reflections, R = H(a + b) H(a), where
+    H(x) v = v - 2 x (x'v) / x'x. The start velocity is scaled too, so that the whole motion
+    turns and grows with its ends.
 
     For half a turn, the common plane is not unique. Within `HALF_TURN` of half a turn, R turns
     in the plane of a and the coordinate axis most orthogonal to a. R is discontinuous there,
@@ -195,11 +199,11 @@ SCALINGS: dict[str, Callable[[Any, Any, Demonstrated, ModuleType], Any]] = {
     ),
     "rotation": _rotated,
 }
-"""Scaling of values (*batch, K, D) by name, for a displacement from start to goal."""
+"""Functions by name that scale values (*batch, K, D) for a displacement from start to goal."""
 
 
 def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
-    """Scaling named `scaling`, for the first `columns` coordinates; a `Scaling` is returned.
+    """Scaling named `scaling`, for the first `columns` coordinates; a `Scaling` stays as it is.
 
     Raises:
         ValueError: Unknown scaling.

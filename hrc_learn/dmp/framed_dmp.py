@@ -1,11 +1,12 @@
 """Motions learned relative to the frames of objects, and adapted to new frames.
 
-Each demonstration is expressed in every frame. While a frame determines the motion, the
-demonstrations agree in that frame. For new frames, the Gaussians of all frames are transformed
-to the base frame and multiplied, as in task-parameterised models (Calinon 2016, "A tutorial on
-task-parameterized movement learning and retrieval", eqs. 5 and 6). Here the Gaussians are over
-the coordinates of a primitive, that is over whole motions instead of single times: a motion
-that deviates at its start continues to deviate. The result is an ordinary primitive.
+Each demonstration is expressed in every frame, and a Gaussian is fitted in each frame. While a
+frame determines the motion, the demonstrations agree in that frame. For new frames, the
+Gaussians are transformed to the base frame and multiplied, as in task-parameterised models
+(Calinon 2016, "A tutorial on task-parameterized movement learning and retrieval", eqs. 5 and
+6). There, a Gaussian describes single times. Here it describes the coordinates of a primitive,
+and thereby whole motions: a motion that deviates at its start continues to deviate. The result
+is an ordinary primitive.
 """
 
 import math
@@ -27,10 +28,11 @@ PERSISTENCE = 0.3
 """Correlation length of the assumed smooth deviations, as a fraction of the motion; with 0.1,
 the error on synthetic motions is twice as large (benchmarks/bench_frames.py)."""
 MODES = 12
-"""Number of modes of these deviations: the next mode has 1e-6 of the variance."""
+"""Number of modes of the assumed smooth deviations; the next mode has 1e-6 of the variance."""
 FREEDOM = 1e-3
 """Standard deviation added independently to each coordinate, relative to the RMS deviation of
-this coordinate over all frames. It makes the covariance invertible; motions hardly change."""
+this coordinate over all frames. It makes the covariance invertible and hardly changes
+motions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,8 @@ class FramedDMP:
 
     x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M numbers for each of
     D columns. The covariance of the n demonstrations is extended by smooth deviations in all
-    directions. They are as large as the observed deviations and count as one demonstration.
+    directions. They are as large as the observed deviations and count as one demonstration
+    more.
     """
 
     primitive: JointDMP

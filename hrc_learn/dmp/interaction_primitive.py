@@ -1,10 +1,10 @@
 """Prediction of a person's and the robot's motion from the beginning of the person's motion.
 
-Interaction primitives (Ben Amor et al. 2014; Maeda et al. 2017, "Probabilistic movement
-primitives for coordination of multiple human-robot collaborative tasks"): the motions of person
-and robot are jointly Gaussian, so the observed part of the person's motion determines the most
-likely motion of the robot. The kind of interaction and its duration are inferred too: each
-combination of kind and duration has a likelihood in closed form.
+In an interaction primitive (Ben Amor et al. 2014; Maeda et al. 2017, "Probabilistic movement
+primitives for coordination of multiple human-robot collaborative tasks"), the motions of person
+and robot are jointly Gaussian. The observed part of the person's motion therefore determines
+the most likely motion of the robot. The kind of interaction and its duration are inferred too:
+each combination of kind and duration has a likelihood in closed form.
 """
 
 import math
@@ -37,7 +37,7 @@ class InteractionPrimitive:
     models: tuple[ProbabilisticDMP[JointDMP], ...]
     """Gaussian of each kind over all columns, the person's columns first."""
     prior: Float[Tensor, "K"]
-    """Fraction of the demonstrations of each kind."""
+    """Fraction of the demonstrations that belong to each kind."""
     log_duration: Float[Tensor, "K 2"]
     """Mean and standard deviation of the logarithm of durations [s]."""
     observed: int
@@ -59,7 +59,7 @@ class InteractionPrimitive:
         Args:
             time: [s], (T,), (B, T) or a list of (T_i,), the same for person and robot.
             person: Observed columns of the person, (B, T, H) or a list of (T_i, H).
-            robot: (B, T, R) or a list of (T_i, R).
+            robot: Columns of the robot, (B, T, R) or a list of (T_i, R).
             kinds: Kind of each demonstration; None: all are of one kind.
             n_basis: Number of basis functions of each column.
             slack: Freedom beyond the variation of the demonstrations; see
@@ -103,7 +103,7 @@ class InteractionPrimitive:
 
         Args:
             time: Time since the person started [s], (n,).
-            person: (n, H); NaN where nothing was observed.
+            person: Observed columns, (n, H); NaN where nothing was observed.
             noise: Standard deviation of each value, from the sensor and from the person's
                 variation between samples.
 
@@ -179,7 +179,7 @@ class InteractionEstimate:
     phase: float
     """Elapsed fraction of the duration, 0 to 1."""
     motion: ProbabilisticDMP[JointDMP]
-    """Motion of person and robot given the observation, on the time scale of its primitive."""
+    """Motion of person and robot given the observation, with the duration of its primitive."""
     observed: int
     """Number of columns of the person."""
 

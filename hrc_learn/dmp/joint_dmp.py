@@ -35,8 +35,8 @@ between two of these times exceeds the checked values by less than 0.1 %."""
 TOLERANCE = 1.05
 """Held-out errors up to this multiple of the smallest error count as equal to the smallest."""
 DEFAULT_COUNT = 50
-"""Default number of basis functions. 50 functions follow recordings of arms to 5e-5 of the
-range; fewer would not make a motion without noise smoother."""
+"""Default number of basis functions. 50 functions reproduce recordings of arms to 5e-5 of the
+range. If the samples have no noise, fewer functions would not give a smoother motion."""
 
 
 STRONG_RIDGE = 1e-5
@@ -123,7 +123,7 @@ def _unscaled(
 
 
 class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
-    """Discrete movement primitive of D coordinates under one phase.
+    """Discrete movement primitive of D coordinates with a common phase.
 
     It is a `LinearPrimitive` whose columns are the coordinates. Values are (*batch, D) in the
     units of the demonstration; velocities are in these units per s, couplings per s^2.
@@ -157,12 +157,12 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
                 demonstrations of different lengths, a list of (T_i, D), with a list of (T_i,)
                 as `time`. The primitive has the floating-point dtype of the positions; the
                 fit runs in float64.
-            n_basis: Number N of basis functions, unless `basis` is given. None: 50, and noise
-                is removed from the samples; see `FitOptions.smooth`. If there are at most
-                1.5 N samples, the motion follows piecewise cubics between them.
+            n_basis: Number N of basis functions, unless `basis` is given. None: 50 functions,
+                and noise is removed from the samples; see `FitOptions.smooth`. If there are at
+                most 1.5 N samples, the motion follows piecewise cubics between them.
             velocity: Recorded velocity per second, shaped like `position`. Without it, the
-                default method also fits the start velocity, and the others differentiate
-                positions.
+                default method also fits the start velocity, and the other methods differentiate
+                the positions.
             mask: (*B, T), false at samples to ignore, such as padding and dropouts.
             scaling: Scaling of the forcing term: `"none"`, `"paper"`, `"amplitude"` or
                 `"rotation"`.
@@ -200,7 +200,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
     def refit(
         self, time: Times, position: Points, scaling: str | Scaling = "none"
     ) -> "JointDMP":
-        """Primitives of other motions, with the basis, spring and approach of this one."""
+        """Primitives fitted to other motions, with basis, spring and approach of this one."""
         return JointDMP.fit(
             time,
             position,
@@ -218,7 +218,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         start: Vectors | None = None,
         goal: Vectors | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """Shortest duration [s] at which the motion keeps the limits, for use in `rollout`.
+        """Shortest duration [s] at which the motion is within the limits, for use in `rollout`.
 
         A slower motion keeps its path if its start velocity is scaled too. Velocities then fall
         as 1 / duration and accelerations as 1 / duration^2.
@@ -275,7 +275,7 @@ def select_basis_count(
     Args:
         time: Timestamps [s], (T,) or (*B, T).
         position: (T,), (T, D) or (*B, T, D).
-        candidates: Numbers to try.
+        candidates: Numbers of basis functions to try.
         n_folds: Number of fits per candidate.
         mask: (*B, T), false at samples to ignore.
         scaling: Scaling of the forcing term.
@@ -397,7 +397,7 @@ def _accumulate(
 
 
 def _checked(index: int, time: Times, position: Points, D: int) -> Samples:
-    """Samples of one demonstration with D coordinates; 0: with any number of coordinates."""
+    """Samples of one demonstration with D coordinates; D = 0 accepts any number."""
     try:
         samples = check_samples(time, position)
     except ValueError as error:

@@ -1,14 +1,14 @@
-"""Learning of a motion with the model that predicts each demonstration best from the others.
+"""Learning of a motion with the model that best predicts each demonstration from the others.
 
 A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n.
-All models but the one with frames compute the coordinates for a context c (known before the
+All models except the one with frames compute the coordinates for a context c (known before the
 motion) as x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest
 demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
 regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
-trajectory database"). The weights without demonstration i have a closed form (for the
-regression: PRESS from the hat matrix, Allen 1974), so these models are not fitted again. Each
-model may be shrunk towards the straight minimum-jerk motion, by the factor from 0 to 1 that
-predicts best.
+trajectory database"). If demonstration i is held out, the weights of the other demonstrations
+have a closed form (for the regression: PRESS from the hat matrix, Allen 1974), so these models
+are not fitted again. Each model may be shrunk towards the straight minimum-jerk motion, by the
+factor from 0 to 1 that predicts best.
 """
 
 import math
@@ -41,8 +41,8 @@ from hrc_learn.model_files import SavedModel, write_model
 BASIS_COUNTS = (10, 20, 30, 50, 100)
 """Numbers of basis functions compared."""
 APPROACHES = (1.0, 0.6)
-"""Approaches compared: the smoothest, and one for which the last 40 % of the path only shifts
-with the goal."""
+"""Values of `FitOptions.approach` compared: the smoothest, and one for which the last 40 % of
+the path only shifts with the goal."""
 WIDTHS = (2.0, 1.0, 0.5, 0.25)
 """Widths of kernels, relative to the spread of the contexts."""
 PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
@@ -60,8 +60,8 @@ CONSTANT = 1e-9
 
 
 Kind = Literal["mean", "kernel", "nearest", "contextual", "frames", "line"]
-"""Kinds of model: the mean, a mean weighted by nearness, the nearest demonstration, a
-regression, frames, and a straight line."""
+"""Kinds of model, in this order: the mean, a mean weighted by the distance of contexts, the
+nearest demonstration, a regression on contexts, a `FramedDMP`, and a straight line."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,7 +81,7 @@ class Candidate:
 
     @property
     def kind(self) -> Kind:
-        """Kind of the model; every kind but the line may be shrunk towards the line."""
+        """Kind of the model; every kind except the line may be shrunk towards the line."""
         if self.shrinkage == 0:
             return "line"
         if self.family != "kernel":
@@ -118,13 +118,14 @@ def learn(
     """Learn a motion from demonstrations; held-out errors select basis, approach and model.
 
     Args:
-        demonstrations: Demonstrations with `time` and `joint_position`, or with `position` and
-            perhaps `orientation`, as from `load_demos`; or pairs of times (T,) [s] and values:
-            joints or other coordinates, (T, D), or a `Pose` of (T).
+        demonstrations: Demonstrations as from `load_demos`, with `time` and `joint_position`,
+            or with `time`, `position` and perhaps `orientation`. Alternatively, pairs of times
+            (T,) [s] and values, which are joints or other coordinates (T, D), or a `Pose` of
+            (T).
         context: Values (n, C) that are known before each motion. None: start and goal.
         frames: Frames of each demonstration, (n, F), for positions in space.
         n_basis: Number of basis functions. None: the smallest of `BASIS_COUNTS` whose error on
-            held-out samples is nearly the least.
+            held-out samples is close to the smallest error.
         approach: As in `FitOptions`. None: one of `APPROACHES`.
         options: Further options for `fit` of the primitive.
 
@@ -221,9 +222,9 @@ class LearnedMotion:
         Args:
             start: Start of one motion, in the form that `rollout` of the primitives accepts.
             goal: Goal.
-            duration: [s].
-            context: (C,) if the demonstrations had contexts.
-            frames: (F,) if the model uses frames.
+            duration: Duration [s].
+            context: Context of the motion, (C,), if the demonstrations had contexts.
+            frames: Frames of the motion, (F,), if the model uses frames.
 
         Raises:
             ValueError: A context or frames are missing or have the wrong size, or a context
@@ -365,7 +366,7 @@ def _fit_of(
 
 
 def _basis_count(times: Sequence[Tensor], values: Sequence[Tensor]) -> int:
-    """Smallest number of functions whose error on held-out samples is nearly the least."""
+    """Smallest number of functions whose error on held-out samples is close to the smallest."""
     shortest = min(map(len, times))
     possible = [n for n in BASIS_COUNTS if 2 * n <= shortest]
     if len(possible) < 2:

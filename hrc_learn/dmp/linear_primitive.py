@@ -62,9 +62,10 @@ class LinearPrimitive(nn.Module):
 
     y'' = alpha (beta (g - y) - y') + scale * sum_i phi_i(s) w_i,   s = t / duration
 
-    (paper eqs. (eq_tf), (eq_cs)); primes are derivatives with respect to s. Without coupling,
-    the motion is a linear map of weights, start, start velocity and goal, computed exactly; see
-    `Response`. Each element of the leading batch dimensions is one primitive.
+    These are equations (eq_tf) and (eq_cs) of the paper (see `docs/concepts/paper.md`); primes
+    are derivatives with respect to s. Without coupling, the motion is a linear map of weights,
+    start, start velocity and goal, computed exactly; see `Response`. Each element of the
+    leading batch dimensions is one primitive.
     """
 
     weights: Tensor
@@ -134,7 +135,7 @@ class LinearPrimitive(nn.Module):
         elif not weights.requires_grad:
             self.weights = nn.Parameter(weights)
         else:
-            # Not a parameter, which is a leaf: gradients would not flow through it.
+            # A buffer: a parameter is a leaf, so gradients would not flow through it.
             self.register_buffer("weights", weights)
         buffers = (start, goal, start_velocity, duration, amplitude, timestamps)
         for name, value in zip(TENSORS[1:], buffers, strict=True):

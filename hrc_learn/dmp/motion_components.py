@@ -17,7 +17,8 @@ from hrc_learn.dmp.samples import Samples
 MARGIN = 0.1
 """Distance by which motions may exceed the demonstrated range, relative to the range."""
 SHRINKAGE = 0.1
-"""Weight of a separable covariance (time times columns), for which a few motions suffice."""
+"""Weight of a separable covariance, which a few motions are enough to determine: the product of
+a covariance over time and a covariance over columns."""
 RIDGE = 1e-3
 """Ridge of the prediction from the start: values from 1e-4 to 1e-2 are equally good."""
 POINTS = (6, 8, 10, 13, 16, 20, 26, 32, 40, 50, 64)
@@ -33,7 +34,7 @@ TINY = 1e-24
 """Smallest variance, for columns that never move."""
 TURN = 6.0
 """If the second control point lies beyond a limit, the third lies this many times as far inside
-the limit. The motion then keeps the limit if the second control point exceeds the limit by at
+the limit. The motion then stays within the limit if the second control point exceeds it by at
 most 2.5 times the margin."""
 KNOWN_STATE = 2
 DEGREE = 3
@@ -70,10 +71,10 @@ class MotionComponents(nn.Module):
         """Restore components; `fit` makes them.
 
         Args:
-            config: `points` (number of control points), `known` (number of control points that
-                the start determines; 1: by position; 2: by position and velocity),
-                `duration` (geometric mean [s]) and `varying` (1: the logarithm of the duration
-                is the last free value).
+            config: Four numbers. `points` is the number of control points, and `duration` the
+                geometric mean of durations [s]. `known` is the number of control points that
+                the start determines, 1 by its position or 2 by position and velocity. `varying`
+                is 1 if the logarithm of the duration is the last free value.
             tensors: The buffers of this class, by name.
         """
         super().__init__()
@@ -131,7 +132,8 @@ class MotionComponents(nn.Module):
         Args:
             parameters: All P parameters, or the first ones if the others are zero.
             time: Time since the start [s], (T,) or (*batch, T). After its end a motion rests.
-            start: (*batch, D). None: the encoded start if starts are not known, else the mean.
+            start: Start, (*batch, D). None: the mean start if the components were fitted with
+                known starts, else the start that the parameters encode.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
                 components were fitted with start velocities, else the encoded velocity.
             order: Derivative with respect to time, 0, 1 or 2.

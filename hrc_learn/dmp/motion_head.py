@@ -48,11 +48,11 @@ between motions."""
 class MotionHead(nn.Module):
     """Map from network parameters to a motion of D columns from any initial state.
 
-    The P parameters are, for each of the D columns in turn, N whitened weights and the goal;
-    then come the timing parameters: the duration if it has a range, and the delay if one is
-    allowed. If all parameters are zero, the motion is the minimum-jerk motion to the centre of
-    the goals. Its duration is then the geometric mean of the shortest and the longest duration,
-    and its delay is half the longest delay.
+    The P parameters begin with N whitened weights and the goal of each of the D columns in
+    turn. The timing parameters follow: the duration if it has a range, and the delay if a delay
+    is allowed. If all parameters are zero, the motion is the minimum-jerk motion to the centre
+    of the goals. Its duration is then the geometric mean of the shortest and the longest
+    duration, and its delay is half the longest delay.
 
     The map is differentiable in all arguments and takes any number of leading batch axes.
     """
@@ -173,10 +173,10 @@ class MotionHead(nn.Module):
             parameters: Mean of the parameters.
             scale_tril: Cholesky factor of the covariance of the first L = D (N + 1) parameters.
                 Duration and delay are known exactly.
-            start: (*batch, D), known exactly.
-            start_velocity: Per second, (*batch, D).
-            since: Time [s], (*batch).
-            origin: (*batch, D).
+            start: Start or current position, (*batch, D), known exactly.
+            start_velocity: Velocity at the start [1/s], (*batch, D), known exactly.
+            since: Time of the current state [s], (*batch).
+            origin: Start of the path to the goal, (*batch, D).
 
         Raises:
             ValueError: A factor of the wrong size.
@@ -237,8 +237,8 @@ class MotionHead(nn.Module):
 
         Args:
             time: Time since the start [s], (T,) or (*batch, T).
-            position: (*batch, T, D), from the start on.
-            start_velocity: Per second, (*batch, D).
+            position: Positions from the start on, (*batch, T, D).
+            start_velocity: Velocity at the start [1/s], (*batch, D).
             timing: Timing parameters as from `timing`; zeros by default.
             noise: Standard deviation of the samples relative to the amplitude. Parameters that
                 the samples do not determine stay zero, the mean of their prior.

@@ -3,7 +3,7 @@
 A linear primitive describes the motion of columns. Each kind of primitive maps its values to
 columns and back: joints are columns themselves, an orientation becomes its error to a
 reference, a pose becomes position, orientation error and body, and joints with a moving goal
-become relative to that goal.
+become positions relative to this goal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,7 +107,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     def _retarget(
         self, columns: DMPState, frame: Any, goal: Any, filtered: bool, **options: Any
     ) -> tuple[DMPState, Any, Any]:
-        """Columns, frame and new goal in columns; value and velocity stay the same.
+        """Columns, frame and goal (as columns) for a new goal, at the same value and velocity.
 
         Args:
             columns: Current state.
@@ -194,15 +194,16 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             time: Time since the start of the motion [s], (T,) or (*batch, T), not negative; by
                 default the timestamps of the demonstration, stretched to the duration. After
                 the duration, the motion settles at its goal.
-            start: (*batch).
-            goal: (*batch).
-            duration: [s], (*batch).
-            start_velocity: Per second, (*batch). By default the demonstrated one, adapted to
-                the duration so that the path stays the same, and turned and scaled with the
-                displacement if the scaling is `"rotation"`.
+            start: Start, (*batch).
+            goal: Goal, (*batch).
+            duration: Duration [s], (*batch).
+            start_velocity: Velocity at the start per second, (*batch). The default is the
+                demonstrated velocity, adapted to the duration so that the path stays the same.
+                The scaling `"rotation"` also turns and scales it with the displacement from
+                start to goal.
             speed: Speed relative to the demonstration, instead of a duration.
-            dt: Sampling interval [s], instead of times: samples run from zero to the first one
-                at or past the end of the longest motion.
+            dt: Sampling interval [s], instead of `time`. The samples run from zero to the first
+                sample at or after the end of the longest motion.
             forcing_gain: Factor on the forcing term, (*batch): the amplitude of a rhythm.
             options: Further arguments of this kind of primitive.
         """
@@ -322,11 +323,11 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """Primitive that passes exactly through via points.
 
         Start and goal keep their values and velocities, and columns without a via point do not
-        change. With `within`, the motion outside of this time does not change either. Via
-        points refer to the start, goal and duration of this primitive; `with_boundary` sets
-        others first. Gradients flow to times, values and velocities. Via points are too close
-        together if the motion would change by more than 1.5 times the largest change that the
-        via points require.
+        change. With `within`, the motion outside of this interval does not change either. Via
+        points refer to the start, goal and duration of this primitive; to use others, call
+        `with_boundary` first. Gradients flow to times, values and velocities. Via points are
+        too close together if the motion would change by more than 1.5 times the largest change
+        that the via points require.
 
         Args:
             time: Times of the via points [s], (*batch, n).
@@ -336,9 +337,9 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             within: Times [s] between which the motion may change; None: from start to end.
 
         Raises:
-            ValueError: Two via points at the same time, a via point outside of `within`, or too
-                many or too close via points for the basis; the message names a sufficient
-                distance.
+            ValueError: Two via points are at the same time, one is outside of `within`, or
+                they are too many or too close together for the basis; the message names a
+                sufficient distance.
         """
         via = self.via_points(time, value, velocity)
         return self.with_motion(through_via_points(self.motion, via, within))
@@ -348,9 +349,9 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     ) -> ViaPoints:
         """Via points as columns (float64); the body of a pose stays free.
 
-        An orientation becomes its error on the branch nearest to the motion, so both signs of
-        a quaternion mean the same. An angular velocity becomes the rate of the error at the
-        given orientation, or at the orientation of the motion if none is given.
+        An orientation becomes its error on the branch nearest to the motion, so both signs of a
+        quaternion give the same result. An angular velocity becomes the rate of the error at
+        the given orientation, or at the orientation of the motion if none is given.
 
         Args:
             time: [s], (*batch, n).
@@ -403,7 +404,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         return self.with_motion(motion.with_coordinates(x, moved.duration), frame)
 
     def reversed[S: "MotionPrimitive"](self: S) -> S:
-        """Primitive that moves the same path backwards, from the goal to the start.
+        """Primitive that moves along the same path backwards, from the goal to the start.
 
         Its motion at time t is that of this primitive at duration - t, fitted with the same
         basis. It accepts new starts and goals.

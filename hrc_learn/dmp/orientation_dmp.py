@@ -1,7 +1,8 @@
 """Movement primitives of an orientation; the columns are its error e to a reference.
 
-e'' = alpha (beta (0 - e) - e') + f, with the forcing term f, is exact at all angles (Koutras
-and Doulgeri 2019). The reference is the goal by default; `orientation_error.py` defines e.
+The equation of motion, e'' = alpha (beta (0 - e) - e') + f with the forcing term f, contains no
+approximation for small angles (Koutras and Doulgeri 2019). The reference is the goal by
+default; `orientation_error.py` defines e.
 """
 
 import math
@@ -67,7 +68,7 @@ class OrientationTrajectory(ErrorColumns, ArrayOutputs):
     outputs = ("time", "orientation", "angular_velocity", "angular_acceleration")
 
     def __init__(self, motion: Trajectory, reference: Float[Tensor, "*batch 4"]):
-        """Describe the motion of columns with an error to the reference."""
+        """Describe an orientation by the motion of its error columns and their reference."""
         self.motion = motion
         """Motion of the columns."""
         self._reference = reference
@@ -124,7 +125,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
 ):
     """Primitive whose columns are a position, the error of an orientation, and a body.
 
-    Position and body may have no columns. The `frame` of methods is the reference.
+    Position and body may have no columns. In the methods, `frame` is the reference.
     """
 
     goal_orientation: Tensor
@@ -138,9 +139,9 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            motion: Motion of the columns. If its error e at the goal is not zero, the reference
-                is exp(e) * goal, for instance if primitives with different goals have one
-                reference.
+            motion: Motion of the columns. With the error e at its goal, the reference is
+                exp(e) * goal. An error other than zero allows primitives with different goals
+                to have one common reference.
             goal_orientation: Unit quaternion (w, x, y, z) at the end.
         """
         super().__init__()
@@ -163,7 +164,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
     def with_motion[S: "OrientedPrimitive"](
         self: S, motion: JointDMP, frame: Tensor | None = None
     ) -> S:
-        """Primitive with another motion of the columns, relative to `frame` (None: as now)."""
+        """Primitive with another motion of the columns, in `frame`; None: the current frame."""
         reference = self.reference if frame is None else frame
         return type(self)(
             motion, to_orientation(motion.goal[..., self.error_columns], reference)
@@ -174,7 +175,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         return self.state_type(motion=columns, reference=frame)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tensors of the columns, and the goal."""
+        """Tensors of the columns, and the goal orientation."""
         return self.motion.tensors() | {"goal_orientation": self.goal_orientation}
 
     def with_tensors[S: "OrientedPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
@@ -231,7 +232,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             linear = (per_s / duration[..., None])[..., P]
         else:
             linear = twist[..., P]
-        # A twist does not include the body, which starts as demonstrated.
+        # A twist does not include the body, which starts with its demonstrated velocity.
         velocity = _join(linear, rate, demonstrated[..., B], like)
         return Boundary(start_columns, goal_columns, velocity), reference
 
@@ -245,7 +246,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Error at the start of a motion, its rate [rad/s], and the reference of the error.
 
         Args:
-            rate: Demonstrated rate, for the duration of the motion.
+            rate: Demonstrated rate, adapted to the duration of the motion.
             start: New start; None keeps the demonstrated value, here and below.
             goal: New goal.
             omega: New angular velocity at the start [rad/s].
@@ -325,9 +326,10 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
     def _to_reference(
         self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool
     ) -> DMPState:
-        """Columns with the error to another reference, for the same motion of the orientation.
+        """Columns with the error to another reference.
 
-        If `filtered`, the acceleration is continuous too.
+        Orientation and angular velocity stay the same, and if `filtered`, so does the angular
+        acceleration.
         """
         motion, E = self.motion, self.error_columns
         position, rate = columns.position, columns.rate
@@ -383,9 +385,9 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
     """Movement primitive of an orientation.
 
     The columns are the error e to a reference, which is the goal by default. By default,
-    forcing term and spring act on e and its derivative; this is exact at all angles. The
-    formulation `"ude"` uses the state of Ude et al. 2014 instead. Both signs of a quaternion
-    give the same motion.
+    forcing term and spring act on e and its derivative, without an approximation for small
+    angles. The formulation `"ude"` uses the state of Ude et al. 2014 instead. Both signs of a
+    quaternion give the same motion.
 
     Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and couplings are angular,
     in the base frame, (*batch, 3). Motions to a new start or goal rotate in the same direction

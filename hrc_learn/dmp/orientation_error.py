@@ -3,7 +3,7 @@
 e = log(g * conj(q)), a rotation vector [rad] in the base frame, so that q = exp(-e) * g
 (Koutras and Doulgeri 2019, "A correct formulation for the orientation dynamic movement
 primitives for robot control in the Cartesian space"; their logarithm is half of ours). At the
-goal, e = 0. A rotation of the tool frame that moves start and goal alike leaves e unchanged.
+goal, e = 0. If the tool frame is rotated at start and goal alike, e does not change.
 """
 
 import math
@@ -53,7 +53,8 @@ def to_orientations(
     error: Float[Tensor, "*#batch T 3"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch T 4"]:
     """Orientations over time with these errors to one goal."""
-    # One product with a 4x4 matrix each: row i is the unit quaternion i times the goal.
+    # Each orientation is one product with a 4x4 matrix. Row i of this matrix is the i-th basis
+    # quaternion times the goal.
     unit = torch.eye(4, dtype=goal.dtype, device=goal.device)
     return quaternion.exp(-error) @ quaternion.multiply(unit, goal[..., None, :])
 
@@ -108,7 +109,7 @@ def retarget(
     old: Float[Tensor, "*batch 4"],
     goal: Float[Tensor, "*#batch 4"],
 ) -> tuple[Tensor, Tensor]:
-    """Error to a new goal and rate of this error, for the same motion of the orientation."""
+    """Error to a new goal, and its rate, at the same orientation and angular velocity."""
     new = nearest_turn(to_error(to_orientation(error, old), goal), error)
     return new, error_rate(new, angular_velocity(error, rate))
 
@@ -116,7 +117,7 @@ def retarget(
 def retarget_numbers(
     error: Numbers, rate: Numbers, old: Numbers, goal: Numbers
 ) -> tuple[Numbers, Numbers]:
-    """`retarget` for one motion in Python's numbers, in a fiftieth of the time."""
+    """`retarget` for one motion with plain Python numbers, in a fiftieth of the time."""
     angle, axis = _polar(error)
     w, x, y, z = old
     between = quaternion.product_of_components(goal, [w, -x, -y, -z])
@@ -190,10 +191,10 @@ def intrinsic_mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
 def mean_along(
     q: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Intrinsic mean of a motion, on the branch of the motion.
+    """Intrinsic mean of the orientations of a motion, near the centre of its swing.
 
     A motion that swings by 170 degrees to either side spends most of its time near the
-    orientation opposite to its centre. The iteration therefore starts from the mean of the
+    orientation opposite to this centre. The iteration therefore starts from the mean of the
     unwrapped rotation vectors.
 
     Args:

@@ -85,11 +85,11 @@ torch.export.register_dataclass(PoseState, serialized_type_name="hrc_learn.dmp.P
 
 
 class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
-    """Discrete movement primitive of a pose under one phase.
+    """Discrete movement primitive of a pose, with one phase for all columns.
 
     Position, orientation error (see `orientation_error`) and, if given, K body coordinates are
-    columns of one linear primitive. The body, such as a redundant joint or an arm angle, keeps
-    its demonstrated shape when the pose moves to another goal.
+    columns of one linear primitive. The body, such as a redundant joint or an arm angle, moves
+    as demonstrated when the pose moves to another goal.
 
     Values are `Pose`s; velocities are twists (linear [m/s], angular [rad/s]), (*batch, 6);
     couplings are accelerations of the position [m/s^2], (*batch, 3), or of the pose,

@@ -1,7 +1,7 @@
 """Gaussians over primitives, and means of primitives, from several demonstrations.
 
-The motion of the columns is linear for orientations and poses too, so all functions compute
-with the columns of `motion`.
+For orientations and poses too, the motion of the columns is a linear map of coordinates. All
+functions therefore compute with the columns of `motion`.
 """
 
 from copy import deepcopy
@@ -44,7 +44,8 @@ PATH_TIMES = 30
 """Number of times at which paths are compared."""
 FEWEST, SINGULAR = 4, 1e-6
 """`FEWEST`: smallest number of primitives from which the dependence of paths on start and goal
-is estimated. `SINGULAR`: relative singular value below which the ends count as constant."""
+is estimated. `SINGULAR`: relative singular value below which start and goal count as
+constant."""
 KNOWN_DURATION = 1e-6
 """Standard deviation of the logarithm of a duration that is given as known."""
 GAUSSIAN = ("mean", "spread", "timing")
@@ -157,8 +158,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Args:
             primitives: Primitives of one motion, fitted with `scaling="none"`.
             slack: Freedom beyond the variation of the demonstrations, as in `around`. Without
-                it, a via point that no combination of demonstrations passes is approached but
-                not reached.
+                slack, the motion approaches but does not reach a via point that lies on no
+                combination of the demonstrations.
 
         Raises:
             ValueError: Fewer than two primitives, or a scaling other than `"none"`.
@@ -197,8 +198,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
 
         Args:
             primitive: A single primitive, fitted with `scaling="none"`.
-            slack: Standard deviation of the forcing term, equal at all times, in units of the
-                spring's force at a distance from the goal that equals the coordinate's range.
+            slack: Standard deviation of the forcing term, equal at all times. Its unit is the
+                force of the spring when a coordinate is as far from its goal as its range.
         """
         motion = primitive.motion
         certain = _linear_coordinates(motion)
@@ -337,7 +338,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def _given(
         self, root: Float[Tensor, "k rank"], residual: Float[Tensor, "k"]
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian given root z = residual with unit noise, for factors z on `spread`."""
+        """Gaussian given root z = residual with unit noise, where z are factors on `spread`."""
         # The prior's identity keeps this positive definite for any number of equal via points.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)
@@ -360,10 +361,10 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     ) -> "ProbabilisticDMP[P]":
         """Gaussian given a start and a goal, by default those of the mean.
 
-        Few demonstrations do not show reliably how a path depends on start and goal. The
-        covariance of path and ends is therefore multiplied by the factor `dependence`, which
-        best predicts each demonstration from the others. On average, this predicts at least as
-        well as the mean of all demonstrations.
+        A few demonstrations do not show reliably how a path depends on start and goal. The
+        covariance between the path and its ends is therefore multiplied by `dependence`, the
+        factor that best predicts each demonstration from the others. On average, this predicts
+        at least as well as the mean of all demonstrations.
 
         Args:
             start: Start of one motion, in the form that `rollout` of the primitive accepts.

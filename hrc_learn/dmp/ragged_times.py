@@ -5,8 +5,8 @@ would need such a matrix, with N + 3 numbers per sample. Here the polynomials of
 are multiplied by the coordinates first. The result is a piecewise polynomial per column, whose
 value at any time is a sum of a few coefficients weighted by powers.
 
-This sum is linear in the coordinates, and its time derivative is the motion of the next order.
-Two functions, `_motion` and `_adjoint`, therefore compute motions, gradients with respect to
+This sum is linear in the coordinates, and its time derivative is a sum of the same form. Two
+functions, `_motion` and `_adjoint`, therefore compute motions, gradients with respect to
 coordinates, and derivatives of both of any order.
 """
 
@@ -212,7 +212,7 @@ def _lowest_degree(
 def _rows(
     table: CoefficientTable, coordinates: Float[Tensor, "B D M"], pieces: int | None = None
 ) -> Float[Tensor, "B pieces K D"]:
-    """Coefficients of each motion, on the first pieces or on all."""
+    """Coefficients of each motion, on the first `pieces` pieces; None: on all."""
     B, D, _ = coordinates.shape
     matrix = table.matrix if pieces is None else table.matrix[:, : pieces * table.size]
     # In this order of products, the coefficients of a piece are neighbours in memory.

@@ -31,7 +31,7 @@ from hrc_learn.dmp.dynamics import (
 from hrc_learn.geometry.numerics import lasting
 
 GAUSS_POINTS = 12
-"""Points of Gauss-Legendre quadrature on a piece; no basis function changes much on a piece."""
+"""Points of Gauss-Legendre quadrature per piece; no basis function changes much on a piece."""
 DEGREE = 12
 """Degree of the polynomials; pieces are so short that the remaining error is rounding."""
 GRIDS_KEPT = 16
@@ -42,7 +42,8 @@ SMALL_MATRIX_CORES = {"SkylakeX", "Cooperlake", "SapphireRapids"}
 """OpenBLAS core types (version 0.3.29) with kernels for small matrices, which skip packing.
 These are all processors with AVX-512, including AMD's."""
 MINIMUM_ROWS = 4
-"""Number of rows from which these kernels are faster than one flat product of all motions."""
+"""Smallest number of rows for which kernels for small matrices are faster than one flat product
+of all motions."""
 
 
 def chebyshev_points() -> Float[Tensor, "P"]:
@@ -64,7 +65,8 @@ def powers_of(
         for _ in range(1, size):
             columns.append(columns[-1] * u)
         return torch.stack([*columns, *others], dim=-1)
-    # Written in place column by column: a product along rows of six takes twice as long.
+    # Written in place column by column: a cumulative product along rows of six numbers takes
+    # twice as long.
     powers = u.new_ones(*u.shape, size + len(others))
     for k in range(1, size):
         torch.mul(powers[..., k - 1], u, out=powers[..., k])
@@ -75,7 +77,7 @@ def powers_of(
 
 @dataclass(frozen=True, eq=False)
 class PiecewisePolynomial:
-    """Matrix function f(s) = sum_p c_p u^p, with u from -1 to 1 along the piece around s."""
+    """Matrix function f(s) = sum_p c_p u^p, with u from -1 to 1 along the piece at s."""
 
     coefficients: Float[Tensor, "pieces P rows columns"]
     interval: float
@@ -103,7 +105,7 @@ class PiecewisePolynomial:
         return self.interval * self.coefficients.shape[0]
 
     def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch rows columns"]:
-        """Value at `s`; past the last piece, the value at its end unless periodic."""
+        """Value at `s`; a function that is not periodic keeps its value at the end."""
         pieces, P, *shape = self.coefficients.shape
         x = s / self.interval
         x = x % pieces if self.periodic else x.clamp(0, pieces)
@@ -188,7 +190,7 @@ class Response:
         self.basis = basis
         self.approach = approach
         self.name = json.dumps([asdict(spring), basis_config(basis), approach])
-        """The parts as JSON text, for `named_response`."""
+        """Spring, basis and approach as JSON text, for `named_response`."""
         self.size = basis.count + 3
         """M, the number of coordinates: N weights, start velocity, start, goal."""
         with lasting():
@@ -229,7 +231,7 @@ class Response:
         return latest.matrices
 
     def latest_grid(self, s: Tensor) -> TimeGrid | None:
-        """Entry of the last call of `matrices` if it was for these times."""
+        """Time grid of the last call of `matrices`, if it has these times."""
         latest = self._latest
         if latest is None or torch.compiler.is_compiling() or not latest.holds(s):
             return None
@@ -274,7 +276,7 @@ class Response:
         return torch.cat([forced, velocity, start, at_rest - start], dim=-1)
 
     def approach_force(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Forcing, per unit of goal - start, that moves from start to goal along m(s)."""
+        """Forcing, per unit of goal - start, that moves along m(s) (`approach_curve`)."""
         offset, slope, curvature = (approach_curve(s, self.approach, k) for k in range(3))
         return curvature - self.spring.acceleration(offset, slope)
 
@@ -362,7 +364,7 @@ class _StateAt(torch.autograd.Function):
 # A table of 50 Gaussians takes 1.3 MB; few programs use 64 different responses at a time.
 @lru_cache(maxsize=64)
 def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Response:
-    """Shared `Response` of these parts: equal primitives use the same tables and matrices."""
+    """Cached `Response`: equal primitives use the same tables and matrices."""
     return Response(spring, basis, approach)
 
 

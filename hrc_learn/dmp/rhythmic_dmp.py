@@ -23,7 +23,7 @@ HIGH_PEAK = 0.9
 GOLDEN = (5**0.5 - 1) / 2
 """Fraction of an interval that a golden-section search keeps."""
 SEARCH_RIDGE = 1e-6
-"""Ridge during the search for a period: larger than that of the fit, for a smooth misfit."""
+"""Ridge during the search for a period: larger than in the fit, to smooth the misfit."""
 PERIOD_ERROR = 1e-6
 """Relative error at which the search ends: far below what samples resolve."""
 
@@ -163,9 +163,9 @@ def fit_rhythmic_orientation(
 ) -> OrientationDMP:
     """Fit a rhythm of an orientation to each demonstration of at least one cycle.
 
-    The error to the mean orientation oscillates as a `fit_rhythmic` primitive; the goal of the
-    result is the centre of the oscillation. `duration` (or `speed`) and `forcing_gain` modulate
-    the rhythm.
+    The error to the mean orientation is fitted like the positions in `fit_rhythmic`. The goal
+    of the result is the centre of the oscillation. `duration` (or `speed`) and `forcing_gain`
+    modulate the rhythm.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).

@@ -26,7 +26,7 @@ MINIMUM_SAMPLES = 3
 """Start, goal and one sample between them; two leave nothing to fit."""
 
 MAXIMUM_KNOTS = 120
-"""Intervals of the splines: finer than any reasonable number of basis functions."""
+"""Largest number of spline intervals: more than any reasonable number of basis functions."""
 STRENGTHS = -10, 6, 81
 """Decimal exponents of the first and the last penalty compared, relative to the samples, and
 the number of penalties. A step of 0.2 decades changes the error by less than 1 %."""
@@ -42,7 +42,7 @@ SAMPLES_EACH = 1.5
 """Samples per basis function that a fit needs to determine the motion between samples. With
 fewer, accelerations are several times too large."""
 DENSE = 4
-"""Samples per basis function of the grids of `densified`, enough to show the cubics' detail."""
+"""Samples per basis function on the grids of `densified`: enough to resolve its cubics."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -20,13 +20,14 @@ from hrc_learn.geometry.numerics import cached_tensors
 REGULARIZATION = 1e-7
 """Default ridge of a fit: far above rounding, far below what a sensor resolves."""
 BLOCK = 2**13
-"""Samples whose columns are computed at a time: 3 MB, which fit the cache."""
+"""Number of samples whose columns are computed at a time: 3 MB, which fit the cache."""
 METHODS = ("trajectory", "ridge", "lwr")
 SAMPLES_PER_FUNCTION = 20
-"""Samples per basis function of the even grid on which columns are orthonormal."""
+"""Samples per basis function on the even grid on which mixed columns are orthonormal."""
 WELL_POSED = 1e-3
-"""Smallest ratio of the smallest to the largest diagonal entry of a Cholesky factor; at 1e-4,
-half of the digits of float64 are lost, because the products have the square of this ratio."""
+"""Smallest allowed ratio of the smallest to the largest diagonal entry of a Cholesky factor.
+The matrix that is factored has the square of this ratio: at 1e-4, half of the digits of float64
+are lost."""
 CONSTANT = 1e-12
 """Standard deviation of a feature, relative to its size, below which the feature counts as
 constant: only rounding is left when the mean is subtracted."""
@@ -41,8 +42,8 @@ def fit_samples(
 
     Args:
         method: `"trajectory"`, least squares on the positions; `"ridge"`, ridge regression on
-            the force; `"lwr"`, locally weighted regression on the force as in the paper, which
-            fits each weight separately.
+            the force; `"lwr"`, locally weighted regression on the force, which fits each weight
+            separately, as in the paper.
         response: Response of the primitive to be fitted.
         samples: One demonstration or many.
         regularization: Ridge, relative to the largest singular value of the design matrix.
@@ -81,8 +82,8 @@ def _fit_ragged(
     """Least squares on the trajectory for all demonstrations at once, on ragged times.
 
     Returns:
-        Weights, start velocity dy/ds, and a flag for each demonstration: if it is true, the
-        samples leave functions undetermined and the other results must not be used.
+        Weights, start velocity dy/ds, and a flag for each demonstration. If the flag is true,
+        the samples do not determine all weights, and the other results must not be used.
     """
     known = [samples.first.double(), samples.last.double()]
     if rate is not None:
@@ -107,9 +108,9 @@ def normal_products(
         known: The last k coordinates: start velocity dy/ds if it is known, start, and goal.
 
     Returns:
-        Products, summed over the valid samples, of n mixed columns and of the positions without
-        the effect of `known`. The mixed columns are orthonormal on an even grid, so products
-        lose no digits if the samples determine all functions.
+        Products [A B]'[A B], summed over the valid samples. A holds n mixed columns. They are
+        orthonormal on an even grid, so the products lose no digits if the samples determine all
+        weights. B holds the positions without the effect of `known`.
     """
     M = response.size
     n = M - known.shape[1]
@@ -143,7 +144,8 @@ def solve_normal(
         regularization: Ridge, relative to the largest singular value of the balanced columns.
 
     Returns:
-        Unknown coordinates, squared residuals, and a flag where functions are undetermined.
+        Unknown coordinates, squared residuals, and a flag for each demonstration: true if the
+        samples do not determine all coordinates.
     """
     mixing, sigma = _orthonormal_columns(response, n, products.device)
     gram, right = products[:, :n, :n], products[:, :n, n:]
@@ -288,7 +290,7 @@ class RidgeFit:
     coefficients: Float[Tensor, "F_and_1 K"]
     """a in the first row, B transposed in the others."""
     held_out: Float[Tensor, "n K"]
-    """Difference of each sample to its prediction from all others."""
+    """Difference between each sample and its prediction from all other samples."""
 
 
 def fit_ridge(
@@ -301,8 +303,9 @@ def fit_ridge(
     """Minimise |Y - A [a B]'|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
 
     The constant a is not penalised, so that a strong penalty leads to the mean of the targets.
-    With the hat matrix H = A (A'A + P)^-1 A', the residual of sample i in a fit to the others,
-    at the same penalty P, is e_i / (1 - H_ii) (PRESS; Allen 1974, "The relationship between
+    A fit to all samples but one, at the same penalty P, needs no second solution. The omitted
+    sample i has the residual e_i / (1 - H_ii), with its residual e_i in the fit to all samples
+    and the hat matrix H = A (A'A + P)^-1 A' (PRESS; Allen 1974, "The relationship between
     variable selection and data augmentation").
 
     Args:

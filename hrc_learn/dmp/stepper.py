@@ -134,7 +134,8 @@ class Stepper:
             # Loops repeat one step length, so keep its matrix. Another thread may replace it.
             E = self._spring.propagator(ds).numpy()
             self._transition = ds, E
-        # After the end of the forcing, only the spring changes the state that it caused.
+        # After the end of the forcing, only the spring changes the state that the forcing
+        # caused.
         forced = after = self._forced(now) if s < self._end else E.dot(before)
         if scale is not None:
             before, after = before.dot(scale), after.dot(scale)

@@ -28,7 +28,7 @@ END = 0
 PRIOR = 20.0
 """Weight of the prior (a Laplace distribution) of each integer, as a number of vectors."""
 LEAST = 0.02
-"""Addition to the mean magnitude of each integer, which is zero for some in the data."""
+"""Value added to the mean magnitude of each integer, because the mean in the data may be 0."""
 HEADROOM = 2.0
 """Largest allowed magnitude of an integer, relative to its largest magnitude in the data."""
 
@@ -51,7 +51,7 @@ class _Tree(NamedTuple):
     """Largest magnitude in the first branch. -1: the question is the sign, and the second
     branch is negative."""
     branches: array
-    """Two for each question: the next question, or -1 - i for leaf i."""
+    """Two entries for each question: the next question, or -1 - i for leaf i."""
     after: list[Interval]
     """Knowledge after each leaf."""
     decided: list[tuple[Interval, ...]]

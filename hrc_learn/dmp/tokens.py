@@ -1,10 +1,10 @@
 """Conversion between motions and tokens, which are short sequences of integers.
 
-Every sequence of tokens decodes to a bounded motion. Language models can predict motions as
-tokens. The components of a motion are rounded to multiples of one step, so components of less
-variance take fewer bits. This minimises the error (reverse water-filling: Cover and Thomas,
-"Elements of information theory", section 10.3). `TokenCode` turns the integers into tokens,
-the first components first.
+Language models can predict motions as tokens, and every sequence of tokens decodes to a bounded
+motion. The components of a motion (`MotionComponents`) are rounded to integer multiples of one
+step, so components of less variance take fewer bits. For a given number of bits, this minimises
+the error (reverse water-filling: Cover and Thomas, "Elements of information theory", section
+10.3). `TokenCode` turns the integers into tokens, the first components first.
 
 Columns that jump between a few values, such as those of grippers, are called columns of steps.
 Their integers encode the times of the jumps.
@@ -40,7 +40,7 @@ this amount if steps are fine."""
 REPRESENTED = 1 / 3
 """Largest error of splines relative to the error of tokens; it adds 5 % to the total error."""
 ROUNDS = 8
-"""Repetitions in which step and probabilities adapt to each other."""
+"""Number of iterations in which step and probabilities adapt to each other."""
 SMALLEST, LARGEST = 16, 2**15
 """Smallest and largest size of the vocabulary."""
 STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
@@ -48,16 +48,16 @@ STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
 its switches in a motion (later switches are left out). `MOST_SLOTS`: largest number of times at
 which it can switch."""
 OF_SCALE = 0.07
-"""Product of our tolerance and the scale of FAST for which both tokenizers have equal errors,
-on five teleoperated datasets."""
+"""Product of `tolerance` and the scale of the tokenizer FAST at which both tokenizers have
+equal errors, on five teleoperated datasets."""
 
 
 class MotionTokenizer(nn.Module):
     """Map between motions of D columns and tokens 0 ... vocabulary_size - 1.
 
     Token 0 ends and pads sequences. Every sequence decodes to a motion within the demonstrated
-    range, extended by a tenth to either side. The first tokens of a sequence decode to a
-    coarser motion.
+    range, extended by a tenth to either side. The first tokens of a sequence alone decode to a
+    coarser form of its motion.
     """
 
     end = END
@@ -75,9 +75,10 @@ class MotionTokenizer(nn.Module):
         """Join the parts; `fit` makes them.
 
         Args:
-            config: `steps` (columns of steps), `slots` (number of times at which they can
-                switch), `step` (components are rounded to multiples of it) and `shift` (mean
-                magnitude of components beyond their integer, in steps).
+            config: Four settings. `steps` lists the columns of steps; `slots` is the number of
+                times at which they can switch. Components are rounded to multiples of `step`.
+                `shift` is the mean difference between the magnitudes of components and of their
+                integers, in steps.
             components: Components of all other columns.
             code: Code of the integers.
             levels: (steps, L).
@@ -158,7 +159,7 @@ class MotionTokenizer(nn.Module):
         reference = y[:, 0, chosen] if start_known else levels[:, 0].expand(len(y), -1)
         switches = _switches(samples, reference, chosen, levels, config["slots"])
         z = components.encode(parts, velocity) * components.spread
-        # Errors of all columns add up.
+        # The squared errors of all columns add up.
         aim = tolerance * max(len(smooth), 1) ** 0.5
         # Begin with a step at which all components are exact enough.
         step, bits = aim * (12 / max(1, z.shape[1])) ** 0.5, None
@@ -198,7 +199,7 @@ class MotionTokenizer(nn.Module):
             length: Length L of all sequences; longer ones are cut, which makes motions coarser.
 
         Raises:
-            ValueError: Shapes that differ from the fit's, or values that are not finite.
+            ValueError: Shapes that differ from those of the fit, or values that are not finite.
         """
         if length is not None and length < 0:
             raise ValueError(f"length must not be negative, got {length}")
@@ -236,7 +237,8 @@ class MotionTokenizer(nn.Module):
                 An empty list is one sequence without tokens: the coarsest motion.
             time: Time since the start [s], (T,) or (*batch, T), at any sampling rate. After
                 its end, a motion rests.
-            start: (*batch, D); by default the mean start, or the encoded one.
+            start: Start, (*batch, D). None: the mean start if the tokenizer was fitted with
+                known starts, otherwise the encoded start.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
                 tokenizer was fitted with velocities, otherwise the encoded one.
             order: Derivative with respect to time, 0, 1 or 2; zero for columns of steps.
@@ -357,7 +359,7 @@ class MotionTokenizer(nn.Module):
 
 
 class ActionProcessor:
-    """Tokens of action chunks with the interface of FAST's processor, which LeRobot calls.
+    """Tokenizer of action chunks with the interface of FAST, the tokenizer that LeRobot calls.
 
     The tokens encode the start of a chunk too, because the interface does not pass the start.
     """
@@ -384,7 +386,8 @@ class ActionProcessor:
 
         Args:
             action_data: The chunks.
-            scale: FAST's scale of coefficients; the tokens have the accuracy of this scale.
+            scale: Scale of the coefficients in FAST; the tokens are as accurate as those of
+                FAST at this scale.
             vocab_size: Number of tokens.
             time_horizon: Ignored; T is read from the chunks.
             action_dim: Ignored; D is read from the chunks.

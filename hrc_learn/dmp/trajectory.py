@@ -131,7 +131,7 @@ class Trajectory(ArrayOutputs):
         X = self._coordinates
         if order:
             X = X / self.duration[..., None, None] ** order
-        # Under a derivative transform, matrices made here could not be kept.
+        # Matrices made inside a derivative transform could not be kept.
         shared = latest is not None or (
             s.ndim == 1 and not s.requires_grad and readable(s, s.detach())
         )
@@ -174,7 +174,7 @@ class ContinuedTrajectory(Trajectory):
     y(s) = H(s) x + E(s - s_0) [state - (H, H')(s_0) x]
 
     H x is the motion with the coordinates x, from which the state may differ. The difference
-    decays as the unforced spring moves, with the transition matrix E. The motion is exact,
+    decays like the unforced spring, whose transition matrix is E. The motion is exact,
     linear in x and the state, and starts with the given position and velocity. If the state
     lies on H x, the motion is the remainder of H x.
     """

@@ -2,17 +2,17 @@
 
 eta' = alpha (beta log(g conj q) - eta) + f,   q' = (0, eta) q / 2,   eta = tau omega
 
-("Orientation in Cartesian space dynamic movement primitives", eq. 16). Primes are derivatives
-with respect to s = t / tau, f is the forcing term, and the logarithm is the rotation vector
-with the full angle. With e = log(g conj q) and v = -eta,
+This is equation 16 of "Orientation in Cartesian space dynamic movement primitives". Primes are
+derivatives with respect to s = t / tau, f is the forcing term, and the logarithm is the
+rotation vector with the full angle. With e = log(g conj q) and v = -eta,
 
     v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
 
-This is the linear primitive except for the drift n, which is zero while the axis of rotation is
-constant. The linear part is solved exactly, and n is integrated by the Runge-Kutta method of
-order 4 in the frame of the linear motion (Lawson 1967, "Generalized Runge-Kutta processes for
-stable systems"). A step is stable at any length and exact for rotations about one axis. The
-logarithm is continuous over time.
+with the factor c of `quaternion.axis_drift`. This is the linear primitive except for the drift
+n, which is zero while the axis of rotation is constant. The linear part is solved exactly, and
+n is integrated by the Runge-Kutta method of order 4 in the frame of the linear motion (Lawson
+1967, "Generalized Runge-Kutta processes for stable systems"). A step is stable at any length
+and exact for rotations about one axis. The logarithm is continuous over time.
 """
 
 from dataclasses import replace
@@ -49,7 +49,7 @@ class UdePrimitive(JointDMP):
         """Primitive whose forcing makes (e, v) follow the motion of a linear primitive.
 
         Args:
-            linear: Fitted to the errors.
+            linear: Linear primitive fitted to the errors.
             errors: Samples for the fit report.
 
         Raises:
@@ -125,9 +125,9 @@ class UdePrimitive(JointDMP):
 
 
 def to_reference(state: DMPState, old: Tensor, new: Tensor) -> DMPState:
-    """State of the error to another reference, for the same motion of the orientation."""
+    """State of the error to another reference, at the same orientation and angular velocity."""
     error, rate = orientation_error.retarget(state.position, state.rate, old, new)
-    # The spring force alpha beta (e - goal) is unchanged if both move alike.
+    # The spring force alpha beta (e - goal) is unchanged if e and goal change equally.
     goal = state.goal + error - state.position
     return replace(state, position=error, rate=rate, goal=goal)
 

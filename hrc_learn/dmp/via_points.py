@@ -1,10 +1,11 @@
 """Changes of motions so that they pass exactly through via points.
 
-After Zhou, Gao and Asfour 2019, "Learning via-movement primitives": a motion is an elementary
+In Zhou, Gao and Asfour 2019, "Learning via-movement primitives", a motion is an elementary
 trajectory plus the shape that a demonstration adds, and via points change the elementary
-trajectory piecewise. Here the weights make that change, so that the result is an ordinary
-primitive: it follows the curve as closely as the basis allows, and passes the via points and
-the end exactly. `MotionPrimitive.condition` does this for values of any kind.
+trajectory piecewise. Here the change is a piecewise polynomial curve, and the weights are
+changed to follow it, so that the result is an ordinary primitive. It follows the curve as
+closely as the basis allows, and passes exactly through the via points and the end.
+`MotionPrimitive.condition` does this for values of any kind.
 """
 
 from dataclasses import dataclass
@@ -22,17 +23,17 @@ SAMPLES_PER_FUNCTION = 8
 """Times per basis function at which curve and motion are compared. More are not needed: basis
 functions cannot follow changes within an eighth of their distance."""
 OUTSIDE = 1e-9
-"""Height, relative to its peak, that a basis function may reach outside of a window (times in
-which a motion may change). Of the Gaussians inside, only the few nearest to the ends of the
-window exceed this height."""
+"""Largest height, relative to its peak, that a basis function may have outside of a window (the
+interval in which a motion may change). Among the Gaussians centred in the window, only the few
+nearest to its ends exceed this height and are not used."""
 RIDGE = 1e-7
 """Ridge on the weights, relative to the norm of a column of the design matrix: it keeps weights
 small if their effects nearly cancel."""
 QUINTIC = torch.tensor(
     [[0, 0, 0, 10, -15, 6], [0, 1, 0, -6, 8, -3], [0, 0, 0, -4, 7, -3]], dtype=torch.float64
 )
-"""Coefficients of Hermite's quintics without second derivatives at the ends of [0, 1]: for the
-change of the value, and for the rates at the start and the end."""
+"""Coefficients of Hermite's quintics with zero second derivatives at the ends of [0, 1]: for
+the change of the value, and for the rates at the start and the end."""
 DEPENDENT = 1e-12
 """Relative singular value below which a constraint counts as implied by the others."""
 OVERSHOOT = 1.5
@@ -40,8 +41,9 @@ OVERSHOOT = 1.5
 require (`_change_curve`)."""
 CLOSEST, CLOSEST_TO_WINDOW = 2, 6
 """Smallest distances at which motions do not overshoot, in units of the distance between basis
-functions. `CLOSEST`: between via points, and to start and end. `CLOSEST_TO_WINDOW`: to the ends
-of a window. At the next smaller distances tried, 1.5 and 5, motions overshoot."""
+functions. `CLOSEST`: from a via point to the next, and to start and end. `CLOSEST_TO_WINDOW`:
+from a via point to the ends of a window. At the next smaller distances tried, 1.5 and 5,
+motions overshoot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,13 +66,13 @@ def through_via_points(
     """Linear primitive changed to pass exactly through via points.
 
     Args:
-        motion: One primitive, or a batch with the same number of via points each.
+        motion: One primitive, or a batch in which all have the same number of via points.
         via: Via points in the columns of the primitive.
         within: Times [s] between which the motion may change; None: from start to end.
 
     Raises:
-        ValueError: Two via points at the same time, a via point outside of `within`, or too
-            many or too close via points for the basis.
+        ValueError: Two via points are at the same time, one is outside of `within`, or they
+            are too many or too close together for the basis.
     """
     if motion.basis.periodic:
         raise ValueError("a rhythm has no via points: every time occurs in each period")
@@ -134,7 +136,7 @@ def _check_overshoot(
 
 
 def _missing(motion: LinearPrimitive, via: ViaPoints) -> Float[Tensor, "*batch n 2 D"]:
-    """Differences in position and dy/ds at the via points; NaN where they are free."""
+    """Via points minus the motion, in position and dy/ds; NaN where a via point is free."""
     fixed = motion.with_coordinates(motion.coordinates().detach()).requires_grad_(False)
     time = via.s * motion.duration.double()[..., None]
     now = fixed.rollout_columns(Boundary(), fixed.duration, time)
@@ -193,7 +195,7 @@ def _knots(
 
 @dataclass(frozen=True, eq=False)
 class _CurveFollower:
-    """Least-squares fit of curves that start at rest, with the weights inside a window.
+    """Least-squares fit of curves that start at rest, by the basis functions inside a window.
 
     In the coordinates z of the weights, the distance to a curve is |z - follow(curve)|.
     """
@@ -218,7 +220,7 @@ class _CurveFollower:
         return z @ self.Q[:: len(self.units)].mT
 
 
-# A decomposition of 8 N x 3 rows each; a task has few windows.
+# Each entry takes a decomposition of 8 N x 3 rows; a task has few windows.
 @cached_tensors(maxsize=16)
 def _curve_follower(response: Response, window: tuple[float, float]) -> _CurveFollower:
     N, (first, last) = response.basis.count, window
@@ -229,8 +231,8 @@ def _curve_follower(response: Response, window: tuple[float, float]) -> _CurveFo
     chosen = (height <= OUTSIDE * forcing.amax(0)).nonzero()[:, 0]
     s = torch.linspace(first, last, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)
     H = response.evaluate(s)[..., chosen]
-    # Derivatives are weighted by their effect over the distance between basis functions, the
-    # finest detail that these can follow.
+    # Derivatives are weighted by their effect over the distance between basis functions, which
+    # is the finest detail that a motion can follow.
     units = torch.tensor([1.0, 1 / N, 1 / N**2], dtype=torch.float64)
     A = (H * units[:, None]).flatten(0, 1)
     unit = 1 / A.norm(dim=0)
