@@ -25,7 +25,8 @@ type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Sequence | floa
 """A tensor, a NumPy array, or a nested list of numbers."""
 
 # Below these thresholds the series are exact to rounding in float64 (next term < 1e-16), while
-# the second derivatives of the closed forms lose digits to cancellation, as 1/threshold^2.
+# the second derivatives of the closed forms lose digits to cancellation, in proportion to
+# 1/threshold^2.
 _SINC_THRESHOLD = 1e-2
 _ARCTAN_THRESHOLD = 1e-3
 
@@ -65,8 +66,8 @@ def check_settings(
 ) -> None:
     """Check that settings are in their ranges.
 
-    Every number, also within a tuple, must be finite, unless the class attribute `unbounded`
-    holds its name; NaN is in no range. A setting annotated with `Literal` must be one of its
+    Every number, also within a tuple, must be finite, unless its name is in the class attribute
+    `unbounded`; NaN is in no range. A setting annotated with `Literal` must be one of its
     values. A dataclass without ranges can use this function as its `__post_init__`.
 
     Args:
@@ -224,8 +225,8 @@ def minimum_jerk[T: (float, Tensor)](x: T) -> tuple[T, T]:
 def lasting() -> Iterator[None]:
     """Context in which to make tensors that are kept and that every later call can use.
 
-    Autograd refuses tensors made in inference mode, and the stand-ins of a tracer end with its
-    trace.
+    Autograd refuses tensors made in inference mode, and the placeholder tensors of a tracer are
+    valid only during its trace.
     """
     with torch.inference_mode(False), _disable_current_modes():
         yield
@@ -298,7 +299,7 @@ def _outlives_the_call(tensor: Tensor) -> bool:
 def matmul(
     A: Float[Tensor, "*#batch m k"], B: Float[Tensor, "*#batch k n"]
 ) -> Float[Tensor, "*batch m n"]:
-    """A B."""
+    """Matrix product A B."""
     if not torch.compiler.is_compiling():
         return A @ B
     return (A.unsqueeze(-1) * B.unsqueeze(-3)).sum(-2)

@@ -66,7 +66,7 @@ class Pose:
         return Pose(r[..., :3], quaternion.exp(r[..., 3:]))
 
     def vector(self) -> Float[Tensor, "*batch 6"]:
-        """Position [m] and rotation vector [rad] of the shortest rotation: the paper's r."""
+        """Position [m] and rotation vector [rad] of the shortest rotation; r in equations."""
         return torch.cat([self.position, quaternion.log(self.orientation)], dim=-1)
 
     def __matmul__(self, other: Pose) -> Pose:

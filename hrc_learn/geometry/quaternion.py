@@ -156,8 +156,8 @@ def mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
     A = q64.mT @ q64
     values, vectors = torch.linalg.eigh(A.detach())
     others, found = vectors[:, :-1], vectors[:, -1]
-    # Zero, but with the derivative of the eigenvector; that of `eigh` needs four different
-    # eigenvalues, which equal quaternions do not have.
+    # The correction is zero, but has the derivative of the eigenvector. The derivative of
+    # `eigh` needs four different eigenvalues, which equal quaternions do not have.
     found = found + others @ ((others.mT @ A @ found) / (values[-1] - values[:-1]))
     return found.to(q) if q.is_floating_point() else found
 
@@ -223,7 +223,7 @@ SINGULAR = 1e-3
 def axis_drift(
     e: Float[Tensor, "*batch 3"], v: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """n(e, v), zero where v lies along e; in the unit of v.
+    """Drift n(e, v) in the unit of v, as defined above; zero where v lies along e.
 
     At whole turns, n cancels the component of v perpendicular to e: v + n lies along e.
     """

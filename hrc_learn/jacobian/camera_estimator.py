@@ -1,16 +1,18 @@
 """Online estimate of a camera that may have been moved, and of the residual image Jacobian.
 
-The state holds a window of key frames. The camera c (thirteen numbers) and the weights W of the
-residual network are unknown. In key frame i, with the tool at pose r_i, the marker's pixel is
+The state holds a window of key frames, which are images far enough apart to show the motion of
+the tool. The unknowns are the camera c (thirteen numbers, see `perspective`) and the weights W
+of the network that represents the residual (see `network`). In key frame i, with the tool at
+pose r_i, the marker's pixel is
 
     x_i = pixel(c, r_i) + W Phi_i + noise,    Phi_i = sum of dr (x) theta since the first frame
 
-Here dr is the motion of the tool between two key frames, and theta are the activations of the
-neurons. W enters linearly and has a Gaussian prior with covariance P, so it is integrated out:
-the errors of frames i and j have the covariance Phi_i^T P Phi_j. The camera follows from
-Gauss-Newton steps of generalised least squares. The search starts from several hypotheses,
-which differ in the rotation about the optical axis. Given the camera, W has a closed form.
-Camera and W together are the maximum a posteriori estimate.
+Here dr is the motion of the tool between two key frames, theta are the activations of the
+neurons, and (x) is the Kronecker product. W enters linearly and has a Gaussian prior with
+covariance P, so it is integrated out: the covariance of the errors of frames i and j is Phi_i^T
+P Phi_j. The camera follows from Gauss-Newton steps of generalised least squares. The search
+starts from several hypotheses, which differ in the rotation about the optical axis. Given the
+camera, W has a closed form. Camera and W together are the maximum a posteriori estimate.
 
 The prior of optics and marker is their posterior from the demonstrations. The prior of the
 camera's position and orientation is wide. If several images in a row show the marker far from
@@ -83,7 +85,7 @@ class CameraConfig:
     """Prior standard deviation of the mean of the residual image Jacobian [px/m]: half a
     percent of an ordinary image Jacobian, the effect of encoder zeros off by 2 mrad."""
     bump: float = 4.0
-    """Error that indicates a moved camera [px], in addition to five standard deviations."""
+    """Error above which the camera may have been moved [px], plus five standard deviations."""
     surprises: int = 3
     """Number of consecutive images with such an error that count as a moved camera."""
 
@@ -101,7 +103,7 @@ class CameraState:
     cost: Float[Tensor, "*batch hypotheses"]
     """Negative log posterior of each hypothesis, up to a constant."""
     covariance: Float[Tensor, "*batch 13 13"]
-    """Covariance of a step from the most probable camera."""
+    """Covariance of a step (`perspective.stepped`) from the most probable camera."""
     position: Float[Tensor, "*batch frames 3"]
     """Positions of the tool in the window [m], the newest last."""
     orientation: Float[Tensor, "*batch frames 4"]

@@ -1,18 +1,19 @@
-"""Detect that a camera was moved, from the tool's marker, and correct pixels for the motion.
+"""Detect from the tool's marker that a camera was moved, and correct pixels for the motion.
 
 A camera fitted to demonstrations (`perspective`) predicts the pixel of the tool's marker
 at any tool pose. If the camera turns by w and moves by v, the seen pixel differs from the
 prediction by e = L (w, v), to first order. L is the interaction matrix: the derivative of the
 pixel with respect to the camera twist. One motion (w, v) is fitted to the differences e of the
 last second.
+
 The displacement L (w, v), as root mean square over the frames, is compared with a threshold:
 2.5 times the largest displacement in demonstrations that were held out of the camera's fit. The
 threshold covers errors of calibration, lens and time stamps. Outside the region of the
 demonstrations these errors are unknown, so frames there are ignored.
 
 `CameraCorrection` maps pixels of the moved camera to pixels of the camera before its motion.
-For the marker it uses the tool pose; for an object, the plane on which the objects of the
-demonstrations lay. All frames since the motion refine the estimate.
+For the marker, it uses the tool pose. For an object, it uses the plane on which the objects of
+the demonstrations lay. All frames since the motion refine the estimate.
 """
 
 from __future__ import annotations
@@ -144,8 +145,8 @@ class CameraReference:
         """Fit the camera, and compute the threshold from displacements of an unmoved camera.
 
         Args:
-            demonstrations: Two or more demonstrations with one fixed camera; read several
-                times.
+            demonstrations: Two or more demonstrations with one fixed camera; they are read
+                several times.
             fps: Frame rate [1/s].
             image_size: Width and height of the image [px].
 
@@ -280,13 +281,13 @@ def camera_placements(
     episode, or more often, is not detected.
 
     Args:
-        demonstrations: Demonstrations in the order of recording; in memory, as they are read
-            several times.
+        demonstrations: Demonstrations in the order of recording, kept in memory because they
+            are read several times.
         image_size: Width and height of the image [px].
 
     Returns:
         The placements: one if the camera never moved, none if fewer than two episodes show the
-        marker in ten frames. Episodes with fewer such frames belong to no placement.
+        marker in ten or more frames. Other episodes belong to no placement.
     """
     seen = {
         index: frames
@@ -432,11 +433,10 @@ def object_height(
 ) -> float:
     """Height of the horizontal plane on which objects lie, in the camera's base frame [m].
 
-    The demonstrations determine the marker's position on the tool only in part. The error of
-    the other part shifts the base frame of the fitted camera from the robot's base frame. The
-    returned height is in the camera's base frame, so it differs from a height in the robot's
-    base frame. When they are grasped, all objects have the same unknown offset from the tool.
-    Least squares on the pixels finds this offset.
+    The demonstrations determine the marker's position on the tool only in part. The
+    undetermined part shifts the base frame of the fitted camera against the robot's base frame,
+    so heights in both frames differ. At the grasps, all objects have the same unknown offset
+    from the tool. Least squares on the pixels finds this offset.
 
     Args:
         reference: Camera of the demonstrations.

@@ -1,14 +1,14 @@
 """Estimators that adapt the image Jacobian J_s online, while the robot moves.
 
-`FixedEstimator` never changes the Jacobian. `PaperEstimator` follows the paper's law. The other
-estimators compare key frames: frames far enough apart to distinguish motion from noise.
-`KeyFrameEstimator` selects them online. The composite law and Broyden's update follow
-gradients. The Kalman filter keeps one covariance for both image rows, since both rows have the
-same regressors.
+`FixedEstimator` never changes the Jacobian. `PaperEstimator` follows the adaptation law of the
+paper by Yan et al. (`docs/concepts/paper.md`). The other estimators compare key frames: frames
+far enough apart to distinguish motion from noise. `KeyFrameEstimator` selects them online. The
+composite law and Broyden's update follow gradients. The Kalman filter keeps one covariance for
+both image rows, since both rows have the same regressors.
 
 Below, W are the weights of the network, theta the activations of its neurons, J_s_hat the
 estimate of J_s, dr the motion of the tool and dx the motion of the image feature between two
-key frames.
+key frames; (x) is the Kronecker product.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """State after one control step."""
 
     def restored(self, state: Any) -> Any:
-        """The state, replaced by the initial state where any of its numbers is not finite."""
+        """The state; elements of the batch with a number that is not finite start anew."""
         if has_numbers(state):
             return state
         batch = state.weight.shape[:-2]
@@ -185,7 +185,7 @@ class LearningConfig(KeyFrameConfig):
 
 @pytree
 class MotionSample:
-    """Motion from the key frame to the present frame; zero without a valid pair."""
+    """Motion from the key frame to the present frame; zero if they are not a valid pair."""
 
     twist: Float[Tensor, "*batch 6"]
     """Motion of the tool, linear [m] and angular [rad]."""
@@ -427,7 +427,7 @@ class BroydenConfig(LearningConfig):
     """Step of Broyden's update."""
 
     min_step: float = 2e-3
-    """Least motion between key frames [m]; large, since the update has no noise model."""
+    """Least motion between key frames [m]; large, because the update has no noise model."""
     gain: float = 0.5
     """Fraction of the prediction error removed by one pair, in (0, 1]."""
 
@@ -439,8 +439,8 @@ class BroydenConfig(LearningConfig):
 class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     """Broyden's update,  J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997).
 
-    An equal change of the weights of all normalised neurons adds a constant, so one update
-    applies everywhere.
+    The update changes the weights of all normalised neurons equally. This adds a constant to
+    the Jacobian, so one update applies everywhere.
     """
 
     constant = True

@@ -1,11 +1,12 @@
 """Radial basis functions of the image Jacobian, and the regression of their weights.
 
-The paper calls each basis function a neuron. The weights w follow from Bayesian ridge
-regression on pairs of key frames. For a pair, dr is the motion of the tool, dx the motion of
-the image feature, and theta are the activations of the neurons. Each image row is
-dx = w . phi + noise with phi = dr (x) theta, a Gaussian prior on w and Gaussian noise. Mean and
-covariance of w then have a closed form in statistics that are summed over pairs, demonstrations
-and processes, so only one demonstration is in memory at a time.
+Each basis function is called a neuron, as in the paper by Yan et al. The weights w follow from
+Bayesian ridge regression on pairs of key frames. For a pair, dr is the motion of the tool, dx
+the motion of the image feature, and theta are the activations of the neurons. The model of each
+image row is dx = w . phi + noise, with the Kronecker product phi = dr (x) theta, a Gaussian
+prior on w and Gaussian noise. Mean and covariance of w then have a closed form in statistics
+that are summed over pairs, demonstrations and processes, so only one demonstration is in memory
+at a time.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class RegressionStatistics:
         )
 
     def __add__(self, other: RegressionStatistics) -> RegressionStatistics:
-        """Statistics of both sets of pairs together."""
+        """Statistics of the pairs of both operands."""
         return tree_map(add, self, other)
 
     def squared_error(self, weights: Float[Tensor, "P 2"]) -> float:
@@ -324,7 +325,7 @@ class RBFCenters:
         six axes.
 
         In a small workspace the image Jacobian is nearly linear in position and rotation. These
-        neurons can represent that; a grid over six inputs would need hundreds of neurons.
+        neurons can represent such a function; a grid over six inputs would need hundreds.
 
         Args:
             demonstrations: Demonstrations, read twice, one by one. In a distributed run, each
@@ -410,7 +411,7 @@ class ImageJacobianFitConfig(KeyFrameConfig):
 
     @classmethod
     def of_residual(cls) -> ImageJacobianFitConfig:
-        """Settings for the residual of a fitted camera, some thousandths of the image Jacobian.
+        """Settings for the residual of a fitted camera: thousandths of the image Jacobian.
 
         Key frames are a centimetre apart: for smaller motions, the noise of the marker detector
         exceeds the residual.
@@ -495,8 +496,8 @@ def fit_weights(
     noise = 2 * config.pixel_noise**2  # variance of a difference of two measurements
     held_out = _held_out_square(folds, precision, noise)
     # The error of a network that is too coarse for the data acts as noise on the weights. The
-    # squared error sums two coordinates, so half of it counts. With NaN (one fold), `max` keeps
-    # the noise.
+    # squared error sums two coordinates, so half of it counts. With a single fold, the held-out
+    # error is NaN, and `max` keeps the noise.
     noise = max(noise, held_out / 2)
     mean, covariance = solve(total, precision, noise)
     report = ImageJacobianFitReport(

@@ -1,6 +1,6 @@
 """Learn neurons, noise and prior of an image Jacobian, and measure its held-out errors.
 
-For given neurons, the weights have a closed form. The evidence has one, too: the probability of
+For given neurons, weights and evidence have closed forms. The evidence is the probability of
 the demonstrated image motion with the weights integrated out (type-II maximum likelihood;
 MacKay 1992, "Bayesian interpolation"). L-BFGS maximises the evidence over neurons, noise and
 prior. The error on held-out demonstrations decides when to stop. In this module, a pair

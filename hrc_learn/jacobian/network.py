@@ -1,6 +1,7 @@
 """Image Jacobian of a fitted camera plus a network of radial basis functions.
 
-Without a camera, the network is the whole image Jacobian, as in the paper.
+Without a camera, the network is the whole image Jacobian, as in the paper by Yan et al.
+(`docs/concepts/paper.md`).
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class RBFImageJacobian(nn.Module):
 
     The first term is the image Jacobian of a camera fitted to demonstrations. The second term,
     the network, represents the residual: lens, misalignment and unmodelled kinematics. Without
-    a camera, the first term is zero and the second is the paper's (approxNN_vec).
+    a camera, the first term is zero and the second is equation (approxNN_vec) of the paper.
 
     r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear, angular)
     in the base frame, *not* the derivative of the rotation vector. Therefore J_s J, with the
@@ -232,7 +233,7 @@ class RBFImageJacobian(nn.Module):
         )
 
     def uncertainty(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of each column of J_s_hat: the larger of both rows.
+        """Posterior standard deviation of each column of J_s_hat, the larger of its two rows.
 
         Args:
             r: Pose, as for `forward`.

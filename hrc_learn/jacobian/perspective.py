@@ -204,7 +204,7 @@ def on_plane(
 def unexplained(
     demonstrations: Sequence[ImageDemonstration], camera: Float[Tensor, "13"]
 ) -> Sequence[ImageDemonstration]:
-    """Demonstrations with the residual as feature: seen pixel minus a camera's prediction.
+    """Demonstrations whose feature is the seen pixel minus the prediction of a camera.
 
     The demonstrations are read on access.
     """
@@ -223,7 +223,7 @@ class CameraFit:
     camera: Float[Tensor, "13"]
     """Most probable camera."""
     covariance: Float[Tensor, "13 13"]
-    """Covariance of a step from that camera (see `stepped`)."""
+    """Covariance of a step (see `stepped`) from the most probable camera."""
     noise: float
     """Robust standard deviation of a pixel coordinate [px]."""
 
@@ -473,7 +473,8 @@ def _shifts(
 ) -> Float[Tensor, "starts 3"]:
     """Shifts t [m] of initial cameras, by least squares, with all points in front of them.
 
-    A point x, rotated to the camera frame, is seen in direction xi = (x + t)_12 / (x + t)_3.
+    A point x, rotated to the camera frame, is seen in the direction xi: the first two
+    components of x + t, divided by the third.
 
     Args:
         point: Points x for each start [m].
@@ -507,8 +508,9 @@ def motion_jacobian(
 ) -> Float[Tensor, "frames 2 6"]:
     """Derivative of pixels with respect to a camera twist in the camera frame [px/rad, px/m].
 
-    This is the interaction matrix of points of Espiau, Chaumette and Rives (1992), times the
-    derivative of the lens; three columns for rotation, then three for translation.
+    This is the interaction matrix of points (Espiau, Chaumette and Rives 1992), times the
+    derivative of the lens. The first three columns are for rotation, the others for
+    translation.
 
     Args:
         camera: Camera.
@@ -523,7 +525,7 @@ def motion_jacobian(
 def moved(
     camera: Float[Tensor, "*#batch 13"], twist: Float[Tensor, "*#batch 6"]
 ) -> Float[Tensor, "*batch 13"]:
-    """Camera turned about its own axes [rad], then moved [m] along its axes before the turn."""
+    """Camera turned about its axes [rad] and moved [m] along these axes as before the turn."""
     back = quaternion.exp(-twist[..., :3])
     turn = quaternion.log(quaternion.multiply(back, quaternion.exp(camera[..., ROTATION])))
     shift = quaternion.rotate(back, camera[..., SHIFT] - twist[..., 3:])

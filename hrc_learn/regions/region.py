@@ -1,4 +1,7 @@
-"""Regions of task space (box, cones, ellipse in the image) and of joint space."""
+"""Regions of task space (box, cones, ellipse in the image) and of joint space.
+
+Labels such as (CaFun) name equations of the paper by Yan et al.; see `docs/concepts/paper.md`.
+"""
 
 from __future__ import annotations
 
@@ -63,9 +66,9 @@ class PositionRegion(Region):
     f_i = ((r_i - c_i) / h_i)^2 - 1                                      (CaFun)
     P   = sum_i k_c/2 max(0, f_i)^2                                      (CaPeFun)
 
-    with position r, centre c and half size h. k_c has the unit of P. The requested speed,
-    2 k_c f (r - c)/h^2, therefore grows as the box shrinks. Near a wall, the distance past
-    the wall decays at the rate 4 k_c/h^2 [1/s].
+    with position r, centre c and half size h. k_c has the unit of P. The requested speed
+    2 k_c f (r - c)/h^2 grows as the box shrinks. Near a wall, the distance past the wall decays
+    at the rate 4 k_c/h^2 [1/s].
 
     Far from a small box this pull grows with the cube of the distance. The axis with the
     largest offset then dominates, and a cap on the twist leaves almost nothing for rotation.
@@ -163,15 +166,17 @@ class OrientationRegion(_Cone):
     rotation, so p and -p are the same orientation.
 
     The gradient suits the geometric Jacobian: it is the derivative of P with respect to a small
-    rotation of the end effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis
-    n of the error. `formulation="paper"` is alpha_o k_o max(0, f) phi n, as printed in the
-    paper (orient_diff_potential); it has the same direction and 2 phi times the length.
+    rotation of the end effector about the base axes. It equals k_o max(0, f) (alpha_o/2) n with
+    the axis n of the error. With `formulation="paper"`, it is alpha_o k_o max(0, f) phi n, as
+    printed in the paper (orient_diff_potential). The direction is the same, and the length is
+    2 phi times as large.
 
     With `coordinates="rotation_vector"` the gradient suits the analytic Jacobian: it is the
-    derivative of P with respect to the rotation vector of x, J_l^T times the gradient above.
-    `formulation="paper"` is then twice this derivative: it equals the printed chain
-    (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever the chain's divisions by the
-    components of both quaternions are defined.
+    derivative of P with respect to the rotation vector of x. It equals J_l^T times the gradient
+    above, with the left Jacobian J_l of rotations. With `formulation="paper"`, it is twice this
+    derivative. This is the product of the printed derivatives (PartialV2Quat) and
+    (JacobianQuatAngAxisDetailed) wherever their divisions by components of quaternions are
+    defined.
     """
 
     formulation: Literal["exact", "paper"] = static("exact")
@@ -209,7 +214,7 @@ class AxisRegion(_Cone):
     f and P are those of `OrientationRegion` for the angle phi between both axes. The gradient
     is the derivative of P with respect to a small rotation of the end effector about the base
     axes. It is perpendicular to both z axes, so it requests no rotation about them. If the
-    two z axes are opposite, it lies along the axis of the rotation from goal to x.
+    two z axes are opposite, the gradient lies along the axis of the rotation from goal to x.
     """
 
     def feedback(
@@ -249,9 +254,9 @@ class VisionRegion(Region):
     f = ((u - u_d) / b_1)^2 + ((v - v_d) / b_2)^2 - 1                    (eq_vision_re_func)
     P = k_v/2 (1 - min(0, f)^2)                                          (eq_vision_p)
 
-    This pull is zero at the target and at the edge of the ellipse, and therefore weak near
-    both. `formulation="saturated"` has the same pull close to the target and a nearly constant
-    pull further out, anywhere in the image:
+    The pull, the gradient of P, is zero at the target and at the edge of the ellipse, and
+    therefore weak near both. `formulation="saturated"` has the same pull close to the target
+    and a nearly constant pull further out, anywhere in the image:
 
     P = 2 k_v s^2 (sqrt(1 + rho^2/s^2) - 1),   rho^2 = f + 1,   s = 1/2
 
