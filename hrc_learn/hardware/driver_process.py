@@ -253,7 +253,7 @@ def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iter
             while servoing():
                 arm.command(runner.step())
 
-    SIGTERM and SIGHUP end the block as `SystemExit` with status 128 + number, SIGINT as
+    SIGTERM and SIGHUP end the block as `SystemExit` with status 128 + signal number, SIGINT as
     `KeyboardInterrupt`; further signals have no effect until the arm is at rest. An ignored
     signal stays ignored. Outside the main thread, signals are not handled.
 
@@ -286,9 +286,9 @@ def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iter
         for number, handler in before.items():
             signal.signal(number, handler)
         if not stopped:
-            print(f"the arm could not be stopped for {patience:g} s", file=sys.stderr)
+            print(f"the arm could not be stopped within {patience:g} s", file=sys.stderr)
     if not stopped:
-        raise RuntimeError(f"the arm could not be stopped for {patience:g} s.")
+        raise RuntimeError(f"the arm could not be stopped within {patience:g} s.")
 
 
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> dict[int, Any]:
@@ -391,7 +391,7 @@ class ArmProcess:
         """
         try:
             if not self._driver.call("close", timeout=_PATIENCE + self._timeout):
-                raise WatchdogError(f"the arm could not be stopped for {_PATIENCE:g} s.")
+                raise WatchdogError(f"the arm could not be stopped within {_PATIENCE:g} s.")
         finally:
             self._driver.end(self._timeout + 1.0)
 

@@ -95,7 +95,7 @@ class FrankaArm(Connected):
         """
         if len(chain.joint_names) != JOINTS:
             joints = len(chain.joint_names)
-            raise ValueError(f"a Franka arm has {JOINTS} joints, but the chain {joints}.")
+            raise ValueError(f"a Franka arm has {JOINTS} joints, but the chain has {joints}.")
         self._config = config = config or FrankaConfig()
         self._names, limits = chain.joint_names, chain.limits
         self._rest = config.rest_timeout(limits.velocity, limits.acceleration, limits.jerk)
@@ -160,7 +160,7 @@ class FrankaArm(Connected):
         """Set the joint velocities to hold [rad/s].
 
         Raises:
-            ValueError: They are not seven finite numbers.
+            ValueError: The velocities are not seven finite numbers.
             DriverError: The arm has been stopped; `recover` makes it move again.
         """
         # No limit here: the loop's filter enforces the limits.

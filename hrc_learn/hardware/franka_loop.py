@@ -396,7 +396,7 @@ def _explained(error: Exception) -> str:
         "ControlException": "Make sure that nothing touches the arm, then call recover().",
         "CommandException": "Release the stop button and the brakes in Desk, activate FCI, "
         "then call recover().",
-        "NetworkException": "The connection has gone: check cable and power, then call "
+        "NetworkException": "The connection is lost: check cable and power, then call "
         "recover(), which connects again.",
     }.get(kind, "Call recover() to try again.")
     return f"{kind}: {error} The arm is stopped by its control box. {advice}"

@@ -23,7 +23,7 @@ class Load:
     """A load on the flange, in addition to the end effector that the arm is configured for."""
 
     mass: float = 0.0
-    """[kg]"""
+    """Mass [kg]."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Centre of mass, in the flange's frame [m]."""
     inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
@@ -68,7 +68,7 @@ class CollisionConfig:
 
 
 class RealtimeError(RuntimeError):
-    """The machine has no real-time scheduling, and it is required."""
+    """The machine lacks real-time scheduling, which is required."""
 
     def __init__(self, why: str):
         """Append the remedy to the reason."""
@@ -106,7 +106,8 @@ class FrankyConfig:
         """Timeout for coming to rest from the highest velocities [s].
 
         Args:
-            limits: Velocities, accelerations and jerks of the joints, before `dynamics`.
+            limits: Limits of velocity, acceleration and jerk of the joints, before they are
+                scaled by `dynamics`.
         """
         velocity, acceleration, jerk = map(np.asarray, limits)
         braking = velocity / (self.dynamics * acceleration) + acceleration / jerk
@@ -149,8 +150,8 @@ class FrankaConfig(FrankyConfig):
     no answer is ever late, and each state is answered.
     """
     compiled: bool = True
-    """True compiles the step, once per machine, in a minute or two. An uncompiled step takes a
-    whole cycle on a busy machine: use it for simulators only.
+    """True compiles the step once per machine, which takes a minute or two. An uncompiled step
+    takes a whole cycle on a busy machine: use it for simulators only.
     """
     gripper: bool = True
     """True if a gripper is mounted."""

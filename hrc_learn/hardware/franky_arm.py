@@ -99,7 +99,7 @@ class FrankyArm(Connected):
         """Set the joint velocities to hold [rad/s].
 
         Raises:
-            ValueError: They are not finite, or beyond the driver's limits.
+            ValueError: The velocities are not finite, or beyond the driver's limits.
             ArmFaultError: The arm has stopped, or the motion of an earlier command has failed.
         """
         velocity = checked_velocity(joint_velocity, _JOINTS, self._fastest)

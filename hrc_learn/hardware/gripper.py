@@ -16,8 +16,8 @@ from hrc_learn.hardware.driver_process import (
 )
 
 _NARROW = 0.005
-"""Opening below which a request squeezes, and change below which a new request is ignored [m].
-A typical object is ten times as wide."""
+"""Opening below which the fingers squeeze, and change of the opening below which a new request
+is ignored [m]. A typical object is ten times as wide."""
 _BETWEEN_READINGS = 0.02
 """Period of the width readings [s]: fingers at 0.1 m/s move 2 mm per period, and skills act on
 motions of millimetres.

@@ -153,7 +153,8 @@ class LeRobotArm(Connected):
         """Set the joint velocities to hold [rad/s].
 
         Raises:
-            ValueError: They are not finite, or beyond the limits of the arm's description.
+            ValueError: The velocities are not finite, or beyond the limits of the arm's
+                description.
             ArmFaultError: The arm has stopped, or its bus is silent.
         """
         velocity = checked_velocity(joint_velocity, self._names, self._fastest)
@@ -249,7 +250,7 @@ class LeRobotArm(Connected):
             self._width = share * self.config.opening
 
     def _alarm(self) -> str:
-        """Fault that a servo reports; empty without one."""
+        """Fault that a servo reports; empty if there is none."""
         alarms = self.units.alarms(self._robot)
         for _ in range(_CONFIRMED):
             if not any(alarms.values()):

@@ -97,14 +97,16 @@ class ArmServer:
         return self.world.time - (self._sent - 1) * CYCLE
 
     def begin(self) -> None:
-        """Count the time of `advance` from now on, so that connecting does not count."""
+        """Count the time of `advance` from now on, so that the time for connecting is left
+        out.
+        """
         self._due = self.world.time
 
     def advance(self, duration: float) -> None:
         """Advance the world until `duration` after the end of the previous call [s].
 
-        World time that passed during driver calls in between counts, as in a loop with a fixed
-        rate.
+        World time that passed during driver calls in between is a part of this duration, as in
+        a loop with a fixed rate.
 
         Raises:
             PhysicsError: The simulation diverged.

@@ -32,7 +32,7 @@ _CLOCK_RESET = 1.0
 step means that the message was reordered, unless no newer message comes for `silence`."""
 _DRIFT = 5e-4
 """Fastest drift of the robot's clock against this machine's [s/s]: NTP slews a clock by 500 ppm
-at most. A difference that grows faster is a delay of the messages, unless the clock is that of
+at most. A difference that grows faster is a delay of the messages, unless the clock belongs to
 a simulator (topic /clock), which may be slower than real time."""
 
 
@@ -91,7 +91,7 @@ class Ros2Arm(Connected):
     are ignored; once the newest joint state or the newest wrench is older than `silence`,
     `read` and `command` raise `ArmFaultError` until a new one arrives. If this process dies, a
     trajectory ends at rest by itself, and a position is held. A velocity controller would hold
-    its last command for ever. In that case, a guard in a separate process therefore sends zero
+    its last command for ever: for this interface, a guard in a separate process then sends zero
     velocities.
 
     Attributes:
@@ -267,7 +267,8 @@ class Ros2Arm(Connected):
         """Set the joint velocities to hold [rad/s].
 
         Raises:
-            ValueError: They are not finite, or beyond the limits of the arm's description.
+            ValueError: The velocities are not finite, or beyond the limits of the arm's
+                description.
             ArmFaultError: The joint states are too old.
         """
         fastest = self._chain.limits.velocity.numpy()

@@ -57,8 +57,8 @@ class ControllerNode:
         session: The node.
         stopped: Reason of the last stop; empty while active.
         commands: Number of commands so far.
-        latencies: Times from the arrival of a joint state to its command [s], of the newest
-            100,000 commands.
+        latencies: Time from the arrival of a joint state to its command [s], for each of the
+            newest 100,000 commands.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class ControllerNode:
         self._heard = self._shown = self._diagnosed = self._pushed = self._last = 0.0
         self._taken = 0.0  # time of the joint state at the newest feature's exposure [s]
         self._states = deque[tuple[float, np.ndarray]](maxlen=_HISTORY)
-        self._path = deque[Any](maxlen=_PATH)  # messages: making them anew would cost 5 us each
+        self._path = deque[Any](maxlen=_PATH)  # messages: creating them costs 5 us each
         stages = ManagedEntity()
         for stage in ("configure", "activate", "deactivate", "cleanup", "shutdown"):
             setattr(stages, f"on_{stage}", self._transition(getattr(self, stage)))
@@ -125,7 +125,9 @@ class ControllerNode:
         return self.node.get_parameter(name).value
 
     def _connect(self) -> None:
-        """Subscribe to the topics of tasks and people, and publish topics for monitors."""
+        """Subscribe to the topics of goals, images, pushes and heartbeats, and create the
+        publishers for monitoring.
+        """
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PointStamped, PoseStamped
         from sensor_msgs.msg import CompressedImage, Image

@@ -58,7 +58,7 @@ class Ros2Session:
         from rclpy.signals import SignalHandlerOptions
 
         self._context = rclpy.Context()
-        # Signals belong to the program: it brings the arm to rest first.
+        # The program handles signals itself: it brings the arm to rest first.
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = (make or rclpy.create_node)(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -132,7 +132,7 @@ def found_description(name: str) -> str:
 
 
 def stamp_of(message: Any) -> float:
-    """Time in the header of a message [s]; 0 without one."""
+    """Time in the header of a message [s]; 0 if there is none."""
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
@@ -151,7 +151,8 @@ def start_guard(topic: str, joints: int, timeout: float, controllers: int) -> su
     """
     numbers = map(str, (joints, timeout, controllers, os.getpid()))
     words = [sys.executable, str(Path(__file__)), topic, *numbers]
-    # In a session of its own: a closed terminal or Ctrl-C must not end it before the commander.
+    # In a separate session: a closed terminal or Ctrl-C must not end the guard before the
+    # commanding process.
     process = subprocess.Popen(words, stdout=subprocess.PIPE, start_new_session=True)
     assert process.stdout is not None
     if not process.stdout.readline():
@@ -178,7 +179,8 @@ def guard_velocities(
     session.node.create_subscription(Float64MultiArray, topic, take, quality(reliable=True))
     zeros = session.node.create_publisher(Float64MultiArray, topic, quality(reliable=True))
     end = time.monotonic() + _STARTUP
-    # Both counts include this process; the others are the controllers and the commander.
+    # Both counts include this process; the others are the controllers and the commanding
+    # process.
     while (
         zeros.get_subscription_count() < controllers + 1
         or session.node.count_publishers(topic) < 2
@@ -203,6 +205,6 @@ def guard_velocities(
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends after its commander
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends after the commanding process
     topic, joints, timeout, *numbers = sys.argv[1:]
     guard_velocities(topic, int(joints), float(timeout), *map(int, numbers))

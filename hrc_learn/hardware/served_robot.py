@@ -60,7 +60,8 @@ class ServedRobot(BaseRobot):
         if not has_new_command:
             target_dq = self.velocity
         super().joint_velocity_control(target_dq, has_new_command)
-        # franky-sim reports a smoothed acceleration, a control box the commanded one.
+        # franky-sim reports a smoothed acceleration, but a control box reports the commanded
+        # one.
         self._tracked_state_components["ddq_d"].set(
             vars(self)["_BaseRobot__t"], (self.velocity - self._last) / CYCLE
         )

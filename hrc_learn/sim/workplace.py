@@ -208,7 +208,7 @@ class Workplace:
         return _vector(*self.table_centre, highest / 2), half
 
     def arm_clearance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
-        """Smaller one of the two `arm_clearances` [m].
+        """Smaller of the two `arm_clearances` [m].
 
         Args:
             q: Joint position [rad].

@@ -158,11 +158,11 @@ def test_an_arm_that_cannot_be_opened_or_stopped_says_so(monkeypatch):
         with pytest.raises(ValueError, match="timeout must be positive"):
             ArmProcess(Arm, timeout=timeout)
     monkeypatch.setattr(driver_process, "bring_to_rest", lambda stop, patience: False)
-    with pytest.raises(WatchdogError, match="the arm could not be stopped for 60 s"):
+    with pytest.raises(WatchdogError, match="the arm could not be stopped within 60 s"):
         ArmProcess(Arm, timeout=PATIENCE).close()
     with pytest.raises(KeyError, match="another") as raised:
         fails_within(ArmProcess(Arm, timeout=PATIENCE))
-    assert raised.value.__notes__ == ["the arm could not be stopped for 60 s."]
+    assert raised.value.__notes__ == ["the arm could not be stopped within 60 s."]
 
 
 def fails_within(device):
@@ -234,11 +234,11 @@ def test_an_arm_that_cannot_be_stopped_is_an_error_unless_there_is_another(monke
             if error is not None:
                 raise error
 
-    with pytest.raises(RuntimeError, match=r"the arm could not be stopped for 3 s\."):
+    with pytest.raises(RuntimeError, match=r"the arm could not be stopped within 3 s\."):
         run()
     with pytest.raises(KeyError):
         run(KeyError("a bug"))
-    assert capsys.readouterr().err.count("could not be stopped for 3 s") == 2
+    assert capsys.readouterr().err.count("could not be stopped within 3 s") == 2
 
 
 def test_velocities_are_checked_by_joint_and_rounding_is_cut():
