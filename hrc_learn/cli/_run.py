@@ -57,10 +57,10 @@ EXTRAS = {library: extra for extra, names in _LIBRARIES.items() for library in n
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
     """Parse the command line into the dataclass `args`, call `main` with it, and exit.
 
-    `main` returns the exit status, None for 0. A ValueError, or a file that is missing, already
-    exists or may not be used, is the caller's mistake: status 2 and one line on stderr. If a
-    library is not installed, the line names the extra that installs it, with status 1. Other
-    exceptions show their traceback.
+    `main` returns the exit status, None for 0. A ValueError is the caller's mistake, and so is
+    a file that is missing, already exists or may not be used: one line is printed on stderr,
+    and the status is 2. If a library is not installed, the line names the extra that installs
+    it, and the status is 1. Other exceptions show their traceback.
     """
     words, program = sys.argv[1:], Path(sys.argv[0]).name
     description = (sys.modules[main.__module__].__doc__ or main.__doc__ or "").strip() or None

@@ -291,7 +291,7 @@ class Show(Measured):
     web: bool = False
     """Show it in the browser until Ctrl-C. This is the default without a screen."""
     episodes: tuple[int, ...] = ()
-    """Episodes to show. Default: all, but at most 200 or a million frames."""
+    """Episodes to show. Default: all, but at most 200 episodes or a million frames."""
     robot: str = ""
     """Arm to draw, given as in `hrc demo`. Default: the arm of the dataset's robot type."""
 
@@ -553,8 +553,8 @@ class WithDriver(WithRobot):
             simulated_only: Options that only the simulated work cell has.
 
         Raises:
-            ValueError: An address without a driver, a driver without an address, or an option
-                of the simulated work cell.
+            ValueError: There is an address without a driver, a driver without an address, or an
+                option of the simulated work cell for a real arm.
         """
         if self.arm in ("lerobot", "ros2"):
             text = "is for Franka arms: use --robot.port for LeRobot, ROS_DOMAIN_ID for ROS 2"
@@ -586,10 +586,10 @@ class WithImperfections(Measured):
 class Demo(WithImperfections, WithRobot, Written):
     """Run the whole job in simulation: demonstrate, learn, grasp, place.
 
-    Records demonstrations, fits a movement primitive and an image Jacobian, then grasps a box
-    with an uncalibrated camera while a scripted person pulls the elbow aside, and places it on
-    a shelf. Demonstrations and models in the folder are kept if they are up to date. Exit
-    status 1 if the job failed or a target was missed.
+    Records demonstrations, and fits a movement primitive and an image Jacobian to them. Then
+    grasps a box with an uncalibrated camera while a scripted person pulls the elbow aside, and
+    places the box on a shelf. Demonstrations and models in the folder are kept if they are up
+    to date. Exit status 1 if the job failed or a target was missed.
     """
 
     out: Path = Path("outputs/demo")
@@ -638,7 +638,8 @@ class Run(WithImperfections, WithDriver, Written):
     shelf: tuple[Shelf, ...] = ("middle",)
     """Shelf for the object. With two or three shelves, one object is placed on each."""
     pulls: Literal["scripted", "random", "none"] = "scripted"
-    """Pulls at the elbow: while the arm waits for a pull, at random moments, or never."""
+    """Pulls at the elbow. scripted: while the arm waits for a pull. random: at random moments.
+    none: never."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     worker: bool = False

@@ -1,6 +1,7 @@
 """`hrc demo` and `hrc run`: the whole job including the learning, and the experiments.
 
-If no model is given, an experiment uses that of `hrc demo`, learned first if it is missing.
+If no model is given, an experiment uses the model of `hrc demo`, which is learned first if it
+is missing.
 """
 
 import hashlib
@@ -70,7 +71,7 @@ def run(args: Run) -> int:
     is_real = args.drives_real_arm(_SIMULATED)
     if args.experiment == "placing":
         if not is_real:
-            refuse_given(args, ["shelf"], "is for a real arm here: all shelves are simulated")
+            refuse_given(args, ["shelf"], "of placing is for a real arm: all are simulated")
         elif len(args.shelf) != 1:
             raise ValueError("hrc run placing places one object: give one --shelf")
     if args.arm == "lerobot":
@@ -192,7 +193,7 @@ def _models(args: Run) -> dict[str, Path]:
                 f"by `hrc demo --robot {args.robot} --out FOLDER`, and name them as options."
             )
         console = Console()
-        console.print(f"note: no model is given or found in {MODELS}: it is learned first")
+        console.print(f"note: no model is given or found in {MODELS}: models are learned first")
         learn(MODELS, console, markerless=args.markerless)
     return {k: (getattr(args, k) or v).resolve() for k, v in needed.items()}
 
@@ -285,7 +286,9 @@ def _digest(folder: Path, pattern: str = "*") -> str:
 def _learning_steps(
     out: Path, robot: WithRobot, markerless: bool
 ) -> Iterator[tuple[str, Callable[[], object], list[Path]]]:
-    """Title and work of each step, the folders that it reads, and last the folder it writes."""
+    """Title and work of each step, and its folders: those that it reads, then the one that it
+    writes.
+    """
     from hrc_learn.cli.fit_command import fit_primitives
     from hrc_learn.cli.image_jacobian_commands import fit_image_jacobian
     from hrc_learn.cli.record_command import record

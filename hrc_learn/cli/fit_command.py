@@ -138,7 +138,7 @@ def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
 def open_moving(
     dataset: Path, episodes: Sequence[int], **options: Any
 ) -> tuple[DemonstrationSource, list[str]]:
-    """Demonstrations of the given episodes, or of all that have two frames at least.
+    """Demonstrations of the given episodes, or of all episodes with at least two frames.
 
     Args:
         dataset: Folder of the dataset.

@@ -104,7 +104,7 @@ def multiply(args: Multiply) -> int:
     job = Multiplication(args, with_settings(args.config, Settings()))
     print(*aligned(job.segmentation.rows(job.demos[:3])), sep="\n")
     if not job.objects:
-        print("no object poses: the scene stays as shown; --config objects.NAME.columns=...")
+        print("no object poses: scenes stay as shown (--config objects.NAME.columns=...)")
     if not args.episodes:
         if file := job.config.segments:
             write_json(Path(file), job.segmentation)

@@ -170,7 +170,7 @@ def test_choices_are_those_of_the_package(alias, known):
             ("run", "grasping", "--shelf", "upper"),
             "--shelf is an option of hrc run",
         ),
-        (("run", "placing", "--shelf", "upper"), "--shelf is for a real arm here"),
+        (("run", "placing", "--shelf", "upper"), "--shelf of placing is for a real arm"),
         (
             ("record", "leader", "--out", "new", "--overwrite"),
             "hrc record placing, servoing",

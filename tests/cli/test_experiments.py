@@ -390,7 +390,7 @@ def test_models_that_are_missing_are_those_of_the_demo(
 
     assert find() == {k: home / k for k in needed}
     assert made == [(Path("outputs/demo"), False)]
-    assert "it is learned first" in capsys.readouterr().out
+    assert "models are learned first" in capsys.readouterr().out
     # Not learned if there are models, or if they are named.
     given = {k: tmp_path / f"my {k}" for k in needed}
     assert find(**given) == given
