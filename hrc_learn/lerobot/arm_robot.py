@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 LATE = 1.5
-"""Action periods after which an action counts as late: its time is then nearer to the next
-frame."""
+"""Action periods after which an action counts as late: from then on, its time is nearer to the
+next frame."""
 PAUSE = 2.0
 """Time without an action [s] after which there is a pause, for example between two episodes,
 and not just a late action."""
 TOLERATED = 0.02
-"""Fraction of late actions that raises no warning."""
+"""Largest fraction of late actions that causes no warning."""
 EPISODE = 1.0
 """Shortest sequence of actions that is long enough for an episode, and is therefore checked for
 motion [s]."""
@@ -271,7 +271,7 @@ class ArmRobot(Device, Robot):
 
     @property
     def person_names(self) -> tuple[str, ...]:
-        """Names of the values observed of the person."""
+        """Names of the observed values of the person's input."""
         return self._person_config.names(self.work_arm.chain)
 
     def connect(self, calibrate: bool = True) -> None:

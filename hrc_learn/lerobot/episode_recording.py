@@ -94,7 +94,7 @@ def record_expert(
         Number of episodes written after each demonstration, and True if it succeeded.
 
     Raises:
-        BusyError: Another process is recording there.
+        BusyError: Another process is recording to this folder.
         FileExistsError: There is something at `folder`.
         RuntimeError: More demonstrations fail than succeed.
     """

@@ -66,7 +66,7 @@ class PersonConfig:
     __post_init__ = check_settings
 
     def names(self, chain: SerialChain) -> tuple[str, ...]:
-        """Names of the values observed of the person."""
+        """Names of the observed values of the person's input."""
         if not self.record or self.kind == "none":
             return ()
         return (*nullspace_inputs(chain), *offsets(chain))

@@ -110,7 +110,7 @@ def test_names_may_be_missing_or_grouped(tmp_path):
 @pytest.mark.parametrize(
     ("shown", "message"),
     [
-        ([np.zeros((9, 2))], "hold still"),
+        ([np.zeros((9, 2))], "are constant"),
         ([np.arange(6.0).reshape(3, 2) ** 2], "too short"),
     ],
 )

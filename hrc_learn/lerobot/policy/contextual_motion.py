@@ -130,7 +130,7 @@ FEWEST = 4
 """Fewest demonstrations for which a regression can be distinguished from chance."""
 SMALLEST_VARIATION = 0.05
 """A context value is used only if its whitened standard deviation between demonstrations is
-larger."""
+larger than this."""
 MARGIN = 0.5
 """Contexts may lie outside the demonstrated range by this fraction of the range."""
 

@@ -118,7 +118,7 @@ class DMPPolicy(MotionPolicy):
         error = fit_closed_form(self.motion, coordinates, contexts, 1 / self._step)
         self.left_out_error = error
         logger.info(
-            "fitted %d demonstrations in closed form, error of one left out %.3f of the spread",
+            "fitted %d demonstrations in closed form, cross-validated error %.3f of the spread",
             len(demonstrations),
             error,
         )
@@ -169,7 +169,7 @@ class DMPPolicy(MotionPolicy):
     ) -> Float[Tensor, "B chunk A"]:
         """The next chunk; its first `n_action_steps` actions count as executed.
 
-        Until `reset`, each call continues where the executed actions of the last one end.
+        Until `reset`, each call continues where the executed actions of the last call end.
 
         Args:
             batch: Observations (B, ...).

@@ -46,15 +46,16 @@ UNKNOWN = 0.3
 keeps policies from relying on their own past motion regardless of observations.
 """
 VELOCITY_WEIGHT = 0.005
-"""Weight of the velocity error, in spreads per second, relative to that of the position."""
+"""Weight of the velocity error, in spreads per second, relative to the weight of the position
+error."""
 SCORE_WEIGHT = 0.1
 """Weight of the error of the plan scores, relative to the error of the plans; it is small
 because a classification learns faster."""
 SAME_WAY = 3.0
-"""Distance from which plans count as distinct, relative to the error of the nearest plan. The
-mean of closer plans is nearer to the demonstration than any of them; the mean of distinct plans
-is not a valid plan. If three plans quantise one normal distribution, they are 2.8 times their
-error apart (Max 1960, "Quantizing for minimum distortion").
+"""Smallest distance at which plans count as distinct, relative to the error of the nearest
+plan. The mean of closer plans is nearer to the demonstration than any of them; the mean of
+distinct plans is not a valid plan. If three plans quantise one normal distribution, they are
+2.8 times their error apart (Max 1960, "Quantizing for minimum distortion").
 """
 LEAST_ERROR = 1e-3
 """Smallest value of the nearest plan's error, in spreads. Without motion the error is zero, but
@@ -257,9 +258,9 @@ class MotionChunkPolicy(MotionPolicy):
     ) -> Float[Tensor, "B chunk A"]:
         """The next chunk; its first action belongs to the time of the observation.
 
-        The chunk continues the last one from its present step. The leftover actions determine
-        this step exactly; without them, it is the step nearest to the plan for the observation.
-        After `reset`, the chunk begins at the measured position.
+        The chunk continues the last chunk from its present step. Leftover actions determine
+        this step exactly; without them, the step nearest to the plan for the observation is
+        used. After `reset`, the chunk begins at the measured position.
 
         Args:
             batch: Observations (B, ...).

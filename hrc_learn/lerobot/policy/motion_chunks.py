@@ -214,7 +214,7 @@ class ChunkNetwork(nn.Module):
         for layer in (self.linear, self.plans, self.scores):
             nn.init.zeros_(layer.weight)
             nn.init.zeros_(layer.bias)
-        if n_plans > 1:  # plans that were all the same would learn the same
+        if n_plans > 1:  # identical plans would learn the same
             nn.init.normal_(self.plans.bias, std=DIFFERENCE)
 
     def forward(

@@ -42,7 +42,7 @@ def make_backbone(
     """
     if name == "small":
         if pretrained:
-            raise ValueError("vision_weights are of a ResNet: give vision_backbone as well")
+            raise ValueError("vision_weights are for a ResNet: give vision_backbone as well")
         return _small(channels)
     if name.startswith("resnet"):
         return _resnet(name, channels, pretrained)
@@ -116,7 +116,8 @@ SMALLEST_SPREAD = 1e-6
 SMALLEST_SCALE = 0.01
 """Smallest scale of a feature's values, relative to their median spread. A joint held at rest
 still varies by a thousandth of the motion of other joints, and varies differently in states
-that were not demonstrated. Amplified, this variation moved an ALOHA arm away from its cube.
+that were not demonstrated. When this variation was amplified, it moved an ALOHA arm away from
+its cube.
 """
 type Observation = Mapping[str, Any]
 """Tensors by key; LeRobot's evaluation adds other entries."""

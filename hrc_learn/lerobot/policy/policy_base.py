@@ -41,7 +41,7 @@ class MotionPolicyConfig(PreTrainedConfig):
     n_action_steps: int = 25
     """Number of actions that are executed before the next chunk is predicted."""
     vision_backbone: str = "small"
-    """Image backbone: "small", four convolutions, or a ResNet of torchvision such as
+    """Image backbone: "small" (four convolutions), or a ResNet of torchvision, such as
     "resnet18"; no weights are downloaded.
     """
     vision_weights: str | None = None
@@ -286,7 +286,7 @@ def frame_rate(config: MotionPolicyConfig, dataset_meta: Any) -> float:
     """Actions a second, from the settings or the dataset.
 
     Raises:
-        ValueError: Neither is known, or they do not agree.
+        ValueError: Neither has a frame rate, or the two do not agree.
     """
     trained, shown = config.fps, None if dataset_meta is None else float(dataset_meta.fps)
     if trained is None:

@@ -195,7 +195,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
     episodes = [np.asarray(x[ACTION], float) for _, x in read_frames(folder, entries, [ACTION])]
     velocity, acceleration, jerk = (scale * _largest(episodes, k, fps) for k in (1, 2, 3))
     if not velocity.any():
-        raise ValueError(f"the actions of {dataset} hold still: name a dataset with motions.")
+        raise ValueError(f"the actions of {dataset} are constant: name a dataset with motions.")
     # Largest second differences that rounding causes in values of constant velocity.
     rounding = 2 * np.finfo(np.float32).eps * np.abs(np.concatenate(episodes)).max(axis=0)
     steady = acceleration <= scale * fps**2 * rounding
