@@ -1,10 +1,10 @@
 """Compile a scalar program (see `scalar_program`) with LLVM, and run its machine code.
 
 For a batch, the code computes as many arms at once as a vector register holds numbers. For one
-arm, it computes successive elements of a tensor at once if their operands are successive or
-equal. The code is a sequence of short functions, so that the compile time is only proportional
-to the length of the program. A value that a later function reads is kept in a slot of the
-workspace, a small array that the caller provides.
+arm, it computes successive elements of a tensor at once if their operands are successive
+elements, too, or equal. The code is a sequence of short functions, so that the compile time is
+only proportional to the length of the program. A value that a later function reads is kept in a
+slot of the workspace, a small array that the caller provides.
 """
 
 import ctypes
@@ -40,7 +40,7 @@ _TRUTH, _INDEX = ir.IntType(1), ir.IntType(32)
 _INTRINSICS = {"abs": "fabs", "round": "roundeven"}
 
 type Unit = tuple[int, ...]
-"""Consecutive value numbers that one instruction computes."""
+"""Consecutive value numbers (see `scalar_program`) that one instruction computes."""
 
 ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.

@@ -4,7 +4,7 @@ Each element of a tensor gets a value number: the index of the instruction that 
 each tensor of the trace becomes a tensor of value numbers. PyTorch applies the operations that
 only move elements (views, slices, concatenations) to these tensors. All other operations become
 one instruction per element. Equal instructions are kept once, and instructions on constants are
-evaluated here.
+evaluated immediately.
 """
 
 import math

@@ -1,3 +1,1 @@
-"""Dashboards, figures, films and reports. Only modules that need Rerun or Matplotlib import
-it.
-"""
+"""Dashboards, figures, films and reports; Rerun and Matplotlib are imported only if needed."""

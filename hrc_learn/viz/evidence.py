@@ -22,12 +22,12 @@ class Clause:
     kept: str
     """Description of how the package meets it."""
     parameters: Sequence[Any]
-    """In the file: ends of the names of settings. On a page: these settings with their values
-    in the runs."""
+    """In `evidence.toml`: ends of the names of settings. On a page: these settings with their
+    values in the runs."""
     test: str
     """File of the test that checks it."""
     measured: Sequence[Any]
-    """In the file: names of the metrics. On a page: the measurements of each run."""
+    """In `evidence.toml`: names of the metrics. On a page: the measurements of each run."""
     outside: str
     """Part of the requirement that this package cannot meet."""
 

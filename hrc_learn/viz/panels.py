@@ -1,4 +1,4 @@
-"""Assignment of the curves of a run to plots and tabs, for both data and layout."""
+"""Assignment of a run's curves to plots and tabs, by which data are sent and layouts built."""
 
 import re
 from collections.abc import Iterable, Mapping

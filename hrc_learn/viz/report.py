@@ -209,7 +209,8 @@ def leading(
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
     """Measurements to show first, and the others, both in the order of the table.
 
-    All missed targets come first. Met targets follow, up to `count` measurements.
+    All missed targets are shown first. Met targets, then values without a target, are added up
+    to `count` measurements.
 
     Args:
         table: All measurements.
