@@ -156,7 +156,7 @@ class DatasetWriter:
         """Add one frame to the open episode.
 
         The first saved episode determines the recorded quantities; all later frames must give
-        the same ones.
+        the same quantities.
 
         Args:
             images: Camera name -> RGB image (height, width, 3), uint8.

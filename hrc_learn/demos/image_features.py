@@ -28,7 +28,8 @@ _SOURCE = b"hrc_learn.video"
 _ADVICE = "hrc fit image-jacobian --marker N searches the remaining videos"
 
 Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
-"""Function of an RGB image: pixel (u right, v down) of the feature, None if not visible."""
+"""Function that finds a feature in an RGB image: its pixel (u right, v down), or None if the
+feature is not visible."""
 
 
 Track = tuple[Float64[np.ndarray, "_frames 2"], Bool[np.ndarray, " _frames"]]

@@ -152,9 +152,10 @@ class ValidationReport:
             self.errors.append(error.issue)
 
     def attempt[T](self, read: Callable[[], T]) -> T | None:
-        """Result of a step of the check. If the step fails: None, and an error in the report.
+        """Run a step of the check; if it fails, add an error to the report and return None.
 
-        Foreign data can fail in unforeseen ways; the check reports them instead of crashing.
+        Foreign data can make a step fail in unforeseen ways. The check then reports an error
+        instead of crashing.
         """
         try:
             return read()

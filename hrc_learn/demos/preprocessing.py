@@ -344,7 +344,7 @@ def at_times(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> Demon
 
 
 def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dict[str, Any]:
-    """Fields and extra columns at other times; equal times may follow each other."""
+    """Fields and extra columns at other times, which may repeat."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     if len(demo) < 2:

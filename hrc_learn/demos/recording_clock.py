@@ -32,8 +32,9 @@ class Clock(NamedTuple):
 def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOptions) -> Clock:
     """Assign the frames of all understood or kept fields to the stamps of the state.
 
-    Slower fields hold their last value: nothing is interpolated, because a robot does not know
-    what its sensors will measure. Frames at either end are cut where a field has no value.
+    Slower fields hold their last value. Nothing is interpolated, because interpolation uses
+    later measurements, which a robot would not have yet. Frames at either end are cut where a
+    field has no value.
 
     Raises:
         DatasetError: Stamps are missing or do not increase. Or the stamps of a field have a

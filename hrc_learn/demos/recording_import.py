@@ -28,7 +28,7 @@ _BATCH = 32
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """One recording, at the stamps of its state."""
+    """One recording, at the stamps of its state (see `recording_clock`)."""
 
     demonstration: Demonstration
     images: dict[str, tuple[Field, Int64[np.ndarray, " _frames"]]] = field(default_factory=dict)

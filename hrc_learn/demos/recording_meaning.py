@@ -129,7 +129,7 @@ def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
 
 
 def _shapes(recording: Recording, names: Sequence[str]) -> list[str]:
-    """Names of the existing fields, with the number of components of fields of numbers."""
+    """Names of the existing fields; fields of numbers with their number of components."""
     fields = ((name, recording.fields[name]) for name in names if name in recording.fields)
     return [f"{n} ({one.width})" if one.kind == "number" else n for n, one in fields]
 
@@ -322,7 +322,7 @@ def _decide_units(
 
 
 def _gripper_among(first: Recording, joints: ColumnSelection) -> list[str]:
-    """One question if the last columns are unnamed and behave like a gripper; else none."""
+    """One question, in a list, if the last columns are unnamed and behave like a gripper."""
     values = read_columns(first, joints.columns)
     if len(values) < 2:
         return []

@@ -32,7 +32,8 @@ TOOL = re.compile(
 _BASE = re.compile(r"(?:^|[/_])base(?:_link)?$|link_?0$", re.IGNORECASE)
 
 type Messages = Callable[..., Iterator[tuple[str, int, Any]]]
-"""Function of topics and the first time [ns]; yields topic, time of reception [ns], message."""
+"""Function that takes topics and the first time [ns]; it yields topic, time of reception [ns]
+and message."""
 
 
 @dataclass
@@ -108,7 +109,7 @@ def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
 
 
 def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
-    """Poses of tools and of frames without children in the base frame, from `/tf` topics.
+    """Poses, in the base frame, of tools and of frames without children, from `/tf` topics.
 
     A time is left out if a frame between base and tool has been silent for too long.
     """

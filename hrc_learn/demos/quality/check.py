@@ -88,7 +88,8 @@ def check_dataset(
         return report
     for check in METADATA_CHECKS:
         report.run(check, folder)
-    # A wrong mapping is raised. A faulty sidecar is reported, and columns are found by name.
+    # Errors in the mapping are raised. A faulty sidecar is reported, and columns are found by
+    # name.
     columns = map_columns(folder.features, mapping)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
     dataset = dataset or OpenedDataset(folder=folder, columns=columns)
@@ -106,6 +107,7 @@ def _first_pass(
 ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
     """Run the checks that need no units, and yield the quantities of the sound episodes.
 
+    An episode is sound if it has all columns of the quantities and all values are finite.
     Appends the profiles of all episodes to `profiles`, and the sound episodes to `sound`.
     """
     folder, columns = dataset.folder, dataset.columns
@@ -204,7 +206,7 @@ def _usual_motion(
     decisions: Mapping[str, UnitDecision],
     features: Mapping[str, FeatureProfiles],
 ) -> UsualMotion:
-    """Role -> usual fast step and usual span of each joint, in SI units."""
+    """Role -> usual fast step (99 % quantile) and usual range of each joint, in SI units."""
     usual = {}
     for role in ("joint_position", "command_position"):
         selection = columns.selections.get(role)

@@ -142,7 +142,7 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
     span, usual_span = feature.stack("span"), feature.median("span")
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
     usual = np.median(ends, axis=0)
-    # Ends within a tenth of the range count as the same level.
+    # Values at start and goal within a tenth of the range count as the same level.
     near = np.abs(ends - usual) <= 0.1 * usual_span
     opposite = np.abs(ends - usual[::-1]) <= 0.1 * usual_span
     # Only components that usually change their level from start to goal.
@@ -297,7 +297,7 @@ def command_tracking(
         shift = tracking.delay - delay
         # The episode's own delay must explain far more of the motion than the usual delay.
         better = gain_over(tracking, round(delay)) > 0.8
-        # Three frames are the scatter of estimated delays.
+        # Estimated delays scatter by three frames.
         if abs(shift) > max(3, 0.1 * abs(delay)) and better and agreement > 0.5:
             text = (
                 f"the state comes {tracking.delay} frames after its command, in the other "
@@ -317,7 +317,7 @@ def command_offsets(
     features: Sequence[FeatureProfiles],
     unit: UnitDecision,
 ) -> Iterator[Issue]:
-    """Report constant offsets of states at rest from their commands, and changed offsets.
+    """Report offsets between commands and resting states, and episodes with unusual offsets.
 
     Different calibrations of a leader and its follower cause such offsets.
 

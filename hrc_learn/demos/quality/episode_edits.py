@@ -29,8 +29,8 @@ _RESTING = 0.01
 """Largest change of a value at rest, relative to its range; more than the noise of encoders."""
 _MEASURED_ANGLES = ("joint_position", "euler_xyz", "euler_intrinsic_xyz")
 _LARGEST_REMAINDER = 0.3 / (2 * np.pi)
-"""Largest difference between a jump and a whole number of turns [turns]: the joint also moves
-from one frame to the next."""
+"""Largest difference between a jump and a whole number of turns [turns]. There is a difference
+because the joint also moves from one frame to the next."""
 _NEIGHBOURS = 4
 """Number of steps before and after a jump from which the speed of a joint is estimated."""
 _SMOOTH = ("joint_position", "joint_velocity", "position")

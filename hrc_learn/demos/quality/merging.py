@@ -220,7 +220,7 @@ class _Merge:
             own.steps & other.steps & own.guessed
             and 0.7 < np.divide(other.factor, own.factor) < 1.4
         ):
-            return 1.0  # two estimates of the same scale
+            return 1.0  # two guesses of one factor, from different data
         for asked, decision in ((self.first, own), (source, other)):
             if decision.doubt:
                 advice = f"hrc check {asked.root} --units {decision.role} UNIT --keep-contract"

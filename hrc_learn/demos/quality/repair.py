@@ -134,9 +134,9 @@ def repair_dataset(
 
     The old dataset is not changed. If LeRobot's recorder was killed, the episodes that it had
     saved are recovered first. Columns keep their keys, names and units. The new
-    `timestamp` is frame / fps by definition. If no column holds true stamps, the old stamps are
-    added as `time`, provided that they differ from frame / fps or frames may be dropped in the
-    middle.
+    `timestamp` is frame / fps by definition. If no column holds measured times (true stamps),
+    the old stamps may be needed. They are added as `time` if they differ from frame / fps, or
+    if frames may be dropped in the middle.
 
     Args:
         path: The dataset to repair.

@@ -443,8 +443,8 @@ def _align_joints(
     """Bring all quantities with one column per joint into the order of the first such quantity.
 
     Returns:
-        Joint names, selections in this order, and role -> joints for quantities with other
-        joints.
+        Joint names; selections in the order of these names; and, for quantities with other
+        joints, role -> joints.
     """
     joints = [found[role] for role in JOINT_FIELDS if role in found]
     if not joints:

@@ -305,7 +305,7 @@ def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
 
 
 Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
-"""Wrapper of a sequence of episodes, such as a progress bar."""
+"""Function that wraps a sequence of episodes, such as in a progress bar."""
 EpisodeFilter = Callable[[EpisodeEntry], bool]
 """Condition on an episode's `index`, `length` and `tasks`, true if the episode is wanted."""
 

@@ -1,4 +1,4 @@
-"""Joint positions compared with the recorded pose of the end effector by forward kinematics.
+"""Comparison of joint positions with recorded end-effector positions, by forward kinematics.
 
 The forward kinematics of a known arm give the recorded positions only if the unit, order, signs
 and zeros of the recorded joints are right. The positions of base and tool need not be known.
@@ -38,11 +38,11 @@ class Agreement:
 
     unit: str
     residual: float
-    """Root mean square distance [m]."""
+    """Root mean square distance between computed and recorded positions [m]."""
     other: float
     """Residual of the unchanged joints, read in rad or in deg, whichever fits better [m]."""
     change: str = ""
-    """Difference of signs or order from the recorded joints, in words."""
+    """Change of signs or order that the recorded joints need, in words; "" if none."""
 
 
 def arm_columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
@@ -119,7 +119,7 @@ def _changes(
 def residual(
     arm: Arm, q: Float64[np.ndarray, "frames joints"], position: Float64[np.ndarray, "frames 3"]
 ) -> float:
-    """Root mean square distance of the positions from forward kinematics [m].
+    """Root mean square distance between positions and forward kinematics [m].
 
     The positions of the base and of the tool on the flange are fitted.
     """

@@ -28,7 +28,7 @@ from hrc_learn.demos.read.quantities import INDEX_KEYS
 NUMERIC = ("float", "int", "uint", "bool")
 """Prefixes of the dtypes of numbers."""
 # Largest numbers of components and of axes of a numeric column. The force field of a wrist
-# sensor has some hundred components.
+# sensor has several hundred components.
 _WIDEST, _MOST_AXES = 100_000, 8
 _WORDS_BEFORE = re.compile(r"^(?:observations?|actions?)[./](?:states?[./])?")
 SIDECAR_PATH = "meta/hrc_learn.json"

@@ -74,7 +74,8 @@ class ComponentMeaning:
     """Role of one component, and its place within the role."""
 
     role: str
-    """Role; "quaternion" has an unknown order, "rotation" an unknown encoding."""
+    """Role. Two values are no keys of `quantities.ROLES`: "quaternion" is a quaternion in
+    unknown order, "rotation" an orientation in unknown encoding."""
     slot: str | int
     """Joint name, or index of the component."""
     side: str = ""

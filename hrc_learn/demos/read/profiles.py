@@ -1,6 +1,7 @@
 """Robust statistics of one episode's columns, and of how the state follows the command.
 
-No statistic depends on a single value: sizes are quantiles, delays and slopes use all frames.
+Apart from the lowest and highest value, no statistic depends on a single value: sizes are
+quantiles, delays and slopes use all frames.
 The contract (`contract`) and the consistency checks (`quality.consistency_checks`) compare
 these profiles over episodes.
 """
@@ -137,7 +138,7 @@ def profile_columns(
 
 
 def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
-    # Five frames suppress single glitches and are still at rest.
+    # In its first and last five frames, an arm usually rests. Their median suppresses glitches.
     few = max(1, min(5, len(values) // 4))
     # One sort gives the quantiles and the number of distinct values.
     ordered = np.sort(values, axis=0)
@@ -301,8 +302,8 @@ def _correlations(
 ) -> Float64[np.ndarray, "delays components"]:
     """Correlation of state(t) with command(t - delay), for delays from -reach to reach.
 
-    The same frames of the state are used for each delay; the correlation is 0 if the command
-    rests in its window.
+    For each delay, the same frames of the state are compared with a window of the command. The
+    correlation is 0 if the command rests in this window.
     """
     inner = len(state) - 2 * reach
     # Scaled to mean 0 and variance 1; 0 where nothing moves.

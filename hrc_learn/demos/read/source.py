@@ -60,7 +60,7 @@ class OpenedDataset:
     columns: ColumnMapping
     sidecar: Sidecar = field(default_factory=Sidecar)
     own_feature: bool = False
-    """True if the image feature is a column of the dataset, or the mapping decides on it."""
+    """True if the image feature is a column of the dataset, or has an entry in the mapping."""
     robot: Arm | None = None
     """Arm that the caller names; None for the arm of the dataset's robot type."""
 
@@ -164,7 +164,9 @@ class OpenedDataset:
         given: Mapping[str, str],
         sample: Collection[int] | None = None,
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
-        """Decide on units as `units_from_episodes` does, and find commands that are changes."""
+        """Decide on units by `units_from_episodes`, and find commands that are changes per
+        step.
+        """
         fps, trackings, poses = self.folder.fps, [], []
         asked = _COMMAND in self.columns.selections.keys() - {*self.declared_units, *given}
 

@@ -24,7 +24,7 @@ ASSUMED = 0.95
 _BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES.items()}
 """Quantity -> unit -> largest value, with an allowance for noise."""
 # Largest joint angles in rad and in deg. Wrists may turn more than once, so that the bound in
-# rad is about two turns, 13 rad. No demonstration in degrees stays within 13 degrees.
+# rad is two turns, 12.6 rad. No demonstration in degrees stays within 13 degrees.
 _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
@@ -33,8 +33,8 @@ STEP_IN_DEGREES = 360 / 4095
 _ENCODERS = (("deg", STEP_IN_DEGREES), ("deg", 360 / 4096), ("rad", math.tau / 4096))
 _FEWEST_STEPS, _FEWEST_ENCODERS = 10, 3
 _RANGED = (0.045, 0.2)
-"""Bounds of one encoder step in values from -100 to 100, for an encoder of 4096 steps a turn
-and joint ranges from a whole turn to a quarter turn."""
+"""Smallest and largest encoder step in values from -100 to 100, for an encoder of 4096 steps a
+turn and joint ranges from a whole turn to a quarter turn."""
 _DYNAMIXEL = re.compile("koch|omx|aloha|widowx|viperx", re.IGNORECASE)
 """Robot types with Dynamixel motors, which apply `drive_mode` themselves. For motors of other
 makers, LeRobot changes the sign of the values."""

@@ -102,8 +102,10 @@ class UnitDecision:
 
     @property
     def si_unit(self) -> str:
-        """Unit after the conversion: that of the quantity, "1" for a fraction of a range ("1/s"
-        for its rate), or "rad" for a gripper that is measured as an angle.
+        """Unit after the conversion.
+
+        This is the SI unit of the quantity, except for fractions of a range ("1", and "1/s" for
+        their rates) and for a gripper that is measured as an angle ("rad").
         """
         own, unit = ROLES[self.role].unit, self.unit.removesuffix("/s")
         if unit in DIMENSIONS["ratio"]:
@@ -114,7 +116,7 @@ class UnitDecision:
 
     @property
     def plain(self) -> "UnitDecision":
-        """The decision without the factors in its units: deg for 1.1 deg."""
+        """The decision without the factors in its units: deg instead of 1.1 deg."""
         units = [re.sub(_SCALED, r"\2\3", unit, count=1) for unit in self.units or (self.unit,)]
         return replace(self, unit=units[0], units=tuple(units) if len({*units}) > 1 else ())
 
@@ -325,7 +327,7 @@ def units_from_episodes(
     sample: Collection[int] | None = None,
     robot_type: str = "",
 ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
-    """Unit of each quantity, from the size of its values where it must be guessed.
+    """Unit of each quantity, guessed from the size of its values where nothing states the unit.
 
     The size of a component is the median of its peaks in all episodes, so that no single frame
     or episode decides.
@@ -407,7 +409,8 @@ def _require_declared(declared: Mapping[str, str | Sequence[str]]) -> None:
 
 _DEGREES = math.log(180 / math.pi)
 _NEAR = math.log(2.5)
-"""Logarithmic distance from the factor 57.3 within which sizes indicate degrees."""
+"""Largest distance of log(ratio of sizes) from log(57.3) that indicates degrees among radians,
+or radians among degrees."""
 
 
 def _contradictions(
