@@ -22,8 +22,8 @@ CHANNELS = ("joint", "pose", "position")
 _RAD = {"rad": 1.0, "deg": math.pi / 180}
 """Radians per unit, for joint units of a fixed size."""
 _SAME_TOOL = 0.02
-"""Largest distance between the start of the model's pose primitive and the arm's tool at the
-start of the model's joint primitive [m]."""
+"""Largest distance [m] between two positions of the tool: the start of the model's pose
+primitive, and the tool of the arm at the start of the model's joint primitive."""
 KINDS = "joints", "position", "pose"
 """Kinds of goals."""
 
@@ -46,7 +46,7 @@ class FittedModel:
 
     folder: Path
     primitives: Mapping[str, Primitive]
-    """Common primitives by channel."""
+    """Common primitive of all demonstrations, by channel."""
 
     @classmethod
     def load(cls, folder: Path) -> FittedModel:

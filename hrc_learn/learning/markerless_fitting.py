@@ -73,7 +73,7 @@ _SHORTEST, _STILL, _TRIED, _ENOUGH, _AGREES = 10, 20.0, 12, 150, 4.0
 _CLOSER = (8.0, 4.0, 2.0)
 # Largest distance of a tool point from the origin of its link [m].
 _NEAR = 0.35
-# Least number of frames, over all demonstrations, in which the finished tool is searched for
+# Least number of frames, over all demonstrations, in which the fitted tool is searched for
 # (all frames if there are fewer).
 _FOLLOWED = 320
 # Largest width of one image in the picture of the findings [px].
@@ -136,7 +136,7 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
 
     Raises:
         ValueError: The dataset has no video or no poses, nothing in the video moves like the
-            arm, or the finished tool is found in no frame.
+            arm, or the fitted tool is found in no frame.
     """
     reader = ImageReader(source.folder)
     key = camera_key(reader.cameras, camera)
@@ -214,7 +214,7 @@ class _Search:
     def follow(
         self, landmarks: Landmarks, camera: Float[Tensor, "13"]
     ) -> list[list[Finding | None]]:
-        """Find the finished tool in frames of all demonstrations.
+        """Find the fitted tool in frames of all demonstrations.
 
         Returns:
             For each demonstration, the tool in each frame. None: the tool was not found, or

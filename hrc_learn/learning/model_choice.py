@@ -82,7 +82,7 @@ def keep_best(
     Args:
         fitted: Primitives of the demonstrations.
         demos: Demonstrations.
-        columns: Columns whose first row is the context. Default: start and goal.
+        columns: Columns whose first row is the context. If empty: start and goal.
         folder: Folder of the model.
         regression_only: True to choose only among regressions on the context.
 

@@ -27,8 +27,8 @@ _DEVIATION = 2e-3
 """Largest distance of a joint from the planned path [rad]: 1 mm at a lever of 0.5 m."""
 _KINDS = "velocity", "acceleration"
 """Limits checked on the planned path; the limit of jerk is enforced by `MotionFilter`."""
-# `_SLOWER`: factor on the duration if the jerk limit distorts the path. `_ATTEMPTS`: durations
-# tried.
+# `_SLOWER`: factor on the duration if the jerk limit distorts the path. `_ATTEMPTS`: largest
+# number of durations tried.
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
 """Longest time that a motion may take to settle after the end of its path [s]."""
@@ -214,7 +214,7 @@ def _times(duration: float) -> Float[Tensor, " samples"]:
 def _joint_path(
     model: FittedModel, start: Tensor | None, goal: Tensor, duration: float
 ) -> Float[Tensor, "samples joints"]:
-    """Path of the joints from rest that the best model predicts, in the model's unit."""
+    """Joint path that the best model predicts, starting at rest, in the model's unit."""
     joint = model.joint
     assert joint is not None
     start = joint.start if start is None else start
@@ -246,7 +246,7 @@ def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration:
 
 
 def _completed(target: Target | None, usual: Pose) -> Pose:
-    """Pose of a target; position or orientation that it lacks come from the usual pose."""
+    """Pose of a target; a missing position or orientation is that of the pose `usual`."""
     if target is None or target.position is None:
         return usual
     turned = usual.orientation if target.orientation is None else target.orientation

@@ -42,8 +42,8 @@ _LEFT_OUT = ("feature", "feature_visible", "human_effort", "joint_effort", "time
 _LEVELS = 5
 # Largest distance of recorded tool positions from forward kinematics that counts as noise [m].
 _APART = 5e-3
-# `_MOVED`: distance from its first position at which an object has moved [m]. `_STILL`:
-# distance up to which it has not begun to move [m].
+# `_MOVED`: distance from its first position beyond which an object has certainly moved [m].
+# `_STILL`: distance up to which the object has not begun to move [m].
 _MOVED, _STILL = 1e-2, 1e-3
 
 
@@ -256,7 +256,7 @@ class MultipliedColumns:
     def _put_joints(
         self, made: dict[str, np.ndarray], values: Mapping[str, np.ndarray]
     ) -> None:
-        """Replace the joint columns, in place, by the values of the new arm, by role."""
+        """Replace the joint columns in place; `values` holds the new arm's values by role."""
         # Begin with the last columns: the number of joints may change, which shifts columns
         # further back.
         for role in sorted(values, key=lambda role: self._places[role][0], reverse=True):
@@ -415,7 +415,7 @@ class MultipliedColumns:
 
 
 def _departure(position: Float[torch.Tensor, "T 3"]) -> int:
-    """Last frame before an object begins to move; the last of all if it does not move."""
+    """Last frame before an object begins to move; the last frame of all if it never moves."""
     away = (position - position[0]).norm(dim=-1)
     moved = int((away > _MOVED).int().argmax())
     if not moved:

@@ -2,8 +2,8 @@
 
 Each demonstration is cut into segments where the gripper begins to move. A segment becomes a
 pose primitive in the frame in which the segment's final poses agree best over the
-demonstrations: an object's frame, a frame at the object that does not turn with the object, or
-the base frame. In a new scene, the primitives of all demonstrations are averaged with random
+demonstrations: an object's frame, a frame at the object with the base's orientation, or the
+base frame. In a new scene, the primitives of all demonstrations are averaged with random
 weights, and move with their frames. A segment begins with the final pose and velocity of the
 previous segment. While the demonstrations still differ, a minimum-jerk curve leads from this
 pose to the segment's own path.
@@ -29,15 +29,16 @@ from hrc_learn.kinematics import Arm
 from hrc_learn.kinematics.inverse import follow_poses
 
 BASE, POSITION_ONLY = "base", " position"
-"""Name of the base frame, and suffix for a frame at an object that does not turn with it."""
+"""Name of the base frame, and suffix of the frame at an object's position with the orientation
+of the base frame."""
 # Smallest number of frames of a segment: fewer do not determine a primitive.
 _SHORTEST = 6
 # `_CONSTANT`: a gripper signal counts as constant if its range is at most this fraction of its
 # largest value. `_MOVING`: the gripper moves while the change from frame to frame exceeds this
 # fraction of the range.
 _CONSTANT, _MOVING = 0.05, 0.02
-# `_LEVER`: lever that converts angles to lengths [m/rad]. `_TREMOR`: tremor of a hand [m], a
-# difference between demonstrations that does not count.
+# `_LEVER`: lever that converts angles to lengths [m/rad]. `_TREMOR`: difference between
+# demonstrations that the tremor of a hand explains, and that is ignored [m].
 _LEVER, _TREMOR = 0.1, 1e-3
 # `_PER_FUNCTION`: frames per basis function. `_FEWEST`, `_MOST`: smallest and largest number of
 # basis functions.
@@ -67,8 +68,8 @@ class Segmentation:
     """Segments of demonstrations; users may correct them in a file."""
 
     frames: tuple[str, ...]
-    """Frame of each segment: "base", an object, or "OBJECT position" for a frame at the object
-    that does not turn with it."""
+    """Frame of each segment: "base", an object, or "OBJECT position" for the frame at the
+    object's position with the orientation of the base frame."""
     cuts: dict[int, tuple[int, ...]]
     """Cuts by episode: first frame of each segment, then the last frame of the last segment."""
 
@@ -85,8 +86,8 @@ class Segmentation:
         """Check that the segments fit the demonstrations.
 
         Raises:
-            ValueError: There is no frame, a frame or an episode is unknown, or cuts are too
-                close or beyond the end of an episode.
+            ValueError: The list of frames is empty, a frame or an episode is unknown, or cuts
+                are too close or beyond the end of an episode.
         """
         for frame in self.frames or [""]:  # an empty list of frames fails, too
             if frame != BASE and frame.removesuffix(POSITION_ONLY) not in objects:
@@ -108,20 +109,21 @@ def find_segments(
     tool: Sequence[Pose],
     departures: Sequence[Sequence[int]] = (),
 ) -> Segmentation:
-    """Cut demonstrations where the gripper begins to switch, and choose the frames.
+    """Cut demonstrations where the gripper begins to open or close; choose coordinate frames.
 
-    An object that begins to move after a switch shows that the switch was a grasp. The arm may
-    still approach the object while the gripper closes, so the cut is where the object moves.
+    If an object begins to move after the gripper switches, the switch was a grasp. The arm may
+    still approach the object while the gripper closes, so the demonstration is cut where the
+    object begins to move.
 
     Args:
         demos: Demonstrations of one task.
         objects: Poses of each object at the start of each demonstration, (n).
         tool: Poses of the tool along each demonstration.
-        departures: Frames at which objects begin to move, by demonstration.
+        departures: Numbers of the frames at which objects begin to move, by demonstration.
 
     Raises:
-        ValueError: A demonstration is too short, or they differ in the number of gripper
-            switches.
+        ValueError: A demonstration is too short, or the demonstrations differ in the number of
+            gripper switches.
     """
     openings = [demo.gripper for demo in demos if demo.gripper is not None] or [np.zeros(1)]
     low, high = min(x.min() for x in openings), max(x.max() for x in openings)
@@ -181,8 +183,8 @@ def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> 
 def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
     """Name of the frame in which a segment's final poses agree over the demonstrations.
 
-    Frames whose spread is at most 1.5 times the least spread, plus the tremor, are as good as
-    the best frame. The nearest of these frames is chosen.
+    A frame counts as good if the spread of the poses in it is at most 1.5 times the least
+    spread, plus the tremor. Of all good frames, the nearest is chosen.
     """
     names = [*objects, *(f"{name}{POSITION_ONLY}" for name in objects), BASE]
     spread: dict[str, float] = {}
@@ -225,7 +227,7 @@ class Draws:
     """Displacement of the tool's initial position [m]."""
 
     def __getitem__(self, index: Tensor) -> Draws:
-        """Choices of the motions at some indices."""
+        """Choices for the motions with these indices."""
         scene = {name: pose[index] for name, pose in self.scene.items()}
         rest = {name: getattr(self, name)[index] for name in ("weights", "speed", "start")}
         return Draws(scene=scene, **rest)
@@ -267,7 +269,8 @@ class _Segment:
 
     frame: str
     dmp: PoseDMP
-    """Primitives (n), with the joint positions as body if the same arm was demonstrated."""
+    """Primitives (n). If the same arm was demonstrated, its joint positions are the body
+    coordinates of the primitives (see `PoseDMP`)."""
     first: Float[Tensor, "n"]
     last: Float[Tensor, "n"]
 
@@ -447,7 +450,7 @@ class MotionSource:
         return [made[k] for k in sorted(made)]
 
     def poses(self, draws: Draws) -> _Poses:
-        """Poses of the tool in new scenes; gradients flow to the scene."""
+        """Poses of the tool in new scenes, differentiable with respect to the scene."""
         main = draws.weights.argmax(-1)
         start = Pose(
             draws.weights @ self.start.position + draws.start, self.start[main].orientation

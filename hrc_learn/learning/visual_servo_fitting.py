@@ -57,7 +57,7 @@ def fit_visual_servo(
     Args:
         demos: Demonstrations with image features, and with end-effector poses or the joint
             positions of a Panda.
-        neurons: Neurons of the network. Default: around the demonstrated poses.
+        neurons: Neurons of the network. Default: neurons around the demonstrated poses.
         config: Noise, prior and key frames for the network, which learns the residual of the
             fitted camera.
         learning: Settings for learning neurons, noise and prior. These are not learned if
@@ -156,7 +156,7 @@ def _ends(demos: Demonstrations, *, partial: bool = False) -> list[_End]:
     """Ends of the demonstrations that show an object.
 
     Raises:
-        ValueError: Only some demonstrations show an object, without `partial`.
+        ValueError: Only some demonstrations show an object, and `partial` is False.
     """
     ends, without = [], []
     for demo in demos:
@@ -174,7 +174,7 @@ def _ends(demos: Demonstrations, *, partial: bool = False) -> list[_End]:
 def _end(demo: Demonstration, source: str) -> _End:
     """End of a demonstration, with positions and pixels averaged over the rest."""
     watched = _watched(demo, source)
-    # Columns u, v and 1 while the object is visible.
+    # The columns are u, v and a flag, which is 1 while the object is visible.
     objects = demo.extra[OBJECT_FEATURE]
     at_rest = torch.from_numpy((demo.time > demo.time[-1] - _REST) & (objects[:, 2] > 0))
     last = (watched.visible & at_rest).nonzero()[:, 0]

@@ -306,7 +306,7 @@ def wood_grain(rng: np.random.Generator) -> UInt8[np.ndarray, "side side 3"]:
 def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
     """Textures of a plate with a transparent border, one for each of `_MODULE_PIXELS`.
 
-    Channels are grey level times opacity, and opacity.
+    The first channel is grey level times opacity, the second is opacity.
     """
     octaves = []
     for module in _MODULE_PIXELS:

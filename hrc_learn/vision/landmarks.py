@@ -30,9 +30,9 @@ FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
 # Largest number of samples drawn from the clearest matches, and then from all matches. With
 # these numbers, an image without the tool takes a fifth of a second.
 _TRIALS = 300, 1000
-# Once a pose is found, it is refined in rounds. In each, a feature matches a point of the tool
-# if it lies within this multiple of `_REACH` from the pixel that the pose predicts, and if
-# their descriptors differ by less than `_SIMILAR`.
+# Once a pose is found, it is refined in rounds, one for each element of `_GUIDED`. A feature
+# matches a point of the tool if it lies within this multiple of `_REACH` from the pixel that
+# the pose predicts, and if their descriptors differ by less than `_SIMILAR`.
 _GUIDED, _SIMILAR = (2.0, 1.0, 1.0), 270.0
 # Least standard deviation of a feature's position in the image [px].
 _LEAST_NOISE = 0.15
@@ -215,7 +215,6 @@ def match_view(view: Features, seen: Features, width: int) -> Finding | None:
     """Find a view in an image: the pixel of its origin, and the direction of its first axis.
 
     Return None if it is not found.
-
 
     Args:
         view: Features of the view.
