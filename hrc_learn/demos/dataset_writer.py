@@ -35,7 +35,7 @@ class DatasetWriter:
 
     Saved episodes are kept in the folder `ROOT.recording/`. The end of the `with` block calls
     `finalize`, which turns them into the dataset in one step. If an exception or a kill
-    interrupts the recording, the saved episodes stay in this folder, and `recover_dataset`
+    interrupts the recording, the saved episodes stay in this folder. `recover_dataset` then
     makes a dataset of them or appends them to the dataset being extended.
 
     Attributes:

@@ -33,8 +33,8 @@ feature is not visible."""
 
 
 Track = tuple[Float64[np.ndarray, "_frames 2"], Bool[np.ndarray, " _frames"]]
-"""Track of a feature: its pixel in each frame (u right, v down) [px], 0 where it is not
-visible, and a mask of the frames in which it is visible."""
+"""Track of a feature: its pixel in each frame (u right, v down) [px], and a mask of the frames
+in which it is visible. The pixel is 0 in all other frames."""
 
 
 class FeatureCache:

@@ -1,4 +1,4 @@
-"""Recordings: fields, with frames that are read on demand, and their division into episodes."""
+"""Recordings: fields whose frames are read on demand, and the split of files into episodes."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -17,7 +17,7 @@ from hrc_learn.demos.read.naming import without_unit
 from hrc_learn.demos.read.units import unit_factor
 
 Kind = Literal["number", "image", "encoded", "text", "depth", "pose", "other"]
-"""Content of a field; "pose" is the pose of a frame that is not known to be the tool's."""
+"""Content of a field; "pose" is the pose of a coordinate frame that may not be the tool's."""
 Read = Callable[[int, int], Shaped[np.ndarray, "_frames ..."]]
 
 UNNAMED = "array"
@@ -181,7 +181,7 @@ def read_stamps(
         name: The field.
         unit: Unit from the caller; "" if none is given.
         rate: Frame rate that converts counted frames to times [1/s].
-        likely: Unit of stamps whose unit would otherwise be in doubt.
+        likely: Unit to assume if the unit would otherwise be in doubt.
 
     Raises:
         DatasetError: Stamps do not increase, or their unit is in doubt.
@@ -292,7 +292,8 @@ def split_episodes(
     """Episodes among the arrays of a file.
 
     Episodes are numbered groups (`demo_0`, `demo_1`), slices that end at `episode_ends` or at
-    frames marked as last ones, or entries along the first axis of three-dimensional arrays.
+    frames marked as the last of an episode, or entries along the first axis of
+    three-dimensional arrays.
 
     Args:
         file: The file.
@@ -403,6 +404,6 @@ def _ends(whole: Recording) -> list[int] | None:
             flags.append(field.numbers()[:, 0] > 0)
     if not flags or len({len(flag) for flag in flags}) > 1:
         return None
-    # A flag may be set in all frames from the success to the end of the episode.
+    # A flag of success may stay set until the end of the episode.
     ends = np.flatnonzero(np.diff(np.logical_or.reduce(flags).astype(int)) < 0) + 1
     return [*ends.tolist(), len(flags[0])]

@@ -125,8 +125,8 @@ class ImportPlan:
     def _tokens(self, places: Sequence[Place]) -> list[str]:
         """Fields and ranges of fields, such as "qpos[0:6]", that stand for the columns."""
         fields, tokens = self.recordings[0].fields, []
-        # A run is a range of one field: its component indices increase with the place in the
-        # list, so that their difference is constant.
+        # A run is a range of one field. Within a run, the component index minus the place in
+        # the list is constant.
         runs = groupby(enumerate(places), key=lambda one: (one[1][0], one[1][1] - one[0]))
         for (name, _), run in runs:
             indices = [index for _, (_, index) in run]
@@ -174,7 +174,8 @@ def write_plan(
         Numbers of `episodes` and `frames`, total duration `seconds` [s] and `fps` [1/s].
 
     Raises:
-        ValueError: Episodes do not fit into one dataset, or as in `ImportPlan.episodes`.
+        ValueError: Episodes do not fit into one dataset.
+        DatasetError: As in `ImportPlan.episodes`.
     """
     rates: dict[float, str] = {}
     for one, recording in zip(plan.episodes(), plan.recordings, strict=True):
@@ -206,7 +207,7 @@ def write_plan(
 
 
 def _with_next_states(demo: Demonstration) -> Demonstration:
-    """Use joints, pose or state of the next frame as the action; the last frame uses itself."""
+    """Use joints, pose or state of the next frame as action; the last frame uses its own."""
     following = np.minimum(np.arange(len(demo)) + 1, len(demo) - 1)
     if demo.joint_position is not None:
         return replace(demo, command_position=demo.joint_position[following])

@@ -104,7 +104,7 @@ def _split(line: str, delimiter: str) -> list[str]:
 
 
 def _without_end(fields: list[str]) -> list[str]:
-    """The fields of a line without an empty one at the end."""
+    """The fields of a line without an empty field at the end."""
     return fields[:-1] if len(fields) > 1 and not fields[-1] else fields
 
 

@@ -1,8 +1,8 @@
 """Videos of a dataset: located, decoded, and encoded during a recording.
 
-A recording encodes one video per episode and camera as the images arrive: raw images would soon
-fill the memory, and a file for many episodes, as LeRobot writes it, would be lost if the
-recording were interrupted.
+A recording encodes one video per episode and camera as the images arrive, because raw images
+would soon fill the memory. LeRobot writes many episodes into one video file; such a file would
+be lost if the recording were interrupted.
 """
 
 import contextlib

@@ -259,7 +259,7 @@ class ColumnRewriter:
     def _image_statistics(
         self, edit: EpisodeEdit, key: str, images: pa.ChunkedArray | VideoSegment
     ) -> dict[str, list]:
-        """Image statistics: recorded ones if all frames remain, else those of some images."""
+        """Recorded image statistics if all frames remain, else statistics of some images."""
         known = self._recorded.get(edit.entry.index, {}).get(key)
         if known is not None and len(edit) == edit.entry.length:
             return known

@@ -45,7 +45,7 @@ range. Hobby servos under load stop a few degrees from their command."""
 
 
 def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
-    """Report unusually short or long episodes: interrupted ones, or several in one."""
+    """Report unusually short or long episodes: interrupted, or several episodes in one."""
     if len(entries) <= FEWEST:
         return
     usual = float(np.median([entry.length for entry in entries]))
@@ -165,8 +165,9 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
 def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     """Report columns that are exchanged, negated, offset or reversed in time in one episode.
 
-    An episode is described by five numbers per component (5, 50 and 95 % quantiles, start and
-    goal) and compared with the median over all episodes, in units of the spread over episodes.
+    An episode is described by five figures per component: 5, 50 and 95 % quantiles, start and
+    goal. The figures are compared with their medians over all episodes. Differences are
+    measured in spreads over the episodes.
     """
     if not feature.key.startswith(("observation.", "state", "action")):
         return

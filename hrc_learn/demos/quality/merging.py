@@ -175,7 +175,7 @@ class _Merge:
         return common
 
     def _match(self, source: _Source, key: str) -> None:
-        """Match each component of a feature of the first dataset with one of the source.
+        """Match each component of a feature of the first dataset with a component of `source`.
 
         The matching components and the factors of their units are kept in the source.
 
@@ -197,7 +197,7 @@ class _Merge:
         source.places[key], source.factors[key] = places, np.array(factors)
 
     def _place(self, source: _Source, key: str, index: int) -> int:
-        """Index of the source's component that matches one of the first dataset.
+        """Index of the source's component that matches a component of the first dataset.
 
         Two components match if their names or their meanings are equal.
         """
@@ -275,7 +275,7 @@ class _Merge:
     def _episodes(
         self, source: _Source, features: Mapping[str, dict]
     ) -> Iterator[edits.EpisodeEdit]:
-        """Episodes of a dataset with the columns and the rate of the merged one."""
+        """Episodes of a dataset with the columns and the rate of the merged dataset."""
         folder = source.folder
         for entry, frames in read_frames(folder, folder.episodes, folder.numbers):
             edit = edits.unedited(source.dataset, source.decisions, entry, frames)

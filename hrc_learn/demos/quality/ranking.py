@@ -155,7 +155,7 @@ def _demonstrations(
     """Readable episodes, one at a time; the error of any other episode adds to its doubt."""
     dataset = open_dataset(root)
     entries = dataset.folder.episodes
-    # Faults are ignored here: the check reports episodes whose units differ from the rest.
+    # Faults are ignored here: the check reports episodes whose units differ from the others.
     decisions, _ = dataset.decide_units(entries, {})
     demos = DemonstrationSource(dataset, entries, decisions).each()
     for entry, demo in zip(progress(entries) if progress else entries, demos, strict=True):
@@ -380,7 +380,7 @@ def write_curated(
         progress: Function as in `repair_dataset`.
 
     Raises:
-        DatasetError: No episode is left, or an accepted one cannot be read.
+        DatasetError: No episode is left, or an accepted episode cannot be read.
         FileExistsError: `out` exists.
     """
     kept = {entry.index: slice(0, entry.length) for entry in open_folder(path).episodes}

@@ -71,7 +71,7 @@ class RepairOptions:
     fps: float | int | None = None
     """Rate of a regular grid to resample to [1/s]; None keeps the frames."""
     videos: bool = True
-    """Keep the videos. Resampling, or dropping frames in the middle, would require new ones."""
+    """Keep the videos. Resampling, or dropping frames in the middle, needs new videos."""
     dry_run: bool = False
     """Report the changes without writing anything."""
 

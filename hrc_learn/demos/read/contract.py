@@ -156,7 +156,7 @@ class Contract:
         }
 
     def keeping(self, kept: "Contract") -> "Contract":
-        """This contract with the names and roles of an older one, which may have been edited.
+        """This contract with the names and roles of an older contract, which may be edited.
 
         A component that is now read as another quantity keeps its new role. A component of a
         quantity keeps its unit, which was already decided with the older contract. Every other
@@ -243,7 +243,7 @@ def read_sidecar(root: Path) -> Sidecar:
 
 
 def keep_contract(root: Path, contract: Contract) -> None:
-    """Write the contract into the sidecar, keeping the rest of its content."""
+    """Write the contract into the sidecar, whose other content is kept."""
     sidecar = replace(read_sidecar(root), contract=contract)
     with new_file(root / SIDECAR_PATH) as part:
         dump_json(part, sidecar)

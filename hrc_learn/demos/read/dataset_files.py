@@ -115,7 +115,7 @@ def read_json(root: Path, file: str) -> dict:
 
 
 def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[dict]:
-    """JSON objects of a file that has one per line.
+    """JSON objects of a file with one object per line.
 
     Args:
         root: Folder of the dataset.

@@ -280,7 +280,7 @@ def read_tasks(root: Path, info: dict) -> dict[int, str]:
 
 
 def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
-    """Statistics of the features, by episode index; features with incomplete ones are left out.
+    """Statistics of the features, by episode index; incomplete statistics are left out.
 
     Raises:
         DatasetError: A file of statistics is damaged.

@@ -48,7 +48,7 @@ def read_each(
     keys: Sequence[str],
     strict: bool = True,
 ) -> Iterator[RawFrames | DatasetError]:
-    """Read columns of every episode, or give the error of one that cannot be read.
+    """Read columns of every episode; for an episode that cannot be read, give the error.
 
     At most about 65,000 frames are held at a time, or one row group if that is larger. No row
     group is read twice unless it is damaged.
@@ -198,7 +198,7 @@ def read_quantities(
     entries: Sequence[EpisodeEntry],
     roles: Iterable[str] | None = None,
 ) -> Iterator[RawEpisode | DatasetError]:
-    """Read the quantities of every episode, or give the error of one that cannot be read.
+    """Read the quantities of every episode; for an episode that cannot be read, give the error.
 
     Args:
         folder: The dataset.

@@ -475,7 +475,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         return raising(self.each())
 
     def each(self) -> Iterator[Demonstration | DatasetError]:
-        """Every demonstration, or the error of one that cannot be read."""
+        """Every demonstration, or the error if an episode cannot be read."""
         for found in read_quantities(self.folder, self.columns, self.entries):
             try:
                 yield found if isinstance(found, DatasetError) else self._convert(found)
