@@ -412,7 +412,7 @@ def _tool(
 
 
 def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> DemonstrationSet:
-    """Demonstrations with tool poses: recorded ones if all have them, else from the joints."""
+    """Demonstrations with tool poses, recorded in all of them or computed from the joints."""
     if all(d.position is not None and d.orientation is not None for d in demos):
         return demos
     arm = arm_of_dataset(source)

@@ -1,12 +1,12 @@
 """Make many new motions of an arm from a few demonstrations, for scenes with moved objects.
 
 Each demonstration is cut into segments where the gripper begins to move. A segment becomes a
-pose primitive in the frame in which the segment's final poses agree best over the
-demonstrations: an object's frame, a frame at the object with the base's orientation, or the
-base frame. In a new scene, the primitives of all demonstrations are averaged with random
-weights, and move with their frames. A segment begins with the final pose and velocity of the
-previous segment. While the demonstrations still differ, a minimum-jerk curve leads from this
-pose to the segment's own path.
+pose primitive in one of three kinds of frames: an object's frame, a frame at the object with
+the base's orientation, or the base frame. The frame is chosen in which the segment's final
+poses agree best over the demonstrations. In a new scene, the primitives of all demonstrations
+are averaged with random weights, and move with their frames. A segment begins with the final
+pose and velocity of the previous segment. While the demonstrations still differ, a minimum-jerk
+curve leads from this pose to the segment's own path.
 """
 
 from __future__ import annotations
