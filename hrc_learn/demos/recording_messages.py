@@ -44,7 +44,7 @@ class Topic:
     received: list[float] = field(default_factory=list)
     """Times of reception [s]."""
     stamps: list[float] = field(default_factory=list)
-    """Times in the messages [s]; 0 where they have none."""
+    """Times in the messages [s]; 0 for messages without a time."""
     values: list[np.ndarray] = field(default_factory=list)
     sample: Any = None
     """First message; for images, its attributes name their format."""

@@ -148,7 +148,8 @@ class MarkerDetector:
         return {id: corners.copy() for id, corners in found.items()}
 
     def _search_near(self, image: np.ndarray, id: int, last: Corners) -> dict[int, Corners]:
-        reach = 0.5 * np.ptp(last, axis=0).max() + 8  # half a marker of motion a frame
+        # From frame to frame, a marker may move by half its size.
+        reach = 0.5 * np.ptp(last, axis=0).max() + 8
         # Images may have become smaller; OpenCV refuses an empty part.
         end = np.array(image.shape[1::-1]) - 1
         low = np.floor(last.min(axis=0) - reach).astype(int).clip(0, end)
@@ -164,8 +165,8 @@ class MarkerDetector:
         half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         found: dict[int, Corners] = {}
         for id, corners in self._search(half, ids).items():
-            # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one. These
-            # corners only show where to search: they may be pixels off.
+            # Pixel k of the image at half resolution covers pixels 2k and 2k + 1 of the image.
+            # These corners only show where to search: they may be pixels off.
             found |= self._search_near(grey, id, 2.0 * corners + 0.5)
         missing = ids.difference(found)
         self._in_vain = {id: self._in_vain.get(id, -1) + 1 for id in missing}
@@ -187,7 +188,7 @@ class MarkerDetector:
 
 
 def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
-    """Image of a marker's middle: the intersection of its diagonals.
+    """Pixel of a marker's middle: the intersection of the marker's diagonals.
 
     The mean of the corners would be wrong, because perspective shrinks the farther half.
     """

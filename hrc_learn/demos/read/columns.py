@@ -317,7 +317,7 @@ class _Conventions:
         return [ComponentMeaning(role, slot) for slot in slots]
 
     def _components(self, feature: Feature) -> list[ComponentMeaning | None]:
-        """Meanings in a feature of mixed content, such as `observation.state`."""
+        """Meanings of the components of a mixed feature, such as `observation.state`."""
         mixed = bool(_STATE_KEY.fullmatch(feature.key)) or feature.key in _ACTION_KEYS
         names = feature.names
         if names is None:

@@ -142,7 +142,7 @@ class OpenedDataset:
         guessed = guessed_from_values(self.columns.selections, known)
         # Commands are identified by comparing them with the joints.
         more = {"time"} - known | ({"joint_position"} if _COMMAND in guessed else set())
-        # The kinematics of a known arm tell the unit of its joints.
+        # The kinematics of a known arm show the unit of its joints.
         more |= {"position"} if "joint_position" in guessed else set()
         roles = {*guessed, *(more & self.columns.selections.keys())}
         sample = {entry.index for entry in _spread(self.folder.episodes, _SAMPLED)}
@@ -353,7 +353,7 @@ def open_demos(
 
     Arguments, errors and warnings are those of `load_demos`, but faults of an episode appear
     when it is read. If units must be guessed from the size of the values, the columns in
-    question are read once here; declared or given units make that unnecessary.
+    question are read once here. This is not necessary if the units are declared or given.
 
     Args:
         path: Folder of the dataset, or an open `LeRobotDataset`.
