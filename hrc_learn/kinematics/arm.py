@@ -43,10 +43,10 @@ _FEWEST_JOINTS = 5  # needed for position, tilt and turn of a tool
 _LARGEST_STEP = 0.5  # larger joint motion between poses of a path starts a wider search [rad]
 
 TCP_OFFSET = 0.1034
-"""Tool centre point of the Franka hand, along z of the flange [m]."""
+"""Distance of the Franka hand's tool centre point from the flange, along z [m]."""
 
-# Capsules of the Franka hand in the frame of the tool centre point. They contain the hand, a
-# box of 60 x 200 x 66 mm, and the open fingers.
+# Capsules of the Franka hand in the frame of the tool centre point. They contain the hand (a
+# box of 60 x 200 x 66 mm) and the open fingers.
 _HAND = (
     ((0.0, -0.08, -0.0704), (0.0, 0.08, -0.0704), 0.05),
     ((0.0, -0.035, -0.01), (0.0, 0.035, -0.01), 0.028),
@@ -73,7 +73,7 @@ class FingerJoint:
 
     name: str
     kind: str
-    """"revolute" or "prismatic"."""
+    """Kind of the joint: "revolute" or "prismatic"."""
     closed: float
     """Position of the closed gripper [rad or m]."""
     opened: float
@@ -97,14 +97,15 @@ class ArmShape:
     """Appearance, collision shapes, gripper and masses of an arm."""
 
     meshes: Mapping[str, tuple[MeshFile, ...]] = field(default_factory=dict)
-    """Meshes by the name of their link (link0, link1, ...); the gripper's are not included."""
+    """Meshes by the name of their link (link0, link1, ...), without the gripper's meshes."""
     gripper: tuple[FingerJoint, ...] = ()
     """Joints of the gripper in the description, carriers first; empty if the description ends
     at the flange."""
     hand: tuple[MeshFile, ...] = ()
     """Meshes of the hand that carries the fingers, in the frame of the tool."""
     shapes: tuple[tuple[int, Shape], ...] = ()
-    """Collision shapes, each with the number of its link's frame; capsules contain them."""
+    """Collision shapes, each with the number of its link's frame. The arm's capsules contain
+    these shapes."""
     masses: tuple[float | None, ...] = ()
     """Masses of base, links, flange and tool [kg]; None where the description gives no mass."""
     inertia: tuple[Float[np.ndarray, "4 4"] | None, ...] = ()
@@ -211,7 +212,7 @@ class Arm(SerialChain):
 
     @cached_property
     def body(self) -> CapsuleArm:
-        """Capsules of the links alone: tasks move the gripper close to objects on purpose."""
+        """Capsules of the links without the gripper, which tasks move close to objects."""
         links = [capsule for capsule in self.whole.capsules if capsule.link <= self.joints]
         return CapsuleArm(self, links, self.whole.overlapping)
 
@@ -219,7 +220,7 @@ class Arm(SerialChain):
     def masses(self) -> tuple[float, ...]:
         """Masses of base, links, flange and tool [kg].
 
-        A missing mass is 1200 kg/m^3 times the volume of the link's capsules.
+        A missing mass is estimated as 1200 kg/m^3 times the volume of the link's capsules.
         """
         count = self.joints + 3
         given = self.shape.masses or (None,) * count
@@ -259,9 +260,9 @@ class Arm(SerialChain):
                 leaves it free. The closed-form inverse never returns the elbow branch with
                 q4 > -0.467 rad.
             near: Configuration to stay close to [rad], one for all poses or one for each.
-            task: Constrained part of the pose; None: the arm's `task`. Five joints reach few
-                full poses.
-            samples: Positions of joint 7 to try, for arms with a closed-form inverse.
+            task: Constrained part of the pose; None: the arm's `task`. An arm with five joints
+                reaches few full poses.
+            samples: Number of positions of joint 7 to try, for a closed-form inverse.
 
         Raises:
             UnreachableError: A pose has no solution; the message names the first such pose.
@@ -331,7 +332,7 @@ class Arm(SerialChain):
         """
         limits = self.limits
         if self._closed_form is None:
-            # The same starts in each call: the result depends on the arguments alone.
+            # Each call has the same starts, so that only the arguments determine the result.
             rng = torch.Generator().manual_seed(0)
             # A joint that turns by more than one revolution repeats its poses.
             low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
@@ -413,7 +414,8 @@ class Arm(SerialChain):
         links = [capsule for capsule in self.whole.capsules if capsule.link <= n]
         if mount is not None:
             flange, tcp = flange @ mount.to(flange), torch.eye(4, dtype=flange.dtype)
-            # A fixed jaw belongs to the gripper that the hand replaces.
+            # Parts ahead of the hand's base are cut off, such as a fixed jaw. They belong to
+            # the gripper that the hand replaces.
             last = [_behind(capsule, flange) for capsule in links if capsule.link == n]
             links = [*(c for c in links if c.link < n), *(c for c in last if c is not None)]
         # The tool centre point lies along the arm's own direction of approach, which may differ

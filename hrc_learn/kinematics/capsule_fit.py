@@ -51,10 +51,10 @@ type _Capsule = tuple[np.ndarray, np.ndarray, float]
 def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> CapsuleArm:
     """Fit capsules around the shapes on an arm's links.
 
-    Like MoveIt's setup assistant, this ignores pairs of links that are neighbours, that overlap
-    in nearly all random postures, or that never come near each other. Capsules are rounder than
-    links: capsules of a short, wide link overlap capsules of the next link but one. Such a pair
-    of links is ignored as well if it overlaps in most postures.
+    Like MoveIt's setup assistant, this function ignores pairs of links that are neighbours,
+    that overlap in nearly all random postures, or that never come near each other. Capsules are
+    rounder than links: capsules of a short, wide link overlap capsules of the next link but
+    one. Such a pair of links is also ignored if it overlaps in most postures.
 
     Args:
         chain: The arm.
@@ -100,7 +100,7 @@ class Hull:
     edges: Float[np.ndarray, "edges 2 3"]
 
     def between(self, axis: np.ndarray, low: float, high: float) -> np.ndarray:
-        """Corners of the part between two planes across an axis."""
+        """Corners of the part of the hull between two planes perpendicular to an axis."""
         along = self.points @ axis
         found = [self.points[(along >= low) & (along <= high)]]
         start, end = self.edges[:, 0] @ axis, self.edges[:, 1] @ axis
@@ -147,7 +147,7 @@ def shape_points(shape: Shape) -> Float[np.ndarray, "points 3"]:
     if shape.kind == "box":
         return signs * shape.size
     radius, half = shape.size
-    if shape.kind != "cylinder":  # a ball at each end, each in a cube
+    if shape.kind != "cylinder":  # each end is a ball, and a cube contains it
         return signs * radius + np.sign(signs[:, 2:]) * [0, 0, half]
     angle = np.arange(_CORNERS) * 2 * math.pi / _CORNERS
     round_ = radius / math.cos(math.pi / _CORNERS) * np.stack([np.cos(angle), np.sin(angle)], 1)

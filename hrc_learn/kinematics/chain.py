@@ -1,9 +1,9 @@
 """Serial arms: forward kinematics and geometric Jacobians.
 
-There are two implementations. In eager mode, matrix products are fast. For compilers, the same
-kinematics are written out number by number: products with the zeros and ones of the arm's
-description are omitted, and each number is a tensor over the batch alone, so the compiler
-fuses everything into one loop over the batch.
+There are two implementations. One uses matrix products, which are fast in eager mode. The other
+is for compilers: the same kinematics are written out number by number. Products with the zeros
+and ones of the arm's description are omitted, and each number is a tensor over the batch alone.
+The compiler therefore fuses everything into one loop over the batch.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hrc_learn.geometry.numerics import ArrayLike, Constant, as_tensor
 from hrc_learn.kinematics.limits import JointLimits
 
 type JointKind = Literal["revolute", "continuous", "prismatic"]
-"""Kind of a joint; a continuous one rotates without limits."""
+"""Kind of a joint; a continuous joint rotates without limits."""
 
 type _Row = list[Tensor]
 
@@ -40,8 +40,8 @@ def transform_and_jacobian(
         q: Joint positions [rad, or m for sliding joints].
         mounts: Frame of each joint at zero, in the frame of the previous joint (or the base).
         tip: Tool centre point in the frame of the last joint.
-        sliding: Mask of joints that move along their z axis; the others, by default all, turn
-            about it.
+        sliding: Mask of joints that move along their z axis. All other joints turn about their
+            z axis; by default, all joints do.
 
     Returns:
         Transform and Jacobian, with the batch dimensions last in memory.
@@ -238,7 +238,7 @@ class SerialChain:
         """
         q = self.joint_positions(q)
         if torch.compiler.is_compiling():
-            return Pose.from_matrix(self.transform_and_jacobian(q)[0])  # J is never computed
+            return Pose.from_matrix(self.transform_and_jacobian(q)[0])  # compilers omit J
         return Pose.from_matrix(self._joint_frames(q)[-1] @ self._tip.like(q))
 
     def link_poses(self, q: ArrayLike) -> Pose:

@@ -175,7 +175,7 @@ class CapsuleArm:
         under `vmap`.
 
         Args:
-            q: Joint position [rad].
+            q: Joint positions [rad].
             centre: Centre of the box, or of each of several boxes [m].
             half_size: Half edges of the box, or of each box [m].
             frames: `SerialChain.link_frames` at q, if already computed.
@@ -313,7 +313,7 @@ class Separation:
     joint_axes: Float[Tensor, "*#batch joints 3"]
     """Axes of the joints in the base frame."""
     joint_origins: Float[Tensor, "*#batch joints 3"]
-    """Points on these axes [m]."""
+    """Points on the axes of the joints, in the base frame [m]."""
     moved: Bool[Tensor, "C joints"]
     """Mask of the joints that move each of the arm's capsules."""
 
@@ -332,7 +332,7 @@ class Separation:
     def gradient_of(
         self, pairs: Int[Tensor, "*#batch pairs"]
     ) -> Float[Tensor, "*batch pairs joints"]:
-        """Some rows of the gradient [m/rad].
+        """Rows of the gradient for some pairs of capsules [m/rad].
 
         Args:
             pairs: Numbers c H + h of pairs of capsules (c of the arm, h of the person), either

@@ -70,14 +70,15 @@ def arm_from_file(
 ) -> Arm:
     """An arm from a URDF or MJCF file.
 
-    Links on moving joints beyond the arm's last joint form the gripper. They belong to the
-    tool, as does a hand that carries only the fingers. Links on moving joints that branch off
-    earlier are left out.
+    Links that are moved by joints beyond the arm's last joint form the gripper. They belong to
+    the tool, as does a hand that carries only the fingers. If moving joints branch off earlier,
+    their links are left out.
 
     Args:
         path: The file.
-        base: Link (URDF) or body (MJCF) of the base; None: the root, or the world.
-        tip: Link, body or site of the flange; None: the only end besides a gripper's.
+        base: Link (URDF) or body (MJCF) of the base; None: the root (URDF) or world (MJCF).
+        tip: Link, body or site of the flange; None: the only end of the arm, apart from the
+            gripper.
         name: Name of the arm; None: the stem of the file.
         tool: Tool centre point in the frame of the flange, z in the direction of approach;
             None: the flange itself.
@@ -145,7 +146,7 @@ def _ready(
     limits: JointLimits,
     given: Sequence[float] | None,
 ) -> Float[Tensor, " joints"] | None:
-    """Ready posture [rad, m]: the given one, or the file's `home`; None without either."""
+    """Ready posture [rad, m]: the given posture, or the file's `home`; None: neither exists."""
     home = description.home or {}
     if given is None:
         if any(name not in home for name in names):
@@ -336,9 +337,9 @@ _POSTURES, _SEED = 4096, 0
 def _comfortable(chain: SerialChain) -> Float[Tensor, " joints"]:
     """Default ready posture [rad, m].
 
-    Among random postures, the one with the highest sum of four scores, each at most one:
-    distance from singularities, distance from limits, the tool pointing down, and the tool in
-    front of the base at half of its reach.
+    It is the random posture with the highest sum of four scores, each at most one: distance
+    from singularities, distance from limits, the tool pointing down, and the tool in front of
+    the base at half of its reach.
     """
     rng = torch.Generator().manual_seed(_SEED)
     lower, upper = chain.limits.lower, chain.limits.upper

@@ -2,7 +2,8 @@
 
 Readers of URDF and MJCF turn a file into links and joints. `Description` refuses anything but a
 tree of rigid bodies, separates the joints of a gripper from those of the arm, and finds the
-tool frame. All transforms are homogeneous and float64, with the numbers of the file.
+tool frame. All transforms are homogeneous matrices in float64, so that the numbers of the file
+are not rounded.
 """
 
 from __future__ import annotations
@@ -71,9 +72,9 @@ def pseudo_inertia(
     physically consistent inertial parameter identification").
 
     Args:
-        mass: [kg]
+        mass: Mass of the body [kg].
         centre: Centre of mass in the frame of the body [m].
-        inertia: Inertia about the centre, along the axes of that frame [kg m^2].
+        inertia: Inertia about the centre of mass, along the axes of this frame [kg m^2].
     """
     c = np.asarray(centre, dtype=float)
     found = np.empty((4, 4))
@@ -89,7 +90,7 @@ class Link:
 
     name: str
     mass: float | None = None
-    """[kg]"""
+    """Mass [kg]; None where the file gives no mass."""
     inertia: Float[np.ndarray, "4 4"] | None = None
     """Pseudo-inertia in the frame of the link."""
     visuals: tuple[Shape, ...] = ()
@@ -98,7 +99,9 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Joint:
-    """A joint. The frame of its child is `origin`, then the motion about or along `axis`."""
+    """A joint. The pose of its child in its parent's frame is `origin` times the motion about
+    or along `axis`.
+    """
 
     name: str
     kind: str
@@ -112,9 +115,9 @@ class Joint:
     """Lower limit [rad or m]; None where the file gives no limit."""
     upper: float | None = None
     velocity: float | None = None
-    """[rad/s] or [m/s]"""
+    """Velocity limit [rad/s or m/s]."""
     effort: float | None = None
-    """[N m] or [N]"""
+    """Torque or force limit [N m or N]."""
     follows: tuple[str, float, float] | None = None
     """Mimicked joint, factor and offset; an empty name fixes the joint at the offset."""
 
@@ -155,7 +158,7 @@ class Description:
         joints: Sequence[Joint],
         home: dict[str, float] | None = None,
     ):
-        """Check that the joints connect the links to trees.
+        """Check that the links and joints form trees.
 
         Raises:
             ValueError: A name is used twice, a joint names a link that does not exist, a link
@@ -237,7 +240,7 @@ class Description:
         return found
 
     def rigid_subtree(self, link: str) -> dict[str, Transform]:
-        """A link and all links fixed to it, with their poses in the frame of the first."""
+        """A link and all links fixed to it, with their poses in the frame of the given link."""
         found, ahead = {link: np.eye(4)}, [link]
         for name in ahead:
             for joint in self.below(name):
@@ -332,7 +335,7 @@ class Description:
         A joint belongs to a gripper if its name says so, or if it is one of several joints that
         branch off at the end of the arm, each with a shorter chain than the arm.
         """
-        height: dict[str, int] = {}  # largest number of joints in a row beyond a link
+        height: dict[str, int] = {}  # largest number of successive joints beyond a link
         for link in reversed(self.subtree(base)):
             height[link] = max((_length(j, height) for j in self.below(link)), default=0)
         ends: list[_End] = []

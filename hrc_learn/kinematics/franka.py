@@ -50,7 +50,7 @@ curves of all tables. A robot itself uses the values of the URDF that it sends t
 these values depend on its system image."""
 
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
-_HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
+_HAND_ANGLE = -pi / 4  # rotation of the mounted hand about z of the flange [rad]
 
 
 # A branch is dropped if its forward kinematics misses the pose by more than this [m, and 1 for
@@ -70,10 +70,10 @@ def franka_branches(
         arm: Chain with Franka's geometry.
         pose: Poses of the tool centre point in the base frame.
         q7: Position of joint 7 [rad].
-        ranges: Joint ranges with which frankik is called. It drops branches outside the Panda's
-            range (False) or outside the narrow range of the FR3 in which velocity limits are
-            constant (True). Neither contains the full range of the FR3; both together lose the
-            fewest branches.
+        ranges: Joint ranges, each for one call of frankik, which drops branches outside the
+            range. False is the Panda's range. True is the narrow range of the FR3 in which
+            velocity limits are constant. Neither contains the full range of the FR3; both
+            together lose the fewest branches.
     """
     import frankik  # only here: the rest of the package works without it
 
@@ -86,7 +86,7 @@ def franka_branches(
     shape = np.broadcast_shapes(flange.shape[:-2], q7.shape)
     flanges = flange.expand(*shape, 4, 4).reshape(-1, 4, 4).numpy()
     angles = q7.expand(shape).reshape(-1).tolist()
-    # The default posture only selects among branches when a joint is indeterminate.
+    # frankik uses the default posture only where a joint position is indeterminate.
     branches = np.full((len(flanges), 4, 7), np.nan)
     for is_fr3 in ranges:
         for row, T, angle in zip(branches, flanges, angles, strict=True):

@@ -29,8 +29,8 @@ class MassMatrix:
 
         Args:
             arm: The arm, with the gripper as its last body.
-            rotor_inertia: Inertia of motor and gear at each joint, which descriptions rarely
-                have [kg m^2].
+            rotor_inertia: Inertia of motor and gear at each joint [kg m^2]; descriptions rarely
+                give it.
         """
         self._arm = arm
         count = arm.joints + 3
@@ -67,7 +67,7 @@ class MassMatrix:
 
 
 def _at_last(vector: Tensor) -> Float[Tensor, "*batch 3 4"]:
-    """Vectors as the last column of matrices (0 | v)."""
+    """Matrices (0 | v) with the given vectors v as their last columns."""
     return torch.nn.functional.pad(vector.unsqueeze(-1), (3, 0))
 
 

@@ -42,7 +42,7 @@ _LEVER = 0.3
 # `null_space_dimension`, `_WEAK` in `task_rank`. `_WEAK` excludes directions in which joints
 # hardly move the tool: the SO-101's tool, for example, is only 8 mm off its last joint's axis.
 _RANK, _WEAK = 1e-6, 0.02
-_BIAS = 1e-9  # smallest damping: the system stays regular with more task rows than joints
+_BIAS = 1e-9  # smallest damping: keeps the system regular with more task rows than joints
 # Starts per pose in each round, largest number of rounds, and iterations from each start.
 _STARTS, _ROUNDS, _ITERATIONS = 24, 6, 40
 # Largest error of a solution's position [m] and orientation [rad].
@@ -286,13 +286,14 @@ def follow_poses(
     """Joint positions along a path of the tool, by differential inverse kinematics.
 
     Joints move as little as possible from one pose to the next, as under velocity control of
-    the tool; at their limits they stop.
+    the tool. They stop at their limits.
 
     Args:
         chain: The arm.
         path: Poses of the tool centre point, (steps, *#rows).
         start: Joint positions at the first pose [rad, m].
-        wish: Posture that the null-space motion approaches at each pose [rad, m]; None: none.
+        wish: Posture that the null-space motion approaches at each pose [rad, m]; None: no
+            null-space motion.
         task: Constrained part of the poses.
 
     Returns:
@@ -366,7 +367,14 @@ def _descend(
 
 
 def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
-    """The same postures with joints turned by whole turns towards a wish, within limits."""
+    """The same postures with joints moved by full revolutions, within limits, to be as close as
+    possible to a wanted configuration.
+
+    Args:
+        chain: The arm.
+        q: Joint positions [rad, m].
+        wish: Wanted configuration [rad, m].
+    """
     turns = torch.tensor([kind != "prismatic" for kind in chain.kinds], device=q.device)
     whole = 2 * math.pi * ((wish - q) / (2 * math.pi)).round()
     moved = q + torch.where(turns, whole, 0.0)
@@ -378,10 +386,10 @@ def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
 def _drawn_nearer(
     chain: SerialChain, goal: Pose, q: Tensor, wish: Tensor, task: TaskSpace
 ) -> Tensor:
-    """Solutions moved in the null space towards a wish.
+    """Solutions moved in the null space towards a wanted configuration `wish`.
 
     A solution is unchanged if the motion would lose the pose or would not end nearer to the
-    wish.
+    wanted configuration.
     """
     moved = q
     for _ in range(15):  # each step removes most of the distance that null-space motion can

@@ -32,11 +32,11 @@ class MotionLimits:
     upper: Float[Tensor, " joints"]
     """Largest position [rad]."""
     velocity: Float[Tensor, " joints"]
-    """[rad/s]"""
+    """Largest velocity [rad/s]."""
     acceleration: Float[Tensor, " joints"]
-    """[rad/s^2]"""
+    """Largest acceleration [rad/s^2]."""
     jerk: Float[Tensor, " joints"]
-    """[rad/s^3]"""
+    """Largest jerk [rad/s^3]."""
     velocity_offset: Float[Tensor, " joints"] | None = None
     """Offset o in `velocity_bounds` [rad/s]; None if velocity limits do not depend on the
     position."""
@@ -93,7 +93,7 @@ class JointLimits(MotionLimits):
     """Limits of each joint of an arm."""
 
     torque: Float[Tensor, " joints"]
-    """[N m]"""
+    """Largest torque [N m]."""
     vintage: str
     """Publisher and date of these values, because manufacturers revise them."""
 
@@ -113,7 +113,7 @@ class JointLimits(MotionLimits):
         dt: float,
         kinds: Sequence[str] = ("velocity", "acceleration", "jerk"),
     ) -> tuple[Float[Tensor, "*batch"], Int[Tensor, "*batch"]]:
-        """Factor by which a path is too fast, and the limit that it breaks most.
+        """Factor by which a path is too fast, and the limit that it exceeds most.
 
         Slowed down by this factor, the path keeps all limits. If the factor is below 1, the
         path keeps them already.
@@ -131,7 +131,7 @@ class JointLimits(MotionLimits):
         factors = []
         for order, kind in enumerate(kinds, 1):
             rate = torch.diff(path, n=order, dim=-2).abs() / dt**order
-            rate = torch.nn.functional.pad(rate, (0, 0, 1, 0))  # a row, if there is none
+            rate = torch.nn.functional.pad(rate, (0, 0, 1, 0))  # short paths have no rows
             factors.append((rate / getattr(self, kind)).amax(-2) ** (1 / order))
         worst, at = torch.cat(factors, -1).max(-1)
         return worst, at

@@ -1,4 +1,4 @@
-"""Robot descriptions in MJCF, which MuJoCo itself reads, with defaults and includes."""
+"""Robot descriptions in MJCF. MuJoCo itself reads the files, with defaults and includes."""
 
 import math
 import warnings
@@ -27,9 +27,9 @@ _NO_MASS = 1e-9
 def read_mjcf(path: Path) -> Description:
     """Read an MJCF file.
 
-    A body becomes a link, and a site becomes a link fixed to its body. If a body has several
-    joints, each joint adds one link of a chain, named after the body and the joint. Missing
-    meshes are left out, and a warning names the first one.
+    A body becomes a link, and a site becomes a link fixed to its body. Each joint of a body
+    adds a link before the body's link, named after the body and the joint. Missing meshes are
+    left out, and a warning names the first one.
 
     Raises:
         ValueError: The file is not MJCF.
@@ -51,8 +51,8 @@ def read_mjcf(path: Path) -> Description:
 
 
 def _model_without_missing_meshes(path: Path, mujoco: Any) -> Any | None:
-    """The model without meshes that have no file, with a warning; None if the file has another
-    error.
+    """Model without the meshes whose files are missing, with a warning; None if the description
+    has another error.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -208,8 +208,8 @@ class _Reader:
         return joints
 
     def _effort(self, j: int) -> float | None:
-        """Force [N] or torque [N m] limit of a joint, else of its first limited actuator; None:
-        no limit.
+        """Force [N] or torque [N m] limit of a joint, or else of the joint's first limited
+        actuator; None: no limit.
         """
         model = self.model
         if model.jnt_actfrclimited[j]:
@@ -228,8 +228,10 @@ class _Reader:
         return None
 
     def _followers(self) -> dict[int, tuple[str, float, float]]:
-        """Leading joint, factor and offset of each joint that an active equality constraint
-        couples to another joint or holds in place, by the number of the joint.
+        """Leading joint, factor and offset, by the number of the following joint.
+
+        A joint follows if an active equality constraint couples it to another joint or holds it
+        in place.
         """
         model, tied = self.model, {}
         for e in range(model.neq):
@@ -237,7 +239,7 @@ class _Reader:
                 other = int(model.eq_obj2id[e])
                 leader = self._joint_name(other) if other >= 0 else ""
                 offset, factor = model.eq_data[e, :2].tolist()
-                # MuJoCo couples motions from the reference positions.
+                # MuJoCo couples displacements from the reference positions.
                 joint = int(model.eq_obj1id[e])
                 offset += model.qpos0[model.jnt_qposadr[joint]]
                 if other >= 0:

@@ -79,7 +79,7 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
 def _registered_name(robot: str) -> str | None:
     """Registered arm of a robot's name or type; None if unknown.
 
-    Capitals, punctuation, the maker in front and roles such as "follower" are ignored.
+    Capitals, punctuation, the maker's name in front, and roles such as "follower" are ignored.
     """
     sources = _sources()
     names = {name: name for name in sources}
@@ -154,7 +154,8 @@ def installed_descriptions(name: str) -> list[Path]:
 
     The search covers example-robot-data, robosuite, and files that mujoco-menagerie and
     robot_descriptions have already fetched; nothing is downloaded. Results come from the first
-    of these sources that has the robot: in each folder, the file with the shortest name.
+    of these sources that has the robot. For each folder, the result is the file with the
+    shortest name.
     """
     wanted = _plain(name)
     for root in _description_folders():
@@ -250,9 +251,9 @@ class ArmChoice:
     name: str = "panda"
     """Registered name, or a URDF or MJCF file, also as FILE:TIP or FILE:BASE:TIP."""
     base: str = ""
-    """Base link of a file; empty: its root."""
+    """Base link of a file; empty: the root of the file."""
     tip: str = ""
-    """Flange link of a file; empty: its only end."""
+    """Flange link of a file; empty: the only end of the arm."""
 
     def arm(self) -> Arm:
         """The arm as described in its file."""

@@ -22,7 +22,8 @@ from hrc_learn.kinematics.description import (
 )
 
 _BOUNDS = ("lower", "upper", "velocity", "effort")
-# `_WORDS`: attributes that hold text. `_NOT_FINITE`: words that are numbers elsewhere.
+# `_WORDS`: attributes that hold text. `_NOT_FINITE`: in all other attributes, these words are
+# numbers that are not finite.
 _WORDS = ("name", "link", "joint", "type", "filename")
 _NOT_FINITE = re.compile(r"\b(nan|inf|infinity)\b", re.IGNORECASE)
 
