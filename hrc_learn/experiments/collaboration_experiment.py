@@ -56,7 +56,7 @@ class CollaborationExperiment(CollaborationScenario):
     placing: Path
     """Folder of the placing skill."""
     shelves: tuple[str, ...] = ("middle",)
-    """Shelf of each of up to three objects."""
+    """Shelf of each object; at most three objects."""
     pulls: Pulls = "scripted"
     """Times at which the scripted person pulls the elbow; overrides `forces`."""
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
@@ -150,7 +150,7 @@ class CollaborationExperiment(CollaborationScenario):
         return {"none": (), "random": "random", "scripted": drags}[self.pulls]
 
     def _job(self) -> PickAndPlaceConfig:
-        """Job that waits as long without drags as with them, so that runs are comparable."""
+        """Job that waits equally long with and without drags, so that runs are comparable."""
         if not self.worker:
             return self.config
         end = DRAGS_NEAR_WORKER[-1].end + _AFTER_DRAGS

@@ -1,4 +1,4 @@
-"""Metrics of a collaboration; with several objects, each metric is the worst value.
+"""Metrics of a collaboration; with several objects, each value is that of the worst object.
 
 Success is decided by contacts and poses of the simulator, not by the report of the task.
 """
@@ -24,9 +24,9 @@ type Measure = Callable[[CollaborationRun], float | int | None]
 _SAME_TASK = "main task not affected (Experiment 3)"
 
 
-# Largest normalised error of a reproduction. The error of the present models is the tremor of
-# the demonstrating hand, which primitives do not reproduce. It is 0.0006 (SO-101) to 0.00102
-# (UR3) of the joints' range, and the same with 15, 60 and 80 basis functions.
+# Largest normalised error of a reproduction. The present error is the tremor of the
+# demonstrating hand, which primitives do not reproduce: 0.0006 (SO-101) to 0.00102 (UR3) of the
+# joints' range. This error is the same with 15, 60 and 80 basis functions.
 _REPRODUCTION = 1.5e-3
 
 
@@ -96,7 +96,7 @@ def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
 _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
     Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
-    # Five joints set the pitch of the tool; its yaw follows from its position.
+    # Five joints control the pitch of the tool. The yaw follows from the tool's position.
     Metric("place pitch", lambda run: _off_by_five_joints(run, 0), "deg", at_most=3.0),
     Metric("place yaw", lambda run: _off_by_five_joints(run, 1), "deg", at_most=3.0),
     never("joint limit violations", lambda run: measures.limit_violations(run.cell)),
@@ -237,7 +237,7 @@ def _worker_contacts(run: CollaborationRun) -> int | None:
 
 
 def _too_hard(run: CollaborationRun) -> int | None:
-    """Steps with more force than allowed; None unless the arm may touch people."""
+    """Number of steps with more force than allowed; None if the arm may not touch people."""
     near = run.near_worker
     if near is None or run.cell.config.safety.separation.mode == "ssm":
         return None
@@ -263,7 +263,7 @@ def _elbow_pulled(run: CollaborationRun) -> float | None:
 
 
 def _worst(run: CollaborationRun, name: str) -> float | None:
-    """Largest value over the objects picked from the table and released; None without any."""
+    """Largest value over all objects picked from the table and released; None: no object."""
     grasped = [e for e in run.picks if e.release is not None and e.receipt is None]
     return max((float(getattr(job, name)) for job in grasped), default=None)
 
@@ -275,7 +275,7 @@ def _pushed(
     log = run.cell.log
     if not (log["nullspace_input"] != 0).any():
         return None
-    # NaN before the first push and after the last.
+    # Deviations are NaN before the first push and after the interaction.
     deviation = measures.Deviation.of(log, run.motion, run.world)
     return float(np.nan_to_num(of(deviation)).max())
 
@@ -287,7 +287,7 @@ def _grasp_offsets(run: CollaborationRun) -> list[float]:
         begin, end = pick.span
         descents = [t for t, _ in measures.spans(log, "grasp") if begin <= t < end]
         if pick.release is not None and descents:
-            # The last attempt: earlier ones missed the object or lost it.
+            # Only the last attempt counts: earlier attempts missed or lost the object.
             offset = measures.grasp_offset(
                 log, run.motion, run.world, pick.item.name, descents[-1]
             )
@@ -303,7 +303,7 @@ def _placed(run: CollaborationRun) -> tuple[float | None, float | None]:
             continue
         pose = run.world.object_pose(pick.item.name)
         errors.append(np.linalg.norm(pose[:2, 3] - pick.goal.position[:2].numpy()))
-        # Relative to the true shelf: errors of the base do not count.
+        # Angles are relative to the true shelf: errors of the base do not count.
         angles.append(measures.place_angle(pose, pick.goal.orientation))
     if not errors:
         return None, None

@@ -73,10 +73,10 @@ of 60 N moves the elbow by 0.2 to 0.4 m within the 4.5 s of an interval."""
 DRAGS_NEAR_WORKER = NULL_SPACE_FORCES + tuple(
     replace(force, start=force.start + 10.0) for force in NULL_SPACE_FORCES
 )
-"""The same forces twice: in the paper the expert drags joint 4 while a worker reaches under the
-arm."""
+"""The same forces twice. In the paper, too, a person drags joint 4 while a worker reaches under
+the arm."""
 
-# Acceleration that the person watch assumes for a person who brings an object [m/s^2]. It is
+# Acceleration that `PersonWatch` assumes for a person that brings an object [m/s^2]. It is
 # lower than usual: the person sees the arm, and must come near enough to hand the object over.
 _GIVER_ACCELERATION = 3.0
 
@@ -98,8 +98,8 @@ class CollaborationScenario:
     camera: CameraKind = "auto"
     """Kind of camera that watches the table."""
     forces: Sequence[ScriptedForce] | Literal["random"] = NULL_SPACE_FORCES
-    """Forces of the person on the elbow, timed from the moment at which the robot begins to
-    wait for them; "random": forces at random moments of the whole job."""
+    """Forces of the person on the elbow. Their times count from the moment at which the robot
+    begins to wait for them. "random": forces at random moments of the whole job."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     """Configuration of the job."""
@@ -201,7 +201,7 @@ def simulate_collaboration(
     config, forces, begin = scenario.config, scenario.forces, None
     pulls: tuple[ScriptedForce, ...] = ()
     if forces == "random":
-        # A separate generator: runs with and without pulls draw the same other values.
+        # A separate generator: all other random values are the same with and without pulls.
         forces = pulls = random_pulls(np.random.default_rng([seed, 1]))
         config, begin = replace(config, interactions=0), 0.0
     person = ScriptedPerturbation(workplace.robot.chain, forces, begin)
@@ -275,7 +275,7 @@ class _Stage:
     Attributes:
         world: World at rest, with all objects at their random poses.
         giving: Person who hands over the last object; None without a hand-over.
-        watch: Person watch with the robot's tracker; None without a person.
+        watch: `PersonWatch` with the robot's tracker of people; None without a person.
     """
 
     def __init__(
@@ -287,7 +287,7 @@ class _Stage:
         rng: np.random.Generator,
     ):
         self._workplace, self._sizes = workplace, scenario.imperfections
-        # Separate generators: runs with and without a person draw the same other values.
+        # Separate generators: all other random values are the same with and without a person.
         person_rng = np.random.default_rng([seed, 2])
         scene, worker = workplace.scene, None
         if scenario.worker:
@@ -346,7 +346,7 @@ class _Stage:
             self.world.move_worker(ends, self._visit.item_at(self.world.time, ends))
 
     def receiving(self, cell: WorkCell) -> dict[str, Receiving]:
-        """Skill that receives the last object, by its name; empty without a hand-over."""
+        """Skill that receives the last object, by the object's name; empty: no hand-over."""
         if self.giving is None:
             return {}
         item = self._workplace.scene.objects[-1]

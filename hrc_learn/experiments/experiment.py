@@ -36,7 +36,7 @@ from hrc_learn.viz.report import (
 from hrc_learn.viz.run_dashboard import record_run
 
 RUN = "run"
-"""Key of the recording of the run itself in the recordings of an experiment."""
+"""Key of the run itself among the recordings of an experiment."""
 TRIALS = "trials"
 """Name of the file of the trials."""
 
@@ -289,7 +289,7 @@ def _run_trials(study: Study, file: Path, made_by: dict, options: RunOptions) ->
 def _print_outputs(out: Path, results: Evaluation, has_film: bool) -> None:
     if results.failure:
         print(f"failed: {results.failure}", file=sys.stderr)
-    # Each on one unbroken line, so that it can be copied from a terminal of any width.
+    # Each path is on one unbroken line, so that it can be copied from a terminal of any width.
     print(f"Report: {shlex.quote(str(out / PAGE))}")
     if has_film:
         print(f"Film: {shlex.quote(str(out / FILM))}")

@@ -1,4 +1,4 @@
-"""Experiment 2 of the paper: an object grasped with an uncalibrated camera, and its metrics."""
+"""Experiment 2 of the paper, grasping with an uncalibrated camera, and its metrics."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -220,8 +220,8 @@ def compare_with_truth(
     Returns:
         `relative_error_median` and `_p95`: |estimate - truth| / |truth|, Frobenius norms with
         rotation scaled to metres by `ROTATION_SCALE`. `within_1_sigma` and `within_2_sigma`:
-        fractions of entries within one or two standard deviations of the truth; a Gaussian has
-        0.68 and 0.95.
+        fractions of entries within one or two standard deviations of the truth; they are 0.68
+        and 0.95 for a Gaussian.
     """
     scale = torch.tensor([1.0] * 3 + [1 / ROTATION_SCALE] * 3, dtype=torch.float64)
     marker = poses.apply(torch.from_numpy(offset)).numpy()

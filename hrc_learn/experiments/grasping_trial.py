@@ -72,7 +72,7 @@ class GraspingScene:
     """Joint positions at the start [rad]."""
     object_pose: Float[np.ndarray, "4 4"]
     imperfections: DrawnImperfections | None = None
-    """Imperfections of arm, calibration, camera and object; None: none."""
+    """Imperfections of arm, calibration, camera and object; None: no imperfections."""
 
     def world(self) -> World:
         """World with this scene, at rest."""
@@ -99,7 +99,8 @@ class GraspingScene:
             config: Distribution of the scenes.
             rng: Random generator.
             camera: Kind of camera that checks if the object is hidden.
-            imperfections: Imperfections of arm, calibration, camera and object; None: none.
+            imperfections: Imperfections of arm, calibration, camera and object; None: no
+                imperfections.
 
         Raises:
             ValueError: Every drawn start hides the object or has no free path home.
@@ -137,7 +138,7 @@ class GraspingRun(CellRun):
     scene: GraspingScene
     item: ObjectConfig
     result: GraspJob | None
-    """Record of the task; None if it failed."""
+    """Record of the task; None if the task failed."""
 
 
 def simulate_grasp(
@@ -157,7 +158,7 @@ def simulate_grasp(
     Args:
         aiming: Learned image Jacobian and visual target.
         scene: Initial conditions.
-        camera: Kind of camera that watches.
+        camera: Kind of camera that watches the table.
         config: Configuration of the grasp.
         rng: Source of image noise and of lost images.
         access: Access to the arm.
@@ -209,7 +210,8 @@ def _draw_camera(
 ) -> CameraModel:
     """Camera of the demonstrations, moved and rotated.
 
-    It looks at a point near the middle of the workplace and is then rotated about its axis.
+    A random camera looks at a point near the middle of the workplace, and is then rotated about
+    its axis.
     """
     camera = workplace.scene.camera
     rotation, position = camera.pose[:3, :3], camera.pose[:3, 3]
@@ -218,7 +220,7 @@ def _draw_camera(
         position = position + CAMERA_SHIFT * rng.uniform(-1, 1, 3)
         middle = workplace.hover().position.numpy()
         sight = middle + _CAMERA_MISS * rng.uniform(-1, 1, 3) - position
-        # Rotation axis times the sine of the angle: near the rotation vector of small tilts.
+        # Rotation axis times the sine of the angle: nearly the rotation vector for small tilts.
         tilt = np.cross(rotation[:, 2], sight / np.linalg.norm(sight))
         rotation = _rotation(tilt) @ rotation
         roll = rng.uniform(-np.pi, np.pi)

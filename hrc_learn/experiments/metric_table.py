@@ -170,7 +170,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def spread(values: Float[np.ndarray, " trials"]) -> dict[str, float]:
     """Quantiles of finite values, at least one: median, p95, min and max."""
     levels = {"median": 0.5, "p95": 0.95, "min": 0.0, "max": 1.0}
-    # "higher" returns a measured value: at least the requested fraction is at or below it.
+    # "higher" returns a measured value. At least the requested fraction of values is not above.
     found = np.quantile(values, [*levels.values()], method="higher")
     return dict(zip(levels, found.tolist(), strict=True))
 
@@ -181,7 +181,7 @@ class Summary:
 
     trials: int
     failed: Mapping[int, str]
-    """Reason by seed."""
+    """Reasons of failures, by seed."""
     spread: Mapping[str, Mapping[str, float]]
     """Quantiles of the values that are not counts, by key; failed trials are included."""
     totals: Mapping[str, int]
@@ -192,7 +192,7 @@ class Summary:
         """Statistics of the trials.
 
         Raises:
-            ValueError: Without trials.
+            ValueError: There are no trials.
         """
         if not trials:
             raise ValueError("there are no trials to sum up.")

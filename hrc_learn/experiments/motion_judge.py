@@ -65,7 +65,7 @@ class Replay:
     sent: Float[np.ndarray, "T joints"]
     """Commanded joint positions, to be reached when the next frame is due [rad]."""
     gripper: Float[np.ndarray, " T"] | None = None
-    """Measured opening; None: as planned."""
+    """Measured opening of the gripper; None: it is as planned."""
     objects: Mapping[str, Float[np.ndarray, "T 7"]] = field(default_factory=dict)
     """Pose of each object."""
     failure: str = ""
@@ -355,7 +355,7 @@ def _function(option: str, text: str) -> Callable[..., Any]:
 
 
 def _module(file: str) -> ModuleType:
-    """Module of a file with any name, which may be that of an installed package."""
+    """Module from a file, which may have the same name as an installed package."""
     spec = importlib.util.spec_from_file_location(file, file)
     assert spec is not None
     assert spec.loader is not None

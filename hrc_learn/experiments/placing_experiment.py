@@ -51,7 +51,7 @@ from hrc_learn.viz.report import Section
 
 @dataclass(frozen=True, kw_only=True)
 class PlacingExperiment:
-    """Place the object on every shelf, planned in both spaces."""
+    """Place the object on every shelf, with motions planned in both spaces."""
 
     title: ClassVar[str] = "Placing: demonstrated once, reproduced faster, on other shelves"
     summary: ClassVar[str] = SUMMARIES["placing"]

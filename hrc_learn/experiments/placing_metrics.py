@@ -40,12 +40,12 @@ class PlacingOutcome:
     """Largest distance of the approach from the demonstrated path, when the demonstrated path
     is shifted so that it ends at this goal [m]."""
     place_error: float
-    """Horizontal distance of the object on its board from its intended place [m]."""
+    """Horizontal distance between the placed object and its intended place [m]."""
     place_tilt: float
-    """Angle of the object from its intended orientation [rad]."""
+    """Angle between the object's actual and intended orientation [rad]."""
     place_turns: tuple[float, float] | None = None
-    """Pitch and yaw of the object from its intended orientation [rad]; None with more than five
-    joints."""
+    """Pitch and yaw of the object relative to its intended orientation [rad]; None if the arm
+    has more than five joints."""
     violations: int
     """Steps in which a joint was outside its range of position or velocity."""
     contacts: tuple[Touch, ...]
@@ -59,7 +59,7 @@ class PlacingOutcome:
 
     @classmethod
     def of(cls, run: SimulatedPlacing, scene: PlacingScene) -> "PlacingOutcome":
-        """Measure a placing on any shelf against the demonstration."""
+        """Measure a placing on any shelf, relative to the demonstration."""
         workplace, demonstration = scene.workplace, scene.demonstration
         shown = demonstrated_path(demonstration, run.cell.chain)
         # The load crosses the front edge of the boards before the end effector does.
@@ -99,7 +99,8 @@ def approach_deviation(
         path: Path of the end effector [m].
         goal: Intended end of the path [m].
         demonstrated: Demonstrated path of the end effector, which ends behind the edge [m].
-        edge: The approach begins where the path crosses this y for the last time [m].
+        edge: y of the front edge of the boards [m]; the approach begins where the path crosses
+            this edge for the last time.
 
     Returns:
         Distance [m]; infinite if the path ends in front of the edge.
@@ -205,7 +206,7 @@ def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
 
 
 def _turn_metrics() -> list[Metric[ByShelf]]:
-    """Largest pitch and yaw of the objects; no rows with more than five joints."""
+    """Largest pitch and yaw of the objects; left out for arms with more than five joints."""
 
     def largest(outcomes: ByShelf, which: int) -> float | None:
         turns = [o.place_turns[which] for o in outcomes.values() if o.place_turns]

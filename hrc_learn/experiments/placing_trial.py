@@ -39,7 +39,7 @@ _TEACHING_ITERATIONS = 4
 # Largest distance of the end of a demonstration from a shelf [m]. Shelves are 24 cm apart. A
 # careless demonstration may miss its shelf by 5 cm.
 _SHELF_DISTANCE = 0.05
-# Starts drawn before the search for a collision-free one fails.
+# Number of starts that are drawn before the search for a collision-free start fails.
 _DRAWS = 100
 
 
@@ -86,12 +86,12 @@ class SimulatedPlacing(CellRun):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlacingScene:
-    """World of placings, with the skill and the demonstration it was learned from."""
+    """World of placings, the placing skill, and the demonstration that it was learned from."""
 
     skill: PlacingSkill
     workplace: Workplace
     world: World
-    """World of that workplace; all placings use it, with the same imperfections."""
+    """World of `workplace`; all placings use this world, with the same imperfections."""
     demonstration: Demonstration
     demonstrated_shelf: str
     correction: PlaceCorrection | None = None
@@ -107,12 +107,12 @@ class PlacingScene:
         access: ArmAccess = SIMULATED,
         observer: Observer = UNOBSERVED,
     ) -> SimulatedPlacing:
-        """Carry the first object of the scene, already in the gripper, to a shelf; release it.
+        """Carry the scene's first object, which is in the gripper, to a shelf and release it.
 
         Args:
             shelf: Name of the shelf.
             start: True joint positions at the start [rad].
-            space: Planning space: the primitive of the joints, as in the paper, or of the pose.
+            space: Space in which the motion is planned: joints, as in the paper, or pose.
             speed: Speed relative to the demonstration.
             access: Access to the arm.
             observer: Live dashboard of the run.
@@ -154,7 +154,7 @@ def taught_correction(
 
     Args:
         world: World with the imperfections of the arm.
-        place: Known place.
+        place: Known pose of the tool, to which the person guides it.
         near: Joint positions near which the arm reaches the place [rad].
         rng: Source of the person's error.
 
@@ -183,7 +183,7 @@ def taught_correction(
 def random_start(
     world: World, workplace: Workplace, noise: float, rng: np.random.Generator
 ) -> Float[Tensor, " joints"]:
-    """Random joint positions about home, within the limits and free of contacts [rad].
+    """Random joint positions around home, within the limits and free of contacts [rad].
 
     Afterwards, the world is in this state, with its first object in the gripper.
 
@@ -226,7 +226,7 @@ def demonstrated_shelf(end: Float[np.ndarray, "3"], workplace: Workplace) -> str
     """Shelf at which a path of the end effector ends.
 
     Raises:
-        ValueError: If it ends more than 5 cm from the place on any shelf.
+        ValueError: If the path ends more than 5 cm from the place on any shelf.
     """
     distance = {
         shelf: float(np.linalg.norm(workplace.shelf(shelf).position.numpy() - end))

@@ -144,7 +144,7 @@ def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[Stop
         opened = partial(Ros2Arm, chain, site.ros2)
     elif not site.ip:
         raise ValueError("ip is empty: give the address of the control box of the arm.")
-    # Only one driver is imported: both register the same types, which fails the second time.
+    # Only one driver is imported: both register the same types, and that fails the second time.
     elif site.driver == "franka":
         loop = FrankaConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
         with FrankaArm(site.ip, chain, loop) as arm:
@@ -175,7 +175,7 @@ class ArmRun(CellRun):
         """Write `run.rrd`, `log.npz` and `result.json`.
 
         Args:
-            folder: Folder of the run; an existing one is replaced.
+            folder: Folder of the run; an existing folder is replaced.
             title: Title of the recording.
             configuration: Configuration to save with the run.
         """
@@ -224,7 +224,7 @@ def task_of(experiment: Experiment[Any], shelf: str) -> tuple[Workplace, Task]:
 
     Args:
         experiment: Placing, grasping or collaboration.
-        shelf: Shelf for the object of placing.
+        shelf: Shelf for the object, in the case of placing.
     """
     if isinstance(experiment, PlacingExperiment):
         workplace = Workplace()

@@ -27,8 +27,8 @@ ELBOW = 3
 
 # Time after the end of a pull in which its effect still counts, while the arm moves back [s].
 _AFTER = 1.0
-# Largest lag of the end effector behind its goal [s]: servos lag, and a motion that a limit
-# delays lags further.
+# Largest lag of the end effector behind its goal [s]: servos lag, and limits may delay a motion
+# further.
 _LAG = 0.5
 # Distance that the goal must move within `_LAG` to have a direction [m].
 _LEAST_MOTION = 0.002
@@ -78,21 +78,21 @@ def true_image_jacobian(
 
 
 def true_tool(motion: MotionLog, world: World, steps: int) -> Pose:
-    """True poses of the tool centre point, (time,), independent of the encoders."""
+    """True poses of the tool centre point, independent of the encoders; batch shape (time,)."""
     hand = body_poses(motion, "hand", steps)
-    # The hand itself may be mounted askew; the tool centre point lies on its axis.
+    # The hand may be mounted askew; the tool centre point lies on the axis of the hand.
     return Pose(hand.apply(torch.from_numpy(world.arm.tool_offset)), hand.orientation)
 
 
 def body_poses(motion: MotionLog, name: str, steps: int) -> Pose:
-    """True poses of a link or an object in the first steps of a run, (time,)."""
+    """True poses of a link or an object in the first steps of a run; batch shape (time,)."""
     (body,) = (body for body in motion.bodies(steps) if body.name == name)
     return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Deviation:
-    """Displacement of end effector and elbow while a person pushed; NaN otherwise."""
+    """Displacement of end effector and elbow due to a person's pushes; NaN at other times."""
 
     position: Float[np.ndarray, " time"]
     """Displacement of the end effector [m]."""
@@ -133,8 +133,9 @@ class Deviation:
 
     @classmethod
     def from_path(cls, log: LoggedSteps, chain: SerialChain) -> "Deviation":
-        """Deviation from the path, measured by the encoders, while a path is followed and the
-        arm is pushed.
+        """Deviation from the path while the arm follows it and is pushed.
+
+        The encoders measure this deviation.
 
         Args:
             log: Log of the run.
@@ -176,8 +177,8 @@ def unwanted_contacts(
     Args:
         world: World at the end of the run.
         log: Log of the run.
-        released: Time at which each object was released on its shelf [s]; its later contacts
-            are wanted.
+        released: Time at which each object was released on its shelf [s]; later contacts of
+            this object do not count.
     """
     released = released or {}
     carried = [
@@ -224,7 +225,7 @@ def grasp_offset(
 
 
 def place_angle(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> float:
-    """Angle of a placed box from its intended orientation [rad].
+    """Angle between the orientation of a placed box and its intended orientation [rad].
 
     Args:
         pose: Pose of the box.
@@ -238,11 +239,12 @@ def place_pitch_and_yaw(
 ) -> tuple[float, float]:
     """Absolute pitch and yaw of a placed box relative to its intended orientation [rad].
 
-    Yaw is about the vertical, pitch about the horizontal axis across the approach of the hand.
+    Yaw is a rotation about the vertical axis. Pitch is a rotation about the horizontal axis
+    that is perpendicular to the direction of the hand.
 
     Args:
         pose: Pose of the box.
-        goal: Orientation of the hand at the goal, not vertical.
+        goal: Orientation of the hand at the goal; the hand must not point up or down.
     """
     turn = _place_turn(pose, goal)
     up = turn.new_tensor([0.0, 0.0, 1.0])
@@ -251,7 +253,9 @@ def place_pitch_and_yaw(
 
 
 def _place_turn(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-    """Rotation vector of a box from its intended orientation, in the base frame [rad]."""
+    """Rotation vector from the intended orientation of a box to its actual one, in the base
+    frame [rad].
+    """
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
     back = quaternion.conjugate(quaternion.multiply(goal, _IN_HAND))
     # A box looks the same after half a turn about its z axis.
@@ -261,7 +265,7 @@ def _place_turn(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> Flo
 
 
 class PullEffect(NamedTuple):
-    """Effect of one pull at the elbow at any moment of a job."""
+    """Effect of one pull at the elbow during a job."""
 
     elbow: float
     """Largest displacement of the elbow [m]."""
@@ -283,7 +287,7 @@ def pull_effects(
 
     Args:
         log: Log of a work cell.
-        pulls: Pulls in the time of the log [s].
+        pulls: Pulls, with times by the clock of the log.
         chain: Kinematics of the arm.
         encoder_offset: Constant errors of the encoders [rad], to compute true distances: a
             displaced elbow changes the effect of these errors. None: distances as the encoders
@@ -317,9 +321,9 @@ def _hidden_displacement(
     """Displacement of the end effector that a push causes and the encoders do not show [m].
 
     Because of the encoders' errors, the true position of the end effector differs from the
-    measured one by an offset that depends on the joints. The result is the change of this
-    offset from the undisturbed joints to the present ones. The undisturbed joints are the
-    joints of the path or, without a path, the last joints before the push.
+    measured position by an offset that depends on the joint positions. The result is the change
+    of this offset from the undisturbed to the present joint positions. The undisturbed joint
+    positions are those of the path or, without a path, the last ones before the push.
     """
     joints = torch.from_numpy(log["joint_position"])
     path = torch.from_numpy(log["path_joints"])
@@ -386,7 +390,7 @@ def _distance_across(
     goal: Float[np.ndarray, "time 3"],
     time: Float[np.ndarray, " time"],
 ) -> Float[np.ndarray, " time"]:
-    """Length of the part of an error perpendicular to the recent motion of the goal [m]."""
+    """Length of an error's component perpendicular to the recent motion of the goal [m]."""
     lag = min(_lag_samples(time), len(time))
     motion = np.full_like(goal, np.nan)
     motion[lag:] = goal[lag:] - goal[: len(goal) - lag]

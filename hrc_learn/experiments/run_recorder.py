@@ -58,7 +58,7 @@ LONGEST = 16.0
 """Longest film [s]; a longer run is shown faster."""
 
 _EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
-_EXTENT = 0.8  # the camera is nearer to a job of smaller extent, such as the SO-101's [m]
+_EXTENT = 0.8  # extent of a job [m]; the camera is nearer to smaller jobs, such as the SO-101's
 _FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
 
 _CAPTIONS: dict[str, str] = read_toml(Path(__file__).with_name("film_captions.toml"))
@@ -225,8 +225,8 @@ def film(recording: RunRecording) -> Film:
 
 
 def frames(recording: RunRecording) -> Iterator[Picture]:
-    """Pictures of the film, rendered if this machine can, otherwise drawn."""
-    job = np.vstack([recording.position, np.zeros(3)])  # with the base of the arm
+    """Pictures of the film, rendered if this machine can render, otherwise drawn."""
+    job = np.vstack([recording.position, np.zeros(3)])  # includes the base of the arm
     size = float(np.clip(np.ptp(job, axis=0).max() / _EXTENT, 0.5, 1.0))
     towards = size * np.array(_TOWARDS) + (1.0 - size) * job.mean(axis=0)
     camera = CameraModel(

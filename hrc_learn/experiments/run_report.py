@@ -125,7 +125,7 @@ def image_jacobian_figure(run: RunRecording) -> Figure:
 
 
 def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
-    """Paths of the end effector with every object, and the demonstration."""
+    """Paths of the end effector while it handles each object, and the demonstrated path."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 5.2))
         axes = space(figure)

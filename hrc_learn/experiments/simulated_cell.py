@@ -182,7 +182,8 @@ def simulated_cell(
         on_phase: Called with name and start time [s] of each phase.
         on_step: Called after each step of the world.
         rng: Random generator that decides which images are lost.
-        clearance: Distance between the arm and its surroundings, kept when it is pushed.
+        clearance: Returns the arm's distance from itself and its surroundings; a pushed arm
+            keeps a margin.
         watch: Watches for people near the arm.
     """
     config, plant = config or WorkCellConfig(), access.declared(world.imperfections.sizes)

@@ -71,7 +71,7 @@ def unmarked_for(
         workplace: Workplace with markers.
         skill: Skill with landmarks; metrics use the point of the tool that the skill sees.
         look: Look of the scene.
-        seed: Draws clutter and light.
+        seed: Seed of clutter and light.
 
     Raises:
         ValueError: The skill needs markers.
@@ -105,10 +105,10 @@ _ARRANGEMENTS = 10_000
 _ENTERS, _REACHES = (4.0, 9.0), (3, 5)
 # `_KEPT_CLEAR`: distance that people keep from a resting arm that they see [m]: the thickness
 # of a sleeve. `_CHECKED_EVERY`: time between checks of this distance [s]. `_DRAWS`: largest
-# number of workers that are drawn to find one who can reach under the arm at this distance.
+# number of workers that are drawn to find one that can reach under the arm at this distance.
 _KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 60
-# The search ends if none of this many drawn workers can reach under the arm. Under arms with
-# enough room, one worker in three can.
+# The search ends if none of this many drawn workers can reach under the arm. If there is enough
+# room, one worker in three can reach under it.
 _HOPELESS = 30
 # Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
 # push creep.
@@ -146,7 +146,7 @@ def workplace_for(shelves: Sequence[str], robot: Arm) -> Workplace:
     """Workplace of an arm with one object for each shelf.
 
     Raises:
-        ValueError: If no shelf is named, or more shelves than there are objects.
+        ValueError: If no shelf is named, or if there are more shelves than objects.
     """
     if not 1 <= len(shelves) <= len(THREE_OBJECTS):
         text = f"{len(shelves)} shelves are named, but there are 1 to {len(THREE_OBJECTS)}"
@@ -218,7 +218,7 @@ def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
         rng: Source of the worker's body, times and motions.
 
     Raises:
-        ValueError: No worker can reach under the arm that waits.
+        ValueError: No worker can reach under the waiting arm.
     """
     # `random_visit` draws visits at a table's side +y. The table is therefore turned by -90
     # degrees, so that its side -x faces +y, and the visit is turned back afterwards.
@@ -307,8 +307,9 @@ def margin_to_stop(
         contact: Highest relative speeds of contacts [m/s]; None: no contact is allowed.
 
     Returns:
-        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach, or would touch the
-        person within the limits of power and force limiting.
+        d - v_h v/a - v^2/(2 a), with the distance d and the other symbols of `near_worker`. It
+        is infinite where the arm does not approach the person, or would touch the person within
+        the limits of power and force limiting.
     """
     stop = replace(config, reaction_time=0.0, clearance=0.0)
     closing = -found.rate(joint_velocity, torch.zeros_like(person_velocity))
@@ -319,7 +320,7 @@ def margin_to_stop(
 
 
 class NearWorker(NamedTuple):
-    """Measures of an arm near a worker, a value for each step."""
+    """Measures of an arm near a worker, with one value for each step."""
 
     margin: Float[np.ndarray, " steps"]
     """Smallest margin of the distance over the stopping distance [m]."""
@@ -389,7 +390,7 @@ def near_worker(
 
 
 class GivingPerson:
-    """Person with an object in the hand, reacting to the motion of the robot's hand.
+    """Person that hands over an object, and reacts to the motion of the robot's hand.
 
     Attributes:
         hand_over: Actions of the person that are decided so far.

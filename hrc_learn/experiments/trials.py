@@ -24,7 +24,7 @@ class Trial:
 
     seed: int
     values: Mapping[str, float | int | str]
-    """Measured values by name; for a failed trial, those that could still be measured."""
+    """Measured values by name; for a failed trial, values that could still be measured."""
     failure: str = ""
     """Reason of a failure; empty after a success."""
 
@@ -33,7 +33,7 @@ class Trial:
         """Trial from the mapping that a run returned: values, and "failure" with a reason.
 
         Raises:
-            ValueError: If a value is neither a number nor text, or one is named "seed".
+            ValueError: If a value is neither a number nor text, or a value is named "seed".
         """
         if _SEED in measured:
             raise ValueError("a trial cannot measure 'seed': that key names the trial itself.")
