@@ -172,7 +172,7 @@ class CurationPage:
         }
 
     def images(self, episode: int, camera: int, first: int) -> Content:
-        """A block of images: the number of images, the bytes of each image, then the images."""
+        """A block of images: their number, each image's length in bytes, then the images."""
         key = self._images.cameras[camera]
         if episode not in self._lengths or not 0 <= first < self._lengths[episode]:
             raise RefusedError(404, "There is no such image.")

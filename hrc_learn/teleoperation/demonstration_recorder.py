@@ -86,7 +86,7 @@ class RecordingQuality:
             now: Arrival time [s].
             stamp: Time of the reading, by the arm's clock [s].
             joint_position: Joint positions [rad].
-            gripper: Opening [m].
+            gripper: Opening of the gripper [m].
             touching: Unexpected contacts of the arm, as text.
         """
         self.arrivals.append(now)
@@ -140,7 +140,7 @@ class RecordingQuality:
         return ""
 
     def lost(self) -> str:
-        """Description of missing frames found from the stamps; empty if there are none."""
+        """Description of missing frames, found from time stamps; empty if none is missing."""
         gaps = np.diff(self._stamps)
         if not len(gaps):
             return ""
@@ -225,7 +225,7 @@ class DemonstrationRecorder:
     is complete when the `with` block has ended; without an episode, no dataset is written. A
     demonstration that is open when the block ends is saved, even after a signal or an error.
     During recording, a draft is written every `_DRAFT_EVERY` seconds, less often for a long
-    demonstration; after a power cut, `recover_dataset` makes an episode of the draft.
+    demonstration. After a power cut, `recover_dataset` turns the draft into an episode.
 
     Attributes:
         state: State of the current demonstration.

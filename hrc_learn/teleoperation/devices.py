@@ -1,5 +1,5 @@
 """Devices that move the end effector: a gamepad, the keys of a terminal, and a haptic device
-with force feedback like the paper's Omega.
+with force feedback, such as the Omega of the paper.
 
 A device implements `Human.read`, which returns the person's input at each step. The haptic
 device has not been run on hardware: it needs `forcedimension-core` (the extra `haptic`) and the
@@ -51,7 +51,7 @@ BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
 # Rumble: the slow motor reports contact and nearby people; the quick motor reports input that
 # the arm does not follow. Pulses are easier to notice than motors that run continuously.
 PULSE_EVERY, _PULSE = 0.25, 0.12  # period and duration of the pulses [s]
-_LEAST_RUMBLE = 0.1  # fraction of full strength; motors hardly turn below
+_LEAST_RUMBLE = 0.1  # fraction of full strength below which motors hardly turn
 _CONTACT = (20.0, 60.0)
 """Contact forces at which pulses begin, and at which they are strongest [N]. Friction of the
 simulated joints looks like a contact of 17 N; a scripted person pulls with 60 N at most."""
@@ -95,10 +95,10 @@ def deflection(stick: Float[np.ndarray, " axes"]) -> Float[np.ndarray, " axes"]:
 class Gamepad(Human):
     """Moves the end effector by sticks: the left one horizontally, the right one vertically.
 
-    Shoulder buttons open and close the gripper, the others send the requests of `BUTTONS`. The
-    end effector turns to the orientation that `coarse_orientation` gives for its position. An
-    unplugged gamepad requests nothing. The gamepad rumbles when the arm touches something,
-    slows down for people or does not follow.
+    Shoulder buttons open and close the gripper; other buttons send the requests of `BUTTONS`.
+    The end effector turns to the orientation that `coarse_orientation` gives for its position.
+    An unplugged gamepad requests nothing. The gamepad rumbles when the arm touches something,
+    slows down for people, or does not follow the input.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Gamepad(Human):
         Raises:
             ValueError: There is no gamepad.
         """
-        # There is no window, so events must come even without a focused window.
+        # This program has no window, so SDL must report events without a focused window.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -363,7 +363,7 @@ class HapticDevice(Human):
         Args:
             chain: Kinematics of the guided arm.
             device: Interface of Force Dimension's library, `forcedimension_core.dhd`.
-            number: Number of the device; -1: the one opened last.
+            number: Number of the device; -1: the device opened last.
             clock: Monotonic clock [s].
         """
         self._chain, self._device, self._number = chain, device, number

@@ -3,9 +3,10 @@ follows the hand, and several inputs are combined and filtered.
 
 This is the mixed interface of the paper, with gizmos (handles that a person drags) on joints
 and end effector. In the paper, the displacement of a joint's gizmo commands a proportional
-velocity, which the pseudo-inverse of the joint's Jacobian maps to the joints (section VII;
-"pinv" here). Here, the displacement by default commands a force, which the transposed Jacobian
-maps to the joints. The gizmo of the end effector requests a velocity of the end effector.
+velocity, which the pseudo-inverse of the joint's Jacobian maps to the joints (section VII; the
+mapping "pinv"). By default, this module instead takes the displacement as a force, which the
+transposed Jacobian maps to the joints (the mapping "transpose"). The gizmo of the end effector
+requests a velocity of the end effector.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,9 +28,9 @@ from hrc_learn.skills.step_report import PersonFeedback, filter_hindrance
 
 ForceMapping = Literal["transpose", "pinv"]
 DEFAULT_MAPPING: ForceMapping = "transpose"
-"""Default mapping of a pull: a force. After projection into the null space, the paper's
-pseudo-inverse moves the elbow about a third as fast as this force; for 6 to 23 % of the pull
-directions, it moves the elbow against the pull (benchmarks/bench_pull_mapping.py).
+"""Default mapping of a pull: the pull is a force. After projection into the null space, the
+paper's pseudo-inverse moves the elbow about a third as fast as this force. For 6 to 23 % of the
+pull directions, it moves the elbow against the pull (benchmarks/bench_pull_mapping.py).
 """
 
 
@@ -52,7 +53,7 @@ class InteractionForceConfig:
     damping: float = 3.0
     """c_d of the mapping "pinv": null-space input per joint velocity [N m s/rad]."""
     max_nullspace_input: float = 20.0
-    """Bound on d of each joint [N m]; d is scaled as a whole."""
+    """Bound on the null-space input d of each joint [N m]; d is scaled as a whole."""
     turn_rate: float = 4.0
     """Decay rate of the end effector's orientation error [1/s]."""
     turn_speed: float = 0.8

@@ -1,4 +1,4 @@
-"""Serve the browser page from which a person guides the arm, as with an AR headset."""
+"""Serve the browser page from which a person guides the arm, by mouse or with an AR headset."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ class PageConfig(AddressConfig):
         (0.7, 0.0, 0.0),
         (0.4, 0.3, 0.0),
     )
-    """Points of the real workplace, in the base frame, that a person in a headset touches to
-    lay the virtual arm over the real one [m]; at least three, 10 cm apart or more."""
+    """Points of the real workplace, in the base frame [m]; at least three, 10 cm apart or more.
+    A person with a headset touches them to align the virtual arm with the real arm."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,7 +90,7 @@ class PageConfig(AddressConfig):
 # rotates the overlaid arm by 6 degrees.
 _APART = 0.1
 _PERIOD = 0.04
-"""Period of refreshes [s]. Each posts the person's efforts and redraws the scene."""
+"""Period of refreshes [s]. Each refresh posts the person's input and redraws the scene."""
 _PANEL_EVERY = 5  # refreshes of the scene per refresh of the panel: text may be slower
 _MOST_FAILURES = 25
 """Number of successive failed refreshes after which the page ends: one second. A failed refresh

@@ -134,7 +134,7 @@ class HeldGizmos:
     def release(self, holder: Hashable = None, name: str | None = None) -> None:
         """Release one gizmo of a holder, all gizmos of a holder, or all held gizmos.
 
-        After a lost connection has returned, the person must take the gizmo again.
+        After a lost connection is restored, the person must take the gizmo again.
         """
 
         def chosen(key: Key) -> bool:
@@ -166,13 +166,13 @@ class HeldGizmos:
 
     @property
     def turn(self) -> Float[torch.Tensor, "4"]:
-        """Unit quaternion of the rotation added (wxyz)."""
+        """Unit quaternion of the added rotation (wxyz)."""
         with self._lock:
             return self._turn
 
     @property
     def turn_vector(self) -> tuple[float, float, float] | None:
-        """Rotation vector in the base frame [rad]; None: nothing was added."""
+        """Vector of the added rotation, in the base frame [rad]; None: no added rotation."""
         turn = self.turn
         if float(quaternion.angle(turn, _NO_TURN)) == 0.0:
             return None

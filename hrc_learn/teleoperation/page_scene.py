@@ -288,7 +288,7 @@ _ASPECT = 1.2  # smallest aspect ratio at which both cabinet and twin are in vie
 
 
 async def _step_back(client: Any) -> None:
-    """Move the camera back if its view is narrow, as on a phone, so that it sees the same."""
+    """Move the camera back if its view is narrow, as on a phone, to show the same scene."""
     aspect = client.camera.aspect
     if aspect < _ASPECT:
         look_at = np.array(_LOOK_AT)

@@ -122,7 +122,7 @@ class PageSessionConfig:
 
 
 class PageSession:
-    """Steps the arm as the person at the page asks, and records demonstrations.
+    """Steps the arm as the person at the page requests, and records demonstrations.
 
     Attributes:
         world: World of the arm.

@@ -1,7 +1,7 @@
 """Serve the clients of the page: each has two sockets, and one client has control of the arm.
 
-The sockets of a client are its session, and its view of the scene, which viser draws and
-serves.
+One socket of a client is its session: requests, signs of life and status. The other is its view
+of the scene, which the library viser draws and serves.
 
 viser accepts any client that reaches its port, and trusts all messages. Its port therefore
 requires a secret here, and messages reach it only through the gate.
@@ -54,7 +54,7 @@ class _Client:
     lag: float = 0.0
     """Time since the client's page last responded [s]."""
     asked: float = math.inf
-    """Time at which the client requested control [s]; infinite: it has not."""
+    """Time at which the client requested control [s]; infinite: no request."""
     slowed: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
     """Time at which the client was last slow, and its silence and lag at that time [s]."""
 
@@ -120,9 +120,9 @@ class Control:
         """Note a sign of life.
 
         Args:
-            client: Client that gives it.
-            lag: Time since the client's page last responded [s]. A worker in the browser gives
-                the signs of life, even if the page hangs.
+            client: Client that gave the sign of life.
+            lag: Time since the client's page last responded [s]. A web worker sends the signs
+                of life, even if the page hangs.
         """
         with self._lock:
             if (one := self._clients.get(client)) is None:
@@ -138,8 +138,8 @@ class Control:
 
         Args:
             client: Client that wants to act.
-            idle: True if its message changes nothing, such as a hand that holds nothing. Only
-                other messages reset the idle time.
+            idle: True if the client's message changes nothing, such as a hand that holds
+                nothing. Only other messages reset the idle time.
         """
         with self._lock:
             self._pass_on()

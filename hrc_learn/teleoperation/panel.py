@@ -26,7 +26,10 @@ from hrc_learn.viz.report import page_templates
 
 @dataclass(frozen=True, kw_only=True)
 class PageStatus(RecorderStatus):
-    """Session status shown on the page; of an autonomous arm, `seconds` is the working time."""
+    """Session status shown on the page.
+
+    If the arm is autonomous, `seconds` is its working time.
+    """
 
     title: str = ""
     """Name of the guided arm."""
@@ -50,7 +53,7 @@ def panel_texts() -> Any:
 
 
 # `_LEAST_CONTACT`: smallest contact force shown [N]; simulated joint friction looks like 17 N.
-# `_LEAST_SLIP`: smallest change of a gripper's opening that is a slip rather than noise [m].
+# `_LEAST_SLIP`: smallest change of a gripper's opening that counts as a slip, not as noise [m].
 _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
 
 

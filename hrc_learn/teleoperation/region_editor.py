@@ -1,4 +1,4 @@
-"""Draw, move and size the Cartesian region with the mouse, and mark the target."""
+"""Draw, move and size the region that attracts the end effector, and mark the target."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -43,7 +43,7 @@ def meet_plane(
 
     Args:
         origin: Origin of the ray [m].
-        direction: Unit vector.
+        direction: Direction of the ray, a unit vector.
         axis: Axis normal to the plane: 2 for a horizontal plane.
         value: Coordinate of the plane along that axis [m].
 
@@ -64,11 +64,11 @@ def meet_box(
 ) -> float:
     """Distance at which a ray enters an axis-aligned box [m]; infinity if it misses the box.
 
-    The slab method of Kay and Kajiya (1986).
+    This is the slab method of Kay and Kajiya (1986).
 
     Args:
         origin: Origin of the ray [m], outside the box.
-        direction: Unit vector.
+        direction: Direction of the ray, a unit vector.
         centre: Centre of the box [m].
         half_size: Half size of the box [m].
     """
@@ -149,7 +149,7 @@ class RegionEditor:
 
         Args:
             region: The region.
-            active: True if the region attracts the end effector; None: as before.
+            active: True if the region attracts the end effector; None: no change.
         """
         if active is not None:
             self._in_force.value = active
@@ -254,8 +254,8 @@ class RegionEditor:
             self.draw(region_over(np.array(points), self.drawn.centre[2] - half, 2 * half))
 
     def _mark_above(self, event: Any) -> None:
-        """Mark the target above the clicked point of the furniture; if none was hit, above the
-        clicked point at the height of the table.
+        """Mark the target above the clicked point of the furniture. If the click hit no
+        furniture, mark it above the clicked point at the height of the table.
         """
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         distances = [

@@ -186,7 +186,7 @@ class ScenarioRun:
 
         Args:
             scenario: Task to perform.
-            fps: Commands per second of the world's time.
+            fps: Commands per second of simulated time.
             seed: Seed of the first initial configuration.
             imperfections: Imperfections of arm, calibration and workplace, drawn again for each
                 seed; None: no imperfections.
@@ -243,7 +243,7 @@ class ScenarioRun:
             width: Opening of the gripper [m].
 
         Returns:
-            Joint positions that were commanded in the end, within the limits [rad].
+            Joint positions that were actually commanded, within the limits [rad].
         """
         with torch.inference_mode():
             _, sent = self.servo.follow(joints)
@@ -335,7 +335,7 @@ class ScenarioRun:
         place = self.scenario.workplace
         middle, half = (x.numpy() for x in place.object_region())
         corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]) * half
-        tool = self.world.hand_marker_offset() * (1.0, -1.0, -1.0)  # it points down
+        tool = self.world.hand_marker_offset() * (1.0, -1.0, -1.0)  # the tool points down
         heights = (place.hover_height, 2 * middle[2])
         above = [np.array([*middle[:2], h]) + tool for h in heights]
         return np.concatenate([centre + corners for centre in (middle, *above)])

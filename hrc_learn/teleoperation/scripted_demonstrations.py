@@ -92,11 +92,11 @@ class ServoDemonstrationConfig(DemonstrationConfig):
     """Scripted demonstration of visual servoing."""
 
     duration: float = 9.0
-    """Duration from the first point to above the object [s]."""
+    """Duration of the motion from the first point to the point above the object [s]."""
     points: int = 4
-    """Random points passed before the object."""
+    """Number of random points that the path passes before the object."""
     descent: float = 0.06
-    """Height from which the end effector finally descends vertically [m]."""
+    """Height of the final vertical descent [m]."""
     reach: tuple[float, float, float] = (0.10, 0.08, 0.06)
     """Largest horizontal distances of points and object from the middle of the table, and
     largest height of the points above the hover pose [m]."""
@@ -272,7 +272,7 @@ def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
     """Turn of the gripper, within the turns that the arm can reach (`hover_turns`) [rad].
 
     With this turn, the gripper closes along the object's x axis. If the arm reaches no such
-    turn, it is the nearest end of the range.
+    turn, the result is the nearest end of the range.
     """
     low, high = workplace.hover_turns
     yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
@@ -291,7 +291,8 @@ _ATTEMPTS = 3
 # the lag of the arm.
 _ARRIVED = 0.02
 
-# The elbow is pulled around the open door: first away from the cabinet, then over to its side.
+# Pulls of the elbow around the cabinet's open door: first away from the cabinet, then to its
+# side.
 ELBOW_FORCES = (
     ScriptedForce(start=0.5, duration=5.0, towards=(0.20, 0.25, 0.58)),
     ScriptedForce(start=4.5, duration=11.0, towards=(0.25, -0.10, 0.65)),
@@ -309,7 +310,8 @@ class PlacingDemonstrationConfig(DemonstrationConfig):
     pull_elbow: bool = True
     """True if the expert pulls the elbow past the cabinet's open door."""
     lift: float = 0.03
-    """Height of the end effector over the board's front edge, above its final height [m]."""
+    """Height of the end effector over the board's front edge, relative to its final height [m].
+    """
 
 
 def placing_expert(

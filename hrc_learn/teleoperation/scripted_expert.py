@@ -1,5 +1,5 @@
-"""Simulate people by scripts: one pulls the arm at given times, an expert guides the end
-effector along way points.
+"""Simulate people by scripts: a person that pulls the arm at given times, and an expert that
+guides the end effector along way points.
 """
 
 import math
@@ -103,7 +103,7 @@ class ScriptedPerturbation(Human):
         Args:
             chain: The arm.
             forces: Pulls to exert.
-            begin: Time at which the script starts [s]; None: when `begin` is called.
+            begin: Time at which the script starts [s]; None: it starts when `begin` is called.
         """
         self._chain = chain
         self.forces = tuple(forces)
@@ -138,7 +138,7 @@ class GuidedPath:
         """Fix the path.
 
         Args:
-            waypoints: Positions to pass [m]; successive ones must differ.
+            waypoints: Positions to pass [m]; successive positions must differ.
             duration: Time from the first to the last way point [s].
             start: Time at the first way point [s].
         """
@@ -146,7 +146,7 @@ class GuidedPath:
         from scipy.interpolate import PchipInterpolator  # takes a quarter of a second
 
         length = np.concatenate([[0.0], np.cumsum(chords)])
-        # Monotone between way points: an overshooting end effector would hit the boards.
+        # The curve is monotone between way points: overshooting, the arm would hit the boards.
         self._curve = PchipInterpolator(length / length[-1], waypoints)
         self._slope = self._curve.derivative()
         self._start, self.duration = start, duration
@@ -179,7 +179,7 @@ class Tremor:
         """Draw the phases.
 
         Args:
-            amplitude: Amplitude of the tremor [m]. The drift's amplitude is three times that.
+            amplitude: Amplitude of the tremor [m]; the drift has three times this amplitude.
             rng: Source of the phases.
         """
         # Two frequencies of tremor (Elble and Koller 1990: 8 to 12 Hz) and two of drift.
@@ -216,7 +216,7 @@ class ScriptedExpert(Human):
         Args:
             chain: The arm.
             path: Path of the end effector.
-            orientation: Rule for the orientation, such as the paper's coarse one.
+            orientation: Rule for the orientation, such as `coarse_orientation`.
             tremor: Unsteadiness of the end effector.
         """
         self.path, self.orientation = path, orientation

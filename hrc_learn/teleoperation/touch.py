@@ -57,7 +57,7 @@ class TouchConfig:
     released: float = 0.4
     """Time without a push at the end effector until the task resumes [s]."""
     collision_rise: float = 30.0
-    """Change of force within `collision_time` that is too large for a pushing hand [N]."""
+    """Change of force within `collision_time` that is too large for a push by hand [N]."""
     collision_time: float = 0.04
     """Interval over which `collision_rise` counts [s]."""
     collision_force: float = 110.0
@@ -217,7 +217,7 @@ _SURE = 2.0
 # evidence for the elbow is at most 2 during a push at the elbow, and soon 10 to 400 during a
 # push at the end effector.
 _CHANGES = 8.0
-# Standard deviations of the loads in contacts of the task: force and moment [N, N m].
+# Standard deviations of the loads when the task itself makes contact: force, moment [N, N m].
 _MET = np.array([60.0] * 3 + [10.0] * 3)
 
 
@@ -261,7 +261,7 @@ class _Posture:
 def touched_place(
     before: Place, above: Explanation, hand: Explanation, none: float, config: TouchConfig
 ) -> Place:
-    """Place that is touched, judged by the evidence for each.
+    """Place that is touched, judged by the evidence for each place.
 
     Args:
         before: Place that was touched last.
@@ -272,8 +272,8 @@ def touched_place(
     """
     likelier = hand.evidence - above.evidence
     evidence = max(above, hand).evidence - none
-    # A touch lasts down to half of the force, as long as there is evidence for a touch and the
-    # other place is not far likelier.
+    # A touch continues down to half of the threshold force, as long as there is evidence for a
+    # touch and the other place is not far likelier.
     stays = {
         "nothing": False,
         "elbow": likelier < _CHANGES and above.size > 0.5 * config.elbow_force,
@@ -348,7 +348,7 @@ class Touch(Human):
         self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
         if self.place == "hand" and not meets:
             self._pushed = self._time
-        if self._nobody_touches() and dt > 0:  # zero: the same reading again
+        if self._nobody_touches() and dt > 0:  # dt is zero if a reading is repeated
             self._bias.follow(arm.jacobian, state.joint_velocity, state.external_torque, dt)
         return HumanInput(
             nullspace_input=self._nullspace_input(arm) if self.place == "elbow" else still,
@@ -390,7 +390,7 @@ class Touch(Human):
         now: Explanation,
         meets: bool,
     ) -> None:
-        """Detect contacts that are too sudden or too hard for a pushing hand."""
+        """Detect contacts that are too sudden or too hard for a push by hand."""
         config, time = self._config, self._time
         self._lately = [old for old in self._lately if old[0] > time - config.collision_time]
         rise = torque - self._lately[0][1] if self._lately else np.zeros_like(torque)

@@ -41,7 +41,7 @@ class Bucket:
     """Token bucket that bounds a rate and allows a burst."""
 
     rate: float
-    """[1/s]"""
+    """Tokens added per second [1/s]."""
     burst: float
     clock: Callable[[], float] = time.monotonic
     left: float = field(init=False)

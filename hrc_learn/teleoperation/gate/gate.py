@@ -322,7 +322,7 @@ def _path(request: Request) -> str:
 
 
 def _header(request: Request, name: str) -> str:
-    """Value of a header that a request may contain once; empty if the header is absent."""
+    """Value of a header that a request may contain at most once; empty if it is absent."""
     values = request.headers.get_all(name)
     if len(values) > 1:
         raise RefusedError(400, f"The request has more than one header {name}.")

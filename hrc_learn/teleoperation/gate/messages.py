@@ -78,7 +78,7 @@ class Gripper(_Message, tag="gripper"):
 
     # The widest of our parallel grippers opens by 0.14 m.
     width: Annotated[float, Meta(ge=0, le=0.3)]
-    """[m]"""
+    """Requested opening [m]."""
 
 
 class Region(_Message, tag="region"):
@@ -135,7 +135,7 @@ class Hands(_Message, tag="hands"):
     tracked: Annotated[tuple[TrackedHand, ...], Meta(max_length=2)] = ()
     """Hands that are seen now."""
     sent: _Time = 0.0
-    """Clock of the client, returned with the status to measure the round-trip time."""
+    """Time by the client's clock, returned with the status to measure the round-trip time."""
 
     def __post_init__(self) -> None:
         for hands in (self.grips, self.tracked):
@@ -165,8 +165,8 @@ class Write(_Message, tag="write"):
 CurationMessage = Decide | Write
 
 
-# Messages of viser's page, with its own names and fields. A field that a later version adds is
-# refused until it is listed here; the browser tests then fail.
+# Messages of viser's page, with viser's own names and fields. If a later version of viser adds
+# a field, messages with it are refused until the field is listed here, and browser tests fail.
 
 
 class _Camera(_Message, tag="ViewerCameraMessage"):
