@@ -249,8 +249,8 @@ class Arm(SerialChain):
     ) -> Float[Tensor, "*batch joints"]:
         """Joint positions within the limits that bring the tool centre point to poses [rad].
 
-        Without `near`, the last batch dimension is a path: the first solution is the closest to
-        the ready posture, and each later solution is the closest to the solution before it.
+        Without `near`, the last batch dimension is a path. The first solution is the closest to
+        the ready posture; each later solution is the closest to the solution before it.
         Neighbouring poses therefore have neighbouring solutions. With `near`, each pose is
         solved by itself. The method is not differentiable.
 

@@ -189,7 +189,7 @@ class SerialChain:
 
         Args:
             tcp: Tool centre point in the frame of the flange.
-            flange: Another flange, in the frame of the last joint; None: the same.
+            flange: Another flange, in the frame of the last joint; None: the same flange.
         """
         new: dict[str, Any] = {"tcp": tcp, "flange": self.flange if flange is None else flange}
         return SerialChain(**self.description_of_chain() | new)

@@ -25,8 +25,8 @@ from hrc_learn.geometry import Capsule
 from hrc_learn.geometry.numerics import Constant, cached_tensors, safe_norm
 from hrc_learn.kinematics.chain import SerialChain
 
-# Search for the point of a segment nearest to a box: in each round, 31 points select one of 32
-# parts of the interval, so the last interval is 1e-6 of the segment's length.
+# Search for the point of a segment nearest to a box. In each round, 31 points select one of 32
+# parts of the interval. The last interval is 1e-6 of the segment's length.
 _PARTS, _ROUNDS = 32, 4
 _TRIED = [
     Constant(torch.arange(1, _PARTS, dtype=torch.float64) / _PARTS ** (k + 1))
@@ -335,8 +335,8 @@ class Separation:
         """Rows of the gradient for some pairs of capsules [m/rad].
 
         Args:
-            pairs: Numbers c H + h of pairs of capsules (c of the arm, h of the person), either
-                the same for the whole batch or separate ones for each element.
+            pairs: Numbers c H + h of pairs of capsules (c of the arm, h of the person). They
+                are the same for the whole batch, or given separately for each element.
         """
         index = pairs.unsqueeze(-1).expand(*self.direction.shape[:-3], -1, 3)
         direction, point = (

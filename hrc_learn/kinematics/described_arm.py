@@ -211,7 +211,7 @@ def _shape(
         for joint in description.below(link)
         if joint.kind in MOVING and joint not in path
     ]
-    at_last = dict(places)  # a hand may carry another one
+    at_last = dict(places)  # a hand may carry another hand
     for hand in {joint.parent for joint in roots} - {moved}:
         pose = to_tool @ at_last[hand][1]
         for link, within in description.rigid_subtree(hand).items():
@@ -337,9 +337,9 @@ _POSTURES, _SEED = 4096, 0
 def _comfortable(chain: SerialChain) -> Float[Tensor, " joints"]:
     """Default ready posture [rad, m].
 
-    It is the random posture with the highest sum of four scores, each at most one: distance
-    from singularities, distance from limits, the tool pointing down, and the tool in front of
-    the base at half of its reach.
+    It is the random posture with the highest sum of four scores, each at most one. The scores
+    are high if the posture is far from singularities, if it is far from limits, if the tool
+    points down, and if the tool is in front of the base at half of its reach.
     """
     rng = torch.Generator().manual_seed(_SEED)
     lower, upper = chain.limits.lower, chain.limits.upper

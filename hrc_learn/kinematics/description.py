@@ -99,9 +99,7 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Joint:
-    """A joint. The pose of its child in its parent's frame is `origin` times the motion about
-    or along `axis`.
-    """
+    """A joint. The child's pose in the parent's frame is `origin` times the joint's motion."""
 
     name: str
     kind: str
@@ -332,8 +330,9 @@ class Description:
     def _ends(self, base: str) -> tuple[list[_End], list[Joint]]:
         """Bodies at which an arm may end, and the first joints of grippers.
 
-        A joint belongs to a gripper if its name says so, or if it is one of several joints that
-        branch off at the end of the arm, each with a shorter chain than the arm.
+        A joint belongs to a gripper if its name says so. Joints also belong to grippers if
+        several of them branch off at the end of the arm, each with a shorter chain than the
+        arm.
         """
         height: dict[str, int] = {}  # largest number of successive joints beyond a link
         for link in reversed(self.subtree(base)):

@@ -8,9 +8,9 @@ q4 > -0.467 rad, where the forearm folds to the other side. In one pose of 300, 
 valid solution at the shoulder singularity (q2 = 0). This module checks its results.
 
 For the Research 3, `frankik` also misses most solutions outside the Panda's range (q6 > 3.7525
-rad, |q7| > 2.8973, |q2| > 1.7628), unless all joints are within the range that Franka gives for
-constant velocity limits. Among the Research 3's configurations with q4 < -0.467, the inverse
-finds 81 % in the whole range, and 99.8 % within the Panda's range.
+rad, |q7| > 2.8973, |q2| > 1.7628). Exceptions are solutions with all joints within the range
+that Franka gives for constant velocity limits. Among the Research 3's configurations with
+q4 < -0.467, the inverse finds 81 % in the whole range, and 99.8 % within the Panda's range.
 
 Franka's meshes of the two arms agree to 2 mm. They protrude from the capsules by at most 30 mm
 at the links (link 2), 46 mm at the base and 9 mm at the gripper: clearances must cover this.

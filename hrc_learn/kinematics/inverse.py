@@ -401,10 +401,10 @@ def _drawn_nearer(
     return torch.where((reached & nearer)[:, None], moved, q)
 
 
-# Redundancy. The arm angle is one number for the posture of a seven-joint arm with its end
-# effector at rest: the angle by which the plane of shoulder, elbow and wrist is turned out of
-# the vertical (Kreutz-Delgado et al. 1992). Unlike the position of joint 7, the angle changes
-# monotonically as the elbow circles, and keeps its meaning when the end effector moves.
+# Redundancy. The arm angle is one number for the posture of a seven-joint arm while its end
+# effector is at rest. It is the angle by which the plane of shoulder, elbow and wrist is turned
+# out of the vertical (Kreutz-Delgado et al. 1992). Unlike the position of joint 7, this angle
+# changes monotonically as the elbow circles, and keeps its meaning when the end effector moves.
 
 # Smallest singular value of the 6 x n Jacobian (with unscaled metres and radians) below which
 # its exact inverse demands joint speeds that no arm reaches.

@@ -125,8 +125,8 @@ class JointLimits(MotionLimits):
             kinds: Limits to keep: velocity, acceleration, jerk, or the first of these.
 
         Returns:
-            The factor, and the number of the limit: all joints of the first kind, then those of
-            the second, and so on.
+            The factor, and the number of the limit. Limits of the first kind are numbered
+            first, for all joints, then limits of the second kind, and so on.
         """
         factors = []
         for order, kind in enumerate(kinds, 1):
@@ -164,7 +164,7 @@ def complete_limits(
     acceleration reaches the velocity limit in 0.2 s, and the default jerk reaches the
     acceleration limit in 20 ms. The default torque is unlimited. A continuous joint may turn
     once in each direction. A torque limit of zero counts as missing, because many descriptions
-    write zero for an unknown one.
+    write zero for an unknown limit.
 
     Args:
         names: Names of the joints.
@@ -172,7 +172,7 @@ def complete_limits(
         known: For each joint, `lower`, `upper`, `velocity`, `acceleration`, `jerk` and `torque`
             [rad, m, s, N m, N]; None or no entry if unknown.
         source: Name or path of the description, for error messages and `JointLimits.vintage`.
-        overrides: For each joint name, the limits that replace known ones. Those under
+        overrides: For each joint name, the limits that replace known limits. Limits under
             `default` apply to all joints.
 
     Raises:

@@ -141,7 +141,7 @@ class _Reader:
         x, y, z = model.geom_size[g].tolist()
         if kind == kinds.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            # MuJoCo moves a mesh to its principal axes, and its geom to compensate.
+            # MuJoCo moves a mesh to its principal axes, and moves the geom to compensate.
             moved = self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh])
             place["pose"] = pose @ np.linalg.inv(moved)
             sx, sy, sz = model.mesh_scale[mesh].tolist()

@@ -35,7 +35,7 @@ class MissingModelError(ModuleNotFoundError):
 
 
 # Simulators are installed for their descriptions alone, without their requirements: gym-aloha
-# requires an older MuJoCo, and robosuite an OpenCV that replaces the headless one.
+# requires an older MuJoCo, and robosuite an OpenCV that replaces headless OpenCV.
 _INSTALL = {
     "example-robot-data": "hrc-learn[meshes]",
     "robosuite": "--no-deps robosuite==1.5.2",
@@ -116,12 +116,12 @@ def arm(
         name_or_file: One of `registered_arms()` or another usual name of such an arm ("xarm",
             "Franka"), the name of a description in an installed package ("ur10e", "iiwa14"; see
             `installed_descriptions`), or a path that ends in .urdf, .xml or .mjcf.
-        base: Link or body that is the base; None: the registered one, or the root.
-        tip: Link, body or site that is the flange; None: the registered one, or the only end
-            besides a gripper's.
+        base: Link or body that is the base; None: the registered base, or the root.
+        tip: Link, body or site that is the flange; None: the registered flange, or the only end
+            of the arm, apart from the gripper.
         tool: Tool centre point in the frame of the flange.
-        limits: Limits that replace or complete those of the file, by joint name, or a TOML
-            file; None: `ur5e.limits.toml` for a file `ur5e.urdf`, if there is one.
+        limits: Limits by joint name that replace or complete the limits of the file, or a TOML
+            file; None: `ur5e.limits.toml` for a file `ur5e.urdf`, if it exists.
         ready: A comfortable posture [rad, m].
 
     Raises:

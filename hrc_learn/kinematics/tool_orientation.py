@@ -24,8 +24,8 @@ NEAR = 0.05
 """Length of the last part of a path [m]; the direction of this part is the tangent."""
 
 # Tangents are not used if their root-mean-square angle to their mean exceeds this angle [rad].
-# They are not used either if their mean differs by more than this angle from the direction in
-# which the end effector points: the end effector then approached the object from the side.
+# They are not used either if the angle between their mean and the pointing direction of the end
+# effector exceeds it: the end effector then approached the object from the side.
 MAX_SPREAD = math.radians(30)
 # Shorter vectors are rounding noise and have no direction.
 _SHORTEST = 1e-12
