@@ -35,7 +35,7 @@ Pulls = Literal["scripted", "random", "none"]
 """Times at which a scripted person pulls the elbow: while the robot waits above the first
 object, at random moments of the whole job, or never."""
 
-# Time for the elbow to come to rest after the last drag [s], the same as without a worker.
+# Time for the elbow to come to rest after the last drag [s]; equal with and without a worker.
 _AFTER_DRAGS = 1.0
 
 

@@ -69,7 +69,7 @@ class ExperimentRun(Protocol):
 
     @property
     def failure(self) -> str:
-        """Reason why the task was given up; empty if it was not. Metrics do not count here."""
+        """Reason why the task was given up, apart from missed bounds; empty if it was not."""
         ...
 
     @property

@@ -91,7 +91,7 @@ class GraspingScene:
     ) -> "GraspingScene":
         """Draw a scene.
 
-        The arm starts anywhere within its joint limits where it touches nothing, does not hide
+        The arm starts anywhere within its joint limits. It touches nothing there, does not hide
         the object from the camera, and can move home on straight lines in joint space.
 
         Args:

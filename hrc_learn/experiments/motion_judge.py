@@ -1,7 +1,7 @@
 """Judges that replay motions of an arm: in the work cell, a MuJoCo scene, or an environment.
 
 A judge puts the objects in their places, lets the arm follow joint positions at the frame rate,
-and checks for success at the end: by MuJoCo's contacts in the work cell, by a Python function
+and checks for success at the end. MuJoCo's contacts decide in the work cell, a Python function
 in MJCF scenes. An environment of gymnasium executes the actions of the planned episode instead,
 and its observations replace the planned observations.
 """
@@ -180,7 +180,7 @@ class SceneJudge:
         joint = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
         direct = np.isin(model.actuator_trntype, joint)
         at = np.where(direct, model.actuator_trnid[:, 0], -1)
-        # A position actuator is one whose force decreases with the position.
+        # The force of a position actuator decreases with the position.
         servos = np.flatnonzero(direct & (model.actuator_biasprm[:, 1] < 0))
         drives = {int(at[a]): int(a) for a in servos}
         names = robot.arm().joint_names
@@ -245,12 +245,12 @@ class SceneJudge:
 class EnvironmentJudge:
     """An environment of gymnasium that executes the actions of new episodes.
 
-    `reset(seed=..., options=...)` puts the objects in their places: `options["objects"]` has
-    the pose of each object by name (x, y, z [m] and quaternion w, x, y, z),
-    `options["joint_position"]` the first joint positions [rad]. Observations are a dictionary
-    of the dataset's features, or of LeRobot's `agent_pos` and `environment_state`. `step` takes
-    the feature `action`, or a dictionary if there are several actions. The last step reports
-    the outcome: `info["is_success"]` or `info["success"]`, and after a failure
+    `reset(seed=..., options=...)` puts the objects in their places. `options["objects"]` has
+    the pose of each object by name (x, y, z [m] and quaternion w, x, y, z), and
+    `options["joint_position"]` has the first joint positions [rad]. Observations are a
+    dictionary of the dataset's features, or of LeRobot's `agent_pos` and `environment_state`.
+    `step` takes the feature `action`, or a dictionary if there are several actions. The last
+    step reports the outcome: `info["is_success"]` or `info["success"]`, and after a failure
     `info["failure"]` with the reason. `reset` may also return `info["failure"]`, which rejects
     the scene.
     """
@@ -389,7 +389,7 @@ def judging(
 ) -> Iterator[Judge]:
     """Judge in several processes, with the arguments and errors of `JudgeConfig.open`."""
     given = (config, robot, fps, widest)
-    # Opened here first, so that a wrong setting raises one error, in this process.
+    # The judge is opened here first, so that a wrong setting raises one error in this process.
     _begin(*given)
     if config.processes <= 1:
         yield partial(map, _replay)

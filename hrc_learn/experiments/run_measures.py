@@ -33,7 +33,8 @@ _LAG = 0.5
 # Distance that the goal must move within `_LAG` to have a direction [m].
 _LEAST_MOTION = 0.002
 # Orientation of a held object in the frame of the hand. The object's x axis lies along the
-# closing direction of the fingers, which is the y axis of the hand; its top faces the palm.
+# closing direction of the fingers, which is the y axis of the hand. The object's top faces the
+# palm.
 _IN_HAND = quaternion.from_matrix(
     torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
 )
@@ -253,9 +254,7 @@ def place_pitch_and_yaw(
 
 
 def _place_turn(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-    """Rotation vector from the intended orientation of a box to its actual one, in the base
-    frame [rad].
-    """
+    """Rotation vector of a box from intended to actual orientation, in the base frame [rad]."""
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
     back = quaternion.conjugate(quaternion.multiply(goal, _IN_HAND))
     # A box looks the same after half a turn about its z axis.

@@ -118,7 +118,7 @@ def person_figure(run: RunRecording) -> Figure:
 
 
 def image_jacobian_figure(run: RunRecording) -> Figure:
-    """Entries of the estimated image Jacobian, with the true ones if known."""
+    """Entries of the estimated image Jacobian, with the true entries if known."""
     assert run.image_jacobian is not None
     known = np.asarray(np.isfinite(run.image_jacobian).all(axis=(1, 2)))
     return plots_figure(run.time, image_jacobian_plots(run), columns=2, shown=known)

@@ -45,7 +45,8 @@ class ArmAccess:
     """Connection to the arm of a world, with the delay and dynamics of its driver.
 
     With a driver, the same task uses all software that a real arm needs: the driver package,
-    its sockets, and the 1 ms cycles of the protocol, to which the simulated world responds.
+    its sockets, and the 1 ms cycles of the protocol. The simulated world responds to these
+    cycles.
     """
 
     open: Callable[[World], AbstractContextManager[OpenedArm]]

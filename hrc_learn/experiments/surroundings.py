@@ -92,15 +92,15 @@ OBJECT_REACH = (0.10, 0.08, 0.0)
 OBJECTS_REACH = (0.12, 0.10)
 """Largest distance of several objects from the middle of the table along x and y [m]."""
 
-# Distance between two objects at which open fingers around one of them do not touch the other,
-# in any orientation [m]: 0.06 m to the outside of a finger, 0.046 m to the farthest object
-# corner.
+# Smallest distance between two objects [m]. Open fingers around one object then do not touch
+# the other, in any orientation: the outside of a finger is 0.06 m from the centre of its
+# object, and the farthest corner of an object is 0.046 m from the object's centre.
 _APART = 0.118
 # Largest number of arrangements of the objects that are tried.
 _ARRANGEMENTS = 10_000
 
 # `_ENTERS`: range of the time at which the worker enters [s]. The robot waits above its first
-# object 11 s after the start, and the worker should reach under it then.
+# object 11 s after the start, and the worker should then reach under the arm.
 # `_REACHES`: range of the number of reaches.
 _ENTERS, _REACHES = (4.0, 9.0), (3, 5)
 # `_KEPT_CLEAR`: distance that people keep from a resting arm that they see [m]: the thickness
@@ -210,8 +210,8 @@ def points_to_see(workplace: Workplace, world: World) -> Float[np.ndarray, "poin
 def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
     """Draw a visit of a worker to the table.
 
-    The worker comes to the side of the table where the elbow is, while the robot waits above
-    its first object, and reaches under the forearm, as in the paper's Experiment 3.
+    The worker comes to the side of the table where the elbow is, and reaches under the forearm
+    while the robot waits above its first object. This is as in the paper's Experiment 3.
 
     Args:
         workplace: Table and arm.
@@ -342,8 +342,8 @@ def near_worker(
     """Margin of the true distance from the worker over the stopping distance, and the force of
     contacts, at each step.
 
-    The stopping distance is v_h v/a + v^2/(2 a), where the arm approaches the worker at the
-    speed v with the deceleration a, and the worker approaches the arm at the speed v_h. It is
+    The stopping distance is v_h v/a + v^2/(2 a). The arm approaches the worker at the speed v
+    and brakes with the deceleration a; the worker approaches the arm at the speed v_h. This is
     the protective distance without reaction time and uncertainty. The margin is the smallest
     over all parts of the body. It is infinite while the arm approaches no part, and for
     contacts within the limits of power and force limiting.
@@ -516,7 +516,7 @@ def _movements(
             if seen is None or seen is newest:
                 continue
             newest = seen
-            # Samples count only until the hand arrives: later ones show a resting hand.
+            # Samples count only until the hand arrives: later samples show a resting hand.
             if watch.see(seen) and seen.time < reach.end:
                 times, hand = watch.times.copy(), watch.hand.copy()
         if len(times) >= _FEWEST_IMAGES and times[-1] > reach.begin:

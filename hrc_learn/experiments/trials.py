@@ -211,5 +211,6 @@ def _trial(run: TrialRun, seed: int, failures: tuple[type[Exception], ...]) -> T
         raise
     finally:
         # World, cell and log of a trial refer to each other, and the garbage collector does
-        # not count the memory of the simulator: fifty trials would occupy two gigabytes.
+        # not count the memory of the simulator. Without this call, fifty trials would occupy
+        # two gigabytes.
         gc.collect()
