@@ -42,7 +42,7 @@ def serve_stream(port: int | None = 9090) -> Iterator[tuple[RecordingStream, str
     the page, with its secret.
 
     Args:
-        port: Port of the page; None: the first free one from 8080 on.
+        port: Port of the page; None: the first free port from 8080 on.
 
     Raises:
         ValueError: The port is in use.
@@ -69,7 +69,7 @@ def serve_recordings(files: Sequence[Path], port: int | None = None) -> Iterator
 
     Args:
         files: Recordings (`.rrd`).
-        port: Port of the page; None: the first free one from 8080 on.
+        port: Port of the page; None: the first free port from 8080 on.
     """
     parts = [file.read_bytes() for file in files]
     with _served(port, lambda: parts) as url:

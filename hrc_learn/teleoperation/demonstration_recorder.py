@@ -104,7 +104,7 @@ class RecordingQuality:
         """Elapsed time of the arm's clock divided by elapsed time of the person's clock.
 
         A simulation slower than real time makes the recorded motion faster than the
-        demonstrated one.
+        demonstrated motion.
         """
         passed = self.arrivals[-1] - self.arrivals[0]
         return self.seconds / passed if passed else 1.0
@@ -129,7 +129,7 @@ class RecordingQuality:
         return slice(int(first), int(end))
 
     def worthless(self) -> str:
-        """Reason why the frames show no demonstration; empty if they do show one."""
+        """Reason why the frames show no demonstration; empty if they show a demonstration."""
         if not self._stamps:
             return "the demonstration has no frames"
         if (part := self.moving()) is None:

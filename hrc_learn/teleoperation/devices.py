@@ -108,7 +108,7 @@ class Gamepad(Human):
         update: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Take an open controller; `Gamepad.open` finds one.
+        """Take an open controller; `Gamepad.open` finds a controller.
 
         Args:
             chain: The arm that is guided.
@@ -358,7 +358,7 @@ class HapticDevice(Human):
         number: int = -1,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Take an open device; `HapticDevice.open` finds one.
+        """Take an open device; `HapticDevice.open` finds a device.
 
         Args:
             chain: Kinematics of the guided arm.

@@ -100,7 +100,7 @@ def headset_data(
 def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
     """All shapes as one binary glTF file, each in the frame of its body.
 
-    Nodes are named `body<index>_<colour number>`, or `stands_<number>` for fixed ones.
+    Nodes are named `body<index>_<colour number>`, or `stands_<number>` for fixed boxes.
 
     Args:
         bodies: Moving bodies; their poses are sent as they change.
@@ -179,7 +179,7 @@ def body_meshes(body: Body) -> dict[Colour, Trimesh]:
     parts: dict[Colour, list[Trimesh]] = {}
     for file in body.meshes:
         for part in (part.placed(file) for part in read_mesh(file.path)):
-            assert part.colour is not None  # a placed part has one
+            assert part.colour is not None  # a placed part has a colour
             # Vertices are not merged, so that sharp edges stay sharp.
             mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
             parts.setdefault(part.colour, []).append(mesh)

@@ -110,8 +110,8 @@ class Page:
                 page.show(status)
 
     The control loop spends time only in `human.read`, `place` and `show`, which exchange
-    references. The library viser draws the scene. Its objects are changed only in its own event
-    loop, because its queues break otherwise.
+    references. The library viser draws the scene. Objects of viser are changed only in viser's
+    own event loop, because viser's queues break otherwise.
 
     Attributes:
         human: Combined input of the people at the page.
@@ -139,7 +139,7 @@ class Page:
             world: World to show. Its bodies "link1", "link2", ... can be held; "link7", "hand",
                 "finger_left" and "finger_right" move the end effector.
             config: Settings of the page.
-            boxes: Fixed boxes beyond those of the world.
+            boxes: Fixed boxes in addition to the boxes of the world.
             task: Description of the task to demonstrate.
             guides: True if the person guides the end effector and records demonstrations;
                 False if the arm works autonomously.

@@ -111,7 +111,7 @@ class PageSessionConfig:
     input_filter: InputFilterConfig = field(default_factory=InputFilterConfig)
     """Bounds on the acceleration of the end effector."""
     record_every: int = 2
-    """Control steps from one recorded frame to the next."""
+    """Number of control steps from one recorded frame to the next."""
 
     __post_init__ = check_positive
 

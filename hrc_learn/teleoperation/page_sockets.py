@@ -111,8 +111,8 @@ class Control:
         with self._lock:
             self._clients.pop(client, None)
             if client == self._leader:
-                # The only client left gets control, like the first one to join: a reloaded page
-                # may join before its old session has left.
+                # The only client left gets control, like the first client to join: a reloaded
+                # page may join before its old session has left.
                 able = [name for name, one in self._clients.items() if one.may_lead]
                 self._give(self._waiting() or (able[0] if len(able) == 1 else None))
 

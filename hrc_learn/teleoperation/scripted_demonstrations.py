@@ -1,5 +1,5 @@
-"""Demonstrate with the scripted expert, and record the frames: visual servoing, and placing
-with pulls at the elbow.
+"""Record demonstrations of a scripted expert: visual servoing, and placing with pulls at the
+elbow.
 """
 
 import math
@@ -49,7 +49,7 @@ class DemonstrationConfig:
     settle: float = 1.0
     """Rest at the end of a demonstration [s]."""
     record_every: int = 2
-    """Control steps from one recorded frame to the next."""
+    """Number of control steps from one recorded frame to the next."""
 
     def __post_init__(self) -> None:
         positive = "duration", "record_every"
@@ -105,7 +105,7 @@ class ServoDemonstrationConfig(DemonstrationConfig):
     wobble: float = 0.12
     """Amplitude of small rotations during the motion [rad]; the images show their effect."""
     record_every: int = 4
-    """Control steps from one recorded frame, and image, to the next."""
+    """Number of control steps from one recorded frame, with its image, to the next frame."""
     markerless: bool = False
     """True films a scene without markers; False records the pixels of markers."""
 
@@ -310,8 +310,7 @@ class PlacingDemonstrationConfig(DemonstrationConfig):
     pull_elbow: bool = True
     """True if the expert pulls the elbow past the cabinet's open door."""
     lift: float = 0.03
-    """Height of the end effector over the board's front edge, relative to its final height [m].
-    """
+    """Height of the end effector over the board's front edge, above the final height [m]."""
 
 
 def placing_expert(

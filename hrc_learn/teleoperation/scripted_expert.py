@@ -146,7 +146,7 @@ class GuidedPath:
         from scipy.interpolate import PchipInterpolator  # takes a quarter of a second
 
         length = np.concatenate([[0.0], np.cumsum(chords)])
-        # The curve is monotone between way points: overshooting, the arm would hit the boards.
+        # The curve is monotone between way points: an overshoot would hit the boards.
         self._curve = PchipInterpolator(length / length[-1], waypoints)
         self._slope = self._curve.derivative()
         self._start, self.duration = start, duration
@@ -226,7 +226,7 @@ class ScriptedExpert(Human):
         """Motion of the end effector at the state's time."""
         pose = self._chain.forward(torch.from_numpy(state.joint_position))
         wanted = torch.from_numpy(self.path.position(state.time))
-        # The rule gives the orientation at the actual position, not at the wanted one.
+        # The rule gives the orientation at the actual position, not at the wanted position.
         goal = Pose(wanted, self.orientation(pose.position, state.time))
         twist = _GAIN * pose.twist_to(goal).numpy()
         twist[:3] += self.path.velocity(state.time)

@@ -29,7 +29,7 @@ Place = Literal["nothing", "elbow", "hand"]
 _ELBOW = 4
 # Correlation time of torque errors, which come from filter lag and settling servos [s].
 _CORRELATED = 0.1
-# Velocity scale of dry friction: well above it, friction has its full size [rad/s].
+# Velocity scale of dry friction [rad/s]: at much higher velocities, friction has its full size.
 _SLIDES = 0.02
 
 
@@ -78,10 +78,11 @@ class TouchConfig:
 class TorqueBias:
     """Bias of the external torques of an untouched arm, estimated online.
 
-    tau = -J_z^T w + o - F tanh(dq / v), with joint velocities dq and a small velocity v. J_z is
-    the Jacobian's row of vertical motion, w the weight of a load at the end effector, o an
-    offset of each joint (errors of its gravity model), and F dry friction, which changes sign
-    with the direction of motion. A Kalman filter estimates w, o and F, each a random walk.
+    The torques are tau = -J_z^T w + o - F tanh(dq / v), with joint velocities dq and a small
+    velocity v. J_z is the Jacobian's row of vertical motion, and w is the weight of a load at
+    the end effector. o is an offset of each joint, due to errors of the gravity model. F is dry
+    friction, which changes sign with the direction of motion. A Kalman filter estimates w, o
+    and F, each a random walk.
     """
 
     # `_FIRST`: initial standard deviations of w [N], o and F [N m], for a load of 0.5 kg.
@@ -206,16 +207,16 @@ def log_density(
     return -0.5 * float(torque @ np.linalg.solve(covariance, torque) + size)
 
 
-# Standard deviations of a person's force and of its moment about the tool centre point: a hand
-# may push the gripper up to 10 cm off its centre [N, N m].
+# Standard deviations of a person's force [N] and of its moment about the tool centre point
+# [N m]: a hand may push the gripper up to 10 cm off its centre.
 _PUSHES, _MOMENTS = 25.0, 2.5
 # Margin of the log evidence above which a push counts as a push at the end effector: a wrong
 # guess would pause the task for nothing.
 _SURE = 2.0
 # Margin of the log evidence at which a push changes its place: while a force rises, friction
 # hides where the force acts. In simulation, the evidence for the end effector minus the
-# evidence for the elbow is at most 2 during a push at the elbow, and soon 10 to 400 during a
-# push at the end effector.
+# evidence for the elbow is at most 2 during a push at the elbow. During a push at the end
+# effector, the difference soon is 10 to 400.
 _CHANGES = 8.0
 # Standard deviations of the loads when the task itself makes contact: force, moment [N, N m].
 _MET = np.array([60.0] * 3 + [10.0] * 3)

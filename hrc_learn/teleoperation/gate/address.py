@@ -30,14 +30,14 @@ class AddressConfig:
     """Address to serve at. By default, only this machine can reach it. At a network address,
     the page uses TLS."""
     port: int | None = None
-    """Port to serve at, which must be free. 0: any free port; None: the first free one from
+    """Port to serve at, which must be free. 0: any free port; None: the first free port from
     8080 on."""
     name: str = ""
     """Name by which browsers reach this machine on the network; empty: its address."""
     certificate: Path | None = None
-    """Certificate for TLS (PEM); None: a self-signed one, which browsers warn about once."""
+    """Certificate for TLS (PEM); None: a self-signed certificate, with a browser warning."""
     key: Path | None = None
-    """Private key of that certificate (PEM)."""
+    """Private key of the certificate (PEM)."""
     most_clients: int = 32
     """Largest number of browsers connected at once."""
 
@@ -106,7 +106,7 @@ def network_name(config: AddressConfig) -> str:
 
 
 def listening_socket(config: AddressConfig) -> socket.socket:
-    """Socket that listens at the configured port, or at the first free one from 8080 on.
+    """Socket that listens at the configured port, or at the first free port from 8080 on.
 
     Raises:
         ValueError: No such port is free, or the host is not an address of this machine.
@@ -136,8 +136,8 @@ def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
     """TLS context of a page on the network; None if only this machine can reach the page and
     no certificate is configured.
 
-    Without a configured certificate, `openssl` makes one. It is kept in the cache folder and
-    used again while it is valid, so that browsers warn about it once.
+    Without a configured certificate, `openssl` makes a certificate. It is kept in the cache
+    folder and used again while it is valid, so that browsers warn about it only once.
 
     Raises:
         ValueError: There is neither a certificate nor `openssl`, or the certificate is invalid.

@@ -72,8 +72,8 @@ class RefusedError(Exception):
 class Admission:
     """Checks of the host, the origin and the secret of a request.
 
-    The secret travels in a header or a WebSocket subprotocol and never in a cookie: browsers
-    send the cookies of a host to all its ports, and so to other servers.
+    The secret travels in a header or a WebSocket subprotocol, never in a cookie. Browsers send
+    the cookies of a host to all ports of this host, and so to other servers.
 
     Attributes:
         address: Address of the page, with its secrets.

@@ -82,7 +82,7 @@ class Gripper(_Message, tag="gripper"):
 
 
 class Region(_Message, tag="region"):
-    """Drawn box; an active one attracts the end effector."""
+    """Drawn box; an active box attracts the end effector."""
 
     centre: Point
     half_size: tuple[_Positive, _Positive, _Positive]
@@ -155,7 +155,7 @@ class Decide(_Message, tag="decide"):
     start: int = 0
     """First frame of the part that is kept."""
     stop: int = 0
-    """Frame after the last one that is kept."""
+    """Frame after the last frame that is kept."""
 
 
 class Write(_Message, tag="write"):
