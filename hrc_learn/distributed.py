@@ -53,7 +53,7 @@ def worker_pool(
 
 @contextmanager
 def processes() -> Iterator[int]:
-    """Join the processes that `torchrun` started, and yield the rank of this one.
+    """Join the processes that `torchrun` started, and yield the rank of this process.
 
     A single process, without a rank in the environment, has rank 0. The backend is gloo,
     because the statistics of a fit are small and on the CPU.

@@ -11,8 +11,9 @@ from typing import final
 
 _FIRST_PAUSE = 0.02
 _LONGEST_PAUSE = 1.0
-"""First and longest pause between attempts to stop [s]; each pause is twice the last. Network
-drivers recover within some tens of milliseconds, a control box within seconds."""
+"""First and longest pause between attempts to stop [s]; each pause is twice as long as the
+previous one. Network drivers recover within some tens of milliseconds, a control box within
+seconds."""
 
 
 class WatchdogError(RuntimeError):
@@ -150,7 +151,7 @@ class Watchdog:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, but do not wait for a stop that hangs: the process must end."""
+        """End the thread without waiting for a stop that hangs, so that the process can end."""
         self._done.set()
         if self._thread.is_alive():
             self._thread.join(self._timeout + _LONGEST_PAUSE)

@@ -161,8 +161,8 @@ class AdaptiveController(nn.Module):
 
     Goals for a part of the tool pose (`Goals.task`) leave more null space. With a basis B of
     that part, J_t = B J and s = J_s_hat^T xi_x + xi_r, the law is
-    u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q). The potential of the regions, whose
-    gradients are s and xi_q, still falls. An arm with the task "nearest pose" (`Arm.task`) also
+    u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q). The potentials of the regions, with the
+    gradients s and xi_q, still fall. An arm with the task "nearest pose" (`Arm.task`) also
     follows this law for goals of the whole pose.
 
     A step is a pure function `(state, observation) -> (command, state)`; the module stores no
@@ -458,7 +458,7 @@ class AdaptiveController(nn.Module):
         yields = config.yields_to_limits and config.safety.constraints is None
         if yields:
             asked, task = task, law.saturate_in_null_space(task, J_task, rows, *bounds)
-            if task is not asked:  # a limit acts, or Python must not branch
+            if task is not asked:  # a limit acts, or not `may_branch`
                 task = law.scale_task(task, J, *bounds, self.caps[0])
         if posture is not None:
             approach = law.approach_velocity(posture, q, J, self.caps[1])

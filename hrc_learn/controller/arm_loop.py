@@ -1,4 +1,4 @@
-"""The law of the arm near people, one control step at a time.
+"""Control law of an arm near people, one control step at a time.
 
 A step is a pure function `(state, reading, request) -> (command, state, report)`:
 
@@ -58,7 +58,7 @@ _AT_REST = 1e-3
 
 @final
 class ArmLoop:
-    """The law of one arm or of a batch of identical arms; the caller passes in the state."""
+    """Control law of an arm or a batch of identical arms; the caller passes in the state."""
 
     def __init__(
         self,
@@ -147,7 +147,8 @@ class ArmLoop:
     ) -> tuple[Float[Tensor, "*batch n"], ArmLoopState, ArmReport]:
         """Second half of a step: turn a request into a joint velocity.
 
-        Arguments and results are those of `step`; the state is that of `observe`.
+        The argument `state` comes from `observe`; the other arguments and the results are those
+        of `step`.
         """
         reading = self._known(state, reading)
         if isinstance(request, Command):

@@ -133,7 +133,7 @@ class SeparationConfig:
 
         Args:
             speed: v, closing speed of the arm [m/s]; negative counts as zero.
-            human_speed: v_h, see `highest_speed`.
+            human_speed: v_h, as in `highest_speed` [m/s].
         """
         v = speed.clamp(min=0)
         v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
@@ -153,8 +153,9 @@ class SeparationConfig:
 
         Args:
             distance: Distance between person and arm [m]; infinite: no person is near.
-            human_speed: v_h, measured speed of the person towards the arm, plus the speed they
-                may gain meanwhile [m/s]; negative counts as zero. None: the configured one.
+            human_speed: v_h, measured speed of the person towards the arm, plus the speed that
+                the person may gain until the arm reacts [m/s]; negative counts as zero. None:
+                the configured one.
         """
         a = self.deceleration
         v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)

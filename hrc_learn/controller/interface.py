@@ -216,7 +216,7 @@ class Goals:
         return replace(self, position=replace(self.position, centre=centre))
 
     def approached_by(self, posture: Float[Tensor, "*#batch n"] | None) -> Goals:
-        """The goals, first approached in joint space towards a posture [rad].
+        """The goals, preceded by an approach to a posture in joint space [rad].
 
         Use an inverse-kinematics solution for the box centre that is close to the present
         joints.
@@ -275,7 +275,8 @@ class Observation:
     """Measured joint velocities [rad/s]. In the first step after a start, they replace the
     velocities of the initial state if the two differ clearly. None: not measured."""
     nullspace_input: Float[Tensor, "*batch n"] | None = None
-    """Null-space input d of the paper: joint torques exerted by a person [N m]; None: none."""
+    """Null-space input d of the paper: joint torques exerted by a person [N m]; None: no
+    input."""
     goals: Goals | None = None
     """Goals of this step; None: the goals of the controller."""
     feature_new: Bool[Tensor, "*batch"] | None = None

@@ -39,8 +39,8 @@ leave their path. The damping of the inverse Jacobian begins at 0.05."""
 
 # A path that has waited for the joints continues if their distance from it is below this [rad].
 _NEAR_AGAIN = 1.4
-# Distances from the path [rad]. Below the first, joints return whatever their alignment is.
-# Above the second, the alignment counts in full.
+# Distances from the path [rad]. Below the first distance, joints return whatever their
+# alignment is. Above the second, the alignment counts in full.
 _NEARBY = 0.3, 0.5
 # `_ON_PATH`: tolerated distance of the end effector from its path [m], half the deviation that
 # a push may cause.
@@ -191,7 +191,7 @@ def changed_rate(
 
     Args:
         rate: Fraction of the path's own speed, -1 to 1.
-        wanted: Magnitude to approach; values beyond 0 and 1 are clipped.
+        wanted: Magnitude of the rate to approach, clipped to 0 to 1.
         dt: Control step [s].
         direction: 1 for forward, -1 for back.
     """
@@ -206,7 +206,7 @@ def deviation_ratio(
 
     Args:
         error: Motion of the end effector to its pose on the path (linear [m], angular [rad]).
-        twist: Velocity of the path there (linear [m/s], angular [rad/s]).
+        twist: Velocity of this pose along the path (linear [m/s], angular [rad/s]).
     """
     return _length(error) / (_ON_PATH + _SERVO_LAG * _length(twist))
 

@@ -20,8 +20,8 @@ _TOLERANCE = 1e-3
 class LimitBarrier(nn.Module):
     """The invariant set of joint states from which all limits can be kept, and its bounds.
 
-    Let delta be the distance to a limit less its margin, v the speed towards it, A and j the
-    limits of acceleration and jerk, and v_hat = v + (a + A)^2/(2 j). The set is
+    Let delta be the distance to a limit, less the margin, v the speed towards the limit, A and
+    j the limits of acceleration and jerk, and v_hat = v + (a + A)^2/(2 j). The set is
 
         v_hat <= min(h(delta), v_max + A^2/(2 j)),   h(delta) = sqrt(c^2 + 2 A delta) - c,
         c = A / rate     <=>     Q(v_hat) = v_hat^2/(2 A) + v_hat/rate <= delta
@@ -222,7 +222,8 @@ class LimitBarrier(nn.Module):
 
 
 def _reachable(wanted: Tensor, last: Tensor, limit: Tensor, reach: Tensor) -> Tensor:
-    """The acceleration within its limit and within reach of the last one [rad/s^2].
+    """Acceleration nearest to `wanted`, within its limit and within `reach` of the last one
+    [rad/s^2].
 
     The clamp to the reach, which the jerk limit sets, comes last: outside the set, the barrier
     may require an acceleration beyond the reach; and at the start, the acceleration may be so
@@ -231,8 +232,8 @@ def _reachable(wanted: Tensor, last: Tensor, limit: Tensor, reach: Tensor) -> Te
     return wanted.clamp(-limit, limit).clamp(last - reach, last + reach)
 
 
-# Velocity that ramps of the acceleration may add during gentle braking, as a fraction of the
-# velocity limits at a cap of 1 m/s. With a smaller fraction, the arm brakes more gently. The
+# During gentle braking, ramps of the acceleration may add this fraction of the velocity limits
+# to the velocity, for a cap of 1 m/s. With a smaller fraction, the arm brakes more gently. The
 # added velocity falls with the square of the cap, as does the effect of the turning links.
 _RAMP = 0.005
 
@@ -304,7 +305,7 @@ class SpeedBarrier(nn.Module):
         self.distal = nn.Buffer(torch.ones(len(A), len(A)).triu().to(A))
         """1 at (i, j) for j >= i, otherwise 0 (n, n)."""
         self.slowing = nn.Buffer(A * delay)
-        """A D, by which a joint may have been faster when its position was read [rad/s]."""
+        """A D: a joint may have been faster by this much when its position was read [rad/s]."""
 
     def braking_time(self, velocity: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 1"]:
         """T, the time constant of the braking motion at a velocity [s]."""

@@ -74,8 +74,8 @@ class MotionFilter:
     """Filter that follows positions within limits of position, velocity, acceleration and jerk.
 
     Positions that keep the limits and continue the previous motion are returned unchanged.
-    Otherwise the motion departs from them and returns later. With the position error e, its
-    rate e' and the requested acceleration a_r,
+    Otherwise the motion departs from the positions and returns to them later. With the position
+    error e, its rate e' and the requested acceleration a_r,
 
         a = a_r - h'(e; A, lambda) e' - h(e' + h(e; A, lambda); j, mu)
         h(x; b, k) = sign(x) (sqrt((b/k)^2 + 2 b |x|) - b/k)
@@ -181,8 +181,8 @@ class MotionFilter:
         """Nearest acceleration that keeps the limits now and later [1/s^2]."""
         A, j, dt = self.acceleration, self.jerk, self.dt
         margin = self._walls + self._sides * state.position[..., None, :]
-        # Past a limit, the motion returns at the speed at which it may approach the limit from
-        # the same distance inside.
+        # Beyond a limit, the speed of the return equals the speed at which the motion may
+        # approach the limit from the same distance on the inner side.
         speed = np.sqrt(self._knee**2 + 2 * A * np.abs(margin)) - self._knee
         speed = np.copysign(speed, margin) - self._reserve
         speed = np.minimum(np.maximum(speed, -self._fastest), self._fastest)

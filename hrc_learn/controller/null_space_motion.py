@@ -80,7 +80,7 @@ class YieldingConfig:
     visual servoing to their posture. "stay": they stay off the path until the path waits for
     them."""
     elbow_speed: float = _GUIDED_SPEED
-    """Highest speed of the elbow in null-space motions [m/s], at most `guided_elbow_speed` of
+    """Highest speed of the elbow in null-space motions [m/s], at most `guided_elbow_speed` for
     the cap on the arm's speed."""
     return_speed: float = 0.4
     """Highest speed of the return, norm over all joints [rad/s]."""
@@ -133,7 +133,7 @@ def null_space_slowdown(
     Args:
         chain: Kinematics of the arm.
         joint_position: Joint positions [rad].
-        null_velocity: Velocity in the null space of the Jacobian there [rad/s].
+        null_velocity: Velocity in the null space at these joints [rad/s].
         elbow_speed: Highest speed of any joint's origin [m/s].
 
     Returns:
@@ -163,7 +163,7 @@ def singularity_fade(
     Args:
         chain: Kinematics of the arm.
         joint_position: Joint positions [rad].
-        null_velocity: Velocity in the null space of the Jacobian there [rad/s].
+        null_velocity: Velocity in the null space at these joints [rad/s].
 
     Returns:
         1 away from singularities and on the way out of one, 0 on the way into one.
@@ -216,7 +216,7 @@ def eased_null_velocity(
     Args:
         chain: Kinematics of the arm.
         joint_position: Joint positions [rad].
-        jacobian: Jacobian of the end effector there.
+        jacobian: Jacobian of the end effector at these joints.
         previous: Null-space velocity of the last step [rad/s].
         requested: Joint velocity whose null-space part is requested [rad/s].
         bounds: Lowest and highest joint velocities that keep the limit margin reserved for the
@@ -361,7 +361,7 @@ def limiting_joint(
     lower: Float[Tensor, "*batch n"],
     upper: Float[Tensor, "*batch n"],
 ) -> Int[Tensor, "*batch"]:
-    """Index, from 0, of the joint with bounds that reduce a velocity most.
+    """Index, from 0, of the joint whose bounds reduce a velocity most.
 
     Args:
         velocity: Joint velocity [rad/s].

@@ -367,7 +367,7 @@ class PathLaw:
         target: PathTarget,
         off: OffPath,
     ) -> tuple[Limitation, ...]:
-        """Limitations of a push by the path."""
+        """Limitations that the path imposes on a push."""
         J, direct, one = reading.jacobian, path.direct_return.active, torch.ones_like(path.rate)
         push = null_projection(J, state.null_velocity)
         kept = fraction_kept(push, null_projection(J, off.push) + off.back)

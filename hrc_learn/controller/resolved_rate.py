@@ -2,7 +2,7 @@
 
 *Feedback.* Two levels between 0 and 1 set the blend. The *vision level* fades vision feedback
 in, on top of Cartesian feedback, while the camera sees the feature. The *task level* fades from
-a joint-space approach towards a posture to task-space feedback. Invalid measurements are
+the joint-space approach of a posture over to task-space feedback. Invalid measurements are
 replaced before any feedback is computed.
 
 *Resolved rate.* A tool twist and a null-space velocity become one joint velocity. The
@@ -91,12 +91,12 @@ def resolved_rate(
 
     The damping lambda is exactly zero unless J is near a singularity. The distance from a
     singularity is estimated as |(J J^T)^-1|_F^(-1/2), which is at most sigma_min, and close to
-    sigma_min where that is small.
+    sigma_min where sigma_min is small.
 
     N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. At a
-    singularity, the null space has more dimensions. N keeps only as many of them as elsewhere,
-    and the kept ones may change from one step to the next. The safety filter limits the
-    resulting acceleration.
+    singularity, the null space has more dimensions. N keeps only as many dimensions as
+    elsewhere, and the kept dimensions may change from one step to the next. The safety filter
+    limits the resulting acceleration.
 
     An arm with fewer joints than rows has no null space. The position of its tool follows the
     twist, and the rotation follows as closely as possible (`position_first`).
@@ -324,10 +324,10 @@ def planned_motion(
 ) -> Float[Tensor, "*batch 6"]:
     """Motion of the tool that the task plans for the coming step (linear [m], angular [rad]).
 
-    Limits may slow the motion down. Slowing down is no drift, so only the fraction that the
-    filtered joint velocity executes counts as planned. This fraction is measured on the whole
-    twist: for a slow task, the correction of measurement noise is as large as the task's own
-    twist and would hide the fraction of the task alone.
+    Limits may slow the motion down, and slowing down is not drift. Therefore only the fraction
+    of the motion that the filtered joint velocity executes counts as planned. This fraction is
+    measured on the whole twist: for a slow task, the correction of measurement noise is as
+    large as the task's own twist and would hide the fraction of the task alone.
 
     Args:
         task_twist: Twist of the task alone.

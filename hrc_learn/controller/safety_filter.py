@@ -72,16 +72,16 @@ class SafetyFilter(nn.Module):
 
         limit_velocity -> cap_speed -> limit_acceleration -> keep_constraints -> keep_speed
 
-    The limits hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), if
-    the arm follows its commands with an error below the margins. Otherwise the limits of
+    A control barrier (`LimitBarrier`) keeps the limits for *any* sequence of commands, if the
+    arm follows its commands with an error below the margins. Otherwise the limits of
     acceleration and jerk hold, and the other limits hold again as soon as these two allow. A
     joint outside its limits, or within their margin, does not move further out. It may rest
     there, and returns when the command asks for it: a stop never causes a motion.
 
-    A second barrier (`SpeedBarrier`) keeps the cap on the speed of tool, elbow and load. If
-    no admissible motion keeps the cap, because it has fallen faster than the arm can brake or
-    the arm was too fast at the start, the arm brakes as hard as it can, and the report says by
-    how much and for how long the cap is exceeded.
+    A second barrier (`SpeedBarrier`) keeps the cap on the speed of tool, elbow and load. The
+    cap may fall faster than the arm can brake, or the arm may be too fast at the start. If
+    no admissible motion then keeps the cap, the arm brakes as hard as it can, and the
+    report says by how much and for how long the cap is exceeded.
 
     Any NaN or infinity, in an argument or in the state, brakes the arm to rest and is not
     stored: neither a command nor a state is ever NaN or infinite.
@@ -464,7 +464,7 @@ class SafetyFilter(nn.Module):
         """The velocity nearest to a given one that keeps limits and distances, and a report."""
         state, command = given.state, given.command
         assert given.jacobian is not None
-        # Fraction of the command that the arm has picked up so far.
+        # Fraction of the command that the arm has reached so far.
         square = torch.linalg.vecdot(command, command)
         along = torch.linalg.vecdot(command, v)
         fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
@@ -491,8 +491,8 @@ class SafetyFilter(nn.Module):
     def _keep_speed(
         self, given: _Inputs, v: Tensor, cap: Tensor | float
     ) -> tuple[Tensor, Bool[Tensor, "*batch 1"] | None]:
-        """The velocity, reduced as far as the cap on the speed of points requires, and a flag;
-        no flag if all arms keep the cap.
+        """The velocity, reduced as far as the cap on the speed of points requires, and a flag
+        for the reduction; None instead of the flag if all arms keep the cap.
 
         The result lies inside the barrier, on the line from the wanted velocity to gentle
         braking (`_easing`), as near to the wanted velocity as possible. Where gentle braking is

@@ -269,7 +269,7 @@ class RunRecording:
     """Centre and half edge lengths of the controller's position region at each step [m]; NaN
     without a controller in the loop."""
     drawn: Bool[np.ndarray, " time"] | None = None
-    """True while the region was drawn by a person."""
+    """True while a region drawn by a person is in use."""
 
     camera: CameraRecording | None = None
     image_jacobian: Float[np.ndarray, "time 2 6"] | None = None

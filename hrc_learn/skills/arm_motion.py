@@ -46,7 +46,7 @@ class StraightLine:
         self.duration = max(distance / speed, turn / _TURNING_SPEED, 0.3)
 
     def at(self, time: float) -> tuple[Pose, Float[Tensor, "6"]]:
-        """Pose and twist (linear [m/s], angular [rad/s]) some time after the start [s]."""
+        """Pose and twist (linear [m/s], angular [rad/s]) at a time after the start [s]."""
         s, slope = minimum_jerk(time / self.duration)
         turned = quaternion.multiply(
             quaternion.exp(s * self._twist[3:]), self._start.orientation
@@ -76,7 +76,7 @@ def joint_line(
 def joints_near(
     chain: SerialChain, pose: Pose, near: Float[Tensor, " joints"]
 ) -> Float[Tensor, " joints"]:
-    """Joint positions [rad] with the end effector at a pose, close to `near`.
+    """Joint positions, close to `near`, that bring the end effector to a pose [rad].
 
     Args:
         chain: Kinematics of the arm.
@@ -109,7 +109,7 @@ class PositionServoConfig:
 
 
 class PositionServo:
-    """Tracks joint positions by velocities within the limits.
+    """Tracks joint positions by joint velocities within the limits of the arm.
 
     A target that keeps the limits is reached by the time of the next target. Other targets are
     smoothed by `MotionFilter`, so that the arm does not jump when the target does.
@@ -213,7 +213,8 @@ class PositionServo:
         return state, self._motion.position
 
     def joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
-        """Joint positions, near the commanded ones, with the end effector at a pose [rad].
+        """Joint positions, near the commanded ones, that bring the end effector to a pose
+        [rad].
 
         Args:
             pose: Pose of the end effector. If it is out of reach, the joint positions only

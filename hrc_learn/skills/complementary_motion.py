@@ -131,7 +131,7 @@ class ComplementaryMotion:
 
     @property
     def offset(self) -> Float[np.ndarray, " joints"]:
-        """Commanded joints minus the policy's posture [rad]."""
+        """Commanded joint positions minus the policy's posture [rad]."""
         if self.posture is None or self.joints is None:
             return np.zeros(len(self._chain.joint_names))
         return (self.joints - self.posture).numpy()

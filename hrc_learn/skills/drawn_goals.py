@@ -1,8 +1,8 @@
 """Goals from a person's drawing: a region or a target for the end effector, and a turn.
 
 The paper's expert draws the Cartesian region in the AR interface and adjusts the coarse
-orientation (section VII). As in the paper (equation CaFun), the region is a box, given by the
-walls that the person drew.
+orientation (section VII), here called the turn. As in the paper (equation CaFun), the region is
+a box, given by the walls that the person drew.
 """
 
 import math
@@ -74,8 +74,9 @@ def drawn_position(
 
     The region's vertical walls are those of the drawn box, moved inwards by the margin over
     which vision feedback fades. The image shows little about height, so the region stays as
-    flat as planned. Its height is the planned height, or the nearest one in the drawn box. For
-    a target, the region is a small box around the target, within the drawn box.
+    flat as planned. The height of the region is the planned height, or the nearest height in
+    the drawn box. For a target, the region is a small box around the target, within the drawn
+    box.
 
     Args:
         drawing: Drawn region, target or both.
@@ -145,7 +146,7 @@ class DrawnGoalsState:
 
 
 class DrawnGoals:
-    """Applies a person's turn, and their drawing if the arm can go there."""
+    """Applies the turn and the drawing of a person; a drawing only if the arm can go there."""
 
     def __init__(
         self, config: DrawnGoalsConfig, refusal: Callable[[Pose], str] = lambda pose: ""

@@ -108,8 +108,8 @@ class GraspingConfig:
             drift_compensation_rate=10.0, command_delay=0.03
         )
     )
-    """Settings of the adaptive controller; the high rate compensates for the drift caused by
-    10 ms steps."""
+    """Settings of the adaptive controller; the high `drift_compensation_rate` compensates for
+    the drift caused by 10 ms steps."""
     detection_timeout: float = 5.0
     """Give up after an object is undetected for this long [s]."""
     lift: float = 0.20
@@ -146,7 +146,8 @@ class GraspJob:
     servo_time: float = float("nan")
     """Duration of the last visual servoing [s]."""
     pixel_error: float = float("nan")
-    """Distance of the marker from its target at the start of the descent [px]."""
+    """Distance of the end effector's marker from its target at the start of the descent
+    [px]."""
     picked_up: Pose | None = None
     """Pose of the end effector at the grasp."""
     attempts: int = 1
@@ -282,8 +283,8 @@ class Grasping:
     def locate(self, item: GraspObject) -> ServoTarget:
         """Detect an object before the arm moves above the table, and return the servo target.
 
-        An arm that is not at home may occlude the object: if it is not detected, the arm goes
-        home first.
+        An arm that is not at home may occlude the object. If the object is not detected, the
+        arm therefore goes home and looks again.
 
         Raises:
             UndetectedObjectError: The object's marker stays undetected.
@@ -322,7 +323,8 @@ class Grasping:
         return seen[item.marker.id]
 
     def _posture(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table, with free paths to them and from them to home [rad].
+        """Joint positions above the table; the paths to them, and from them to home, are free
+        [rad].
 
         If there are no such positions, the arm goes home first. The positions of objects on the
         table are not known yet, so the path to the posture avoids the whole region of the
@@ -335,10 +337,11 @@ class Grasping:
         return posture
 
     def _via(self, clearance: float | None) -> Float[Tensor, " joints"] | None:
-        """The first posture above the table with free paths to it and from it to home [rad].
+        """The first posture above the table for which the paths to it, and on to home, are free
+        [rad].
 
         Args:
-            clearance: Clearance of the path to the posture from objects [m]; None: not checked.
+            clearance: Clearance from objects on the path to the posture [m]; None: not checked.
 
         Returns:
             The posture; None if there is none.

@@ -26,9 +26,9 @@ _NO_PERSON = 100.0
 # time stamp is further ahead has an unknown age.
 _CLOCK_ERROR = 0.05
 # Time in which an arm comes to rest [s]. The arm's drivers brake with 0.7 of the highest joint
-# acceleration; a joint of a Panda then stops from 0.8 rad/s in this time. It determines a speed
-# scale near people. Without this scale, the arm came too close to a worker in up to 7 of 60
-# jobs.
+# acceleration; a joint of a Panda then stops from 0.8 rad/s in this time. This time determines
+# the speed scale near people. Without the speed scale, the arm came too close to a worker in up
+# to 7 of 60 jobs.
 _COMING_TO_REST = 0.15
 
 NEAR_PEOPLE = ConstraintConfig(distance_weight=0.1)

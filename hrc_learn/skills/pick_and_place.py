@@ -101,7 +101,7 @@ def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float, size: f
     Args:
         cell: Arm, gripper and person.
         plan: Plan to the goal.
-        goal: Pose of the end effector, as the arm reads it, from which the object is lowered.
+        goal: Pose of the end effector from which the object is lowered, as measured by the arm.
         lowering: Largest distance to lower the object, if there is no contact [m].
         size: Size of the hand relative to the Franka hand, to which the retreat is scaled.
 
@@ -191,7 +191,7 @@ class PickAndPlace:
 
         Args:
             orders: Objects, each with the name of its shelf.
-            before: Called before each object with its number, from 0.
+            before: Function called before each object with the number of the object, from 0.
 
         Raises:
             ValueError: There is no such shelf, or the arm cannot reach it.

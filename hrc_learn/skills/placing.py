@@ -415,7 +415,7 @@ def plan_candidates(
         goal: Pose of the end effector at the release.
         start: Present joint positions [rad].
         skill: Learned motion.
-        workplace: Workplace with the home near which the via points lie.
+        workplace: Workplace; the via points lie near its home.
         dt: Control step [s].
         speed: Speed relative to the demonstration.
     """

@@ -53,10 +53,11 @@ class ReceivingConfig:
     tolerance: float = 0.06
     """Standard deviation of the meeting point at which the speed is halved [m]."""
     near: float = 0.09
-    """Largest distance of the hand from its demonstrated position relative to the end effector
-    [m]."""
+    """Largest difference between the measured and the demonstrated position of the hand
+    relative to the end effector [m]."""
     still: float = 0.5
-    """Time for which the hand has to stay near that position before the fingers close [s]."""
+    """Time for which the hand has to stay near the demonstrated position before the fingers
+    close [s]."""
     attempts: int = 3
     """Largest number of times that the fingers close."""
     timeout: float = 30.0
@@ -318,7 +319,7 @@ def _end(estimate: InteractionEstimate) -> tuple[Float[Tensor, "3"], Float[Tenso
 def _eased(
     at: Tensor, velocity: Tensor, goal: Tensor, speed: float, config: ReceivingConfig, dt: float
 ) -> Float[Tensor, "3"]:
-    """Velocity towards the goal within limits of speed and acceleration, able to stop there."""
+    """Velocity towards the goal, limited in speed and acceleration so as to stop there."""
     offset = goal - at
     distance = float(offset.norm())
     fastest = min(speed, (config.acceleration * distance) ** 0.5, distance / (5 * dt))

@@ -266,7 +266,8 @@ def step_columns(
 ) -> dict[str, Any]:
     """Log columns of the arm, of its loop, and of the feedback to the person.
 
-    The components of "hindered" are `HINDRANCES`, those of "safety" `INTERVENTIONS`.
+    The components of the column "hindered" are `HINDRANCES`; those of "safety" are
+    `INTERVENTIONS`.
 
     Args:
         state: Reading of the arm.

@@ -72,8 +72,8 @@ class VisualServoConfig:
     occlusion_timeout: float = 10.0
     """Give up after the end effector's marker is undetected for this long [s]."""
     object_error: float = 0.0025
-    """Predicted error above the object below which the gripper may descend to grasp [m], one
-    standard deviation in the plane. With a larger error, the end effector probes."""
+    """Largest predicted error above the object with which the gripper may descend to grasp [m]:
+    one standard deviation in the plane. With a larger error, the end effector probes."""
     probe: float = 0.06
     """Height above the box from which a probe descends [m]. The descent shows how the marker's
     pixel depends on height."""
@@ -124,7 +124,7 @@ class VisualServoConfig:
         check_settings(self, positive=(*positive, "angle", "rate"), not_negative=not_negative)
 
     def scaled(self, size: float) -> "VisualServoConfig":
-        """The same settings, with the lengths above the table scaled to a hand.
+        """The same settings, with the lengths above the table scaled to the size of a hand.
 
         Args:
             size: Size of the hand relative to the Franka hand.

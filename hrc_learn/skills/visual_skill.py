@@ -141,11 +141,11 @@ class VisualServoSkill:
     """Demonstrated turn of the gripper; None if marker directions were not recorded: the
     gripper then does not align with the object."""
     learned: EvidenceResult | None = None
-    """Learned RBF centres, noise and prior; None if they were given."""
+    """Learned RBF centres, noise and prior; None if they were given and not learned."""
     landmarks: Landmarks | None = None
     """Landmarks of tool and objects; None if tool and objects carry markers."""
     cells: CellErrors | None = None
-    """Held-out errors of each cell of a grid; None for a loaded skill."""
+    """Held-out errors in each cell of a horizontal grid; None for a loaded skill."""
 
     def save(self, folder: Path) -> None:
         """Write the image Jacobian and all other learned parts that are not None."""

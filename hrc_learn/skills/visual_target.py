@@ -5,7 +5,8 @@ marker in the tool frame at that moment is learned from the pixels of both marke
 scene, the estimated camera turns the object's pixel into a ray, which is intersected with the
 plane at the demonstrated height of objects. At the goal of the end effector, this intersection
 has the learned position in the tool frame. The target in the image is the pixel that the end
-effector's marker will have at the goal. Calibration errors that move both markers alike cancel.
+effector's marker will have at the goal. Calibration errors cancel if they move both markers
+alike.
 """
 
 import math

@@ -87,7 +87,7 @@ class HiddenMarkerError(MissedGraspError):
 
 
 class StoppedByPersonError(TaskFailedError):
-    """A person or a contact has stopped the arm; it is at rest."""
+    """A person or a contact has stopped the arm; the arm is at rest."""
 
 
 class BlockedPathError(TaskFailedError):
@@ -619,8 +619,8 @@ class WorkCell:
 
         Args:
             waited: Time for which the task has waited [s].
-            blocked: Reason of the wait, as the start of the message.
-            cure: What a person can do about it.
+            blocked: Reason for the wait, as the start of the message.
+            cure: Action of a person that ends the wait.
         """
         if waited > self.config.longest_wait:
             raise TaskFailedError(
