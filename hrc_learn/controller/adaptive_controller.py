@@ -160,10 +160,12 @@ class AdaptiveController(nn.Module):
     null-space motion yields to the task near limits, and a safety filter has the last word.
 
     Goals for a part of the tool pose (`Goals.task`) leave more null space. With a basis B of
-    that part, J_t = B J and s = J_s_hat^T xi_x + xi_r, the law is
-    u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q). The potentials of the regions, with the
-    gradients s and xi_q, still fall. An arm with the task "nearest pose" (`Arm.task`) also
-    follows this law for goals of the whole pose.
+    this part, J_t = B J and s = J_s_hat^T xi_x + xi_r, the law is
+
+        u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q).
+
+    The potentials of the regions, with the gradients s and xi_q, still fall. An arm with the
+    task "nearest pose" (`Arm.task`) also follows this law for goals of the whole pose.
 
     A step is a pure function `(state, observation) -> (command, state)`; the module stores no
     state. Run real-time loops under `torch.inference_mode()`.
@@ -185,7 +187,7 @@ class AdaptiveController(nn.Module):
             estimator: Estimator of the image Jacobian.
             goals: Regions that attract tool, image feature and joints; an observation may
                 replace them.
-            config: Settings; default: the recommended ones.
+            config: Settings; default: the recommended settings.
             joint_region: Region within the joint limits; default: from the arm's limits.
 
         Raises:

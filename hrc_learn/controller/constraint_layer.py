@@ -69,7 +69,7 @@ class _Step:
     pseudo-inverse of these rows (p, rows). The columns of the pseudo-inverse are multiplied by
     `side`, so the columns of inactive limits are zero."""
     pending: Tensor
-    """True while a limit is only partly added, because another one had to be dropped first
+    """True while a limit is only partly added, because another limit had to be dropped first
     (1)."""
     index: Tensor
     """Index of the partly added limit (1)."""
@@ -293,7 +293,7 @@ class ConstraintReport:
     slowed: Float[Tensor, "*batch"]
     """Fraction of the task velocity given up, 0 to 1."""
     violation: Float[Tensor, "*batch"]
-    """Largest excess of a closing speed over the allowed one [m/s]; above zero where joint
+    """Largest excess of a closing speed over the allowed speed [m/s]; above zero where joint
     limits or other distances permit no better solution."""
     solved: Bool[Tensor, "*batch"]
     """False where the arm brakes because the solver needed more steps than allowed."""
@@ -310,7 +310,8 @@ def constrained_velocity(
     task_fraction: Float[Tensor, "*batch"] | None = None,
     separation: SeparationConfig | None = None,
 ) -> tuple[Float[Tensor, "*batch n"], ConstraintReport]:
-    """Joint velocity nearest to a wanted one that keeps all limits, with priority for the task.
+    """Joint velocity that keeps all limits and is nearest to a wanted one, with priority for
+    the task.
 
     With the joint velocity t of the task and orthonormal bases N of the null space of J and P
     of the range of J^T, every joint velocity is
@@ -344,7 +345,7 @@ def constrained_velocity(
         lower: Lowest joint velocity allowed by the limits of position, velocity, acceleration
             and jerk [rad/s]. Not above `upper`.
         upper: Highest joint velocity allowed [rad/s].
-        distances: Distances to keep; None: none.
+        distances: Distances to keep; None: no distances.
         config: Weights and clearance; default: the recommended settings.
         task_fraction: Fraction of `task` that `wanted` contains, 0 to 1; it is below 1 while
             the arm accelerates. None: 1.

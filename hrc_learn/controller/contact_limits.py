@@ -3,14 +3,14 @@
 Speed and separation monitoring keeps a distance (`SeparationConfig`). For power and force
 limiting, arm and body region are modelled as two masses with the spring of the region between
 them (ISO 10218-2:2025, Annex M; formerly ISO/TS 15066:2016, A.3.4). A contact at the relative
-speed v has the peak force v sqrt(mu k), where 1/mu = 1/m_H + 1/m_R, and the effective mass m_R
-of the arm at its posture is given by
+speed v has the peak force v sqrt(mu k), with the stiffness k of the spring and
 
-    1/m_R = n^T J M^-1 J^T n
+    1/mu = 1/m_H + 1/m_R,    1/m_R = n^T J M^-1 J^T n.
 
-with the direction n of approach, the Jacobian J of the contact point and the mass matrix M. A
-part of the body between the arm and furniture cannot yield: in this case we also assume that
-the arm keeps pushing until it has stopped.
+Here m_H is the effective mass of the body region, m_R the effective mass of the arm at its
+posture, n the direction of approach, J the Jacobian of the contact point, and M the mass
+matrix. A part of the body between the arm and furniture cannot yield: in this case we also
+assume that the arm keeps pushing until it has stopped.
 
 The values are those of ISO/TS 15066:2016, tables A.2 and A.3, as commonly quoted. Secondary
 sources confirm the spring constants and masses, and state that the edition of 2025 kept the
@@ -61,7 +61,7 @@ _REGIONS = tomllib.loads(Path(__file__).with_name("body_regions.toml").read_text
 BODY_REGIONS = {name: BodyRegion(**row) for name, row in _REGIONS.items()}
 """Regions by name: ISO/TS 15066:2016, tables A.2 and A.3."""
 _TABLE = Constant(torch.tensor(list(BODY_REGIONS.values()), dtype=torch.float64))
-# Transient limits are this many times the quasi-static ones (table A.2).
+# Transient limits are this many times the quasi-static limits (table A.2).
 _TRANSIENT = 2.0
 # Cosine of 60 degrees: furniture clamps a person if, seen from the arm, the directions of
 # furniture and person differ by at most this angle.

@@ -265,8 +265,8 @@ class Observation:
     joint_position: Float[Tensor, "*batch n"]
     """Measured joint positions [rad]."""
     feature: Float[Tensor, "*batch rows"]
-    """Measured feature (u, v) [px], or u and v of several points in turn, such as the corners
-    of a marker; any value, even NaN, where the feature is not visible."""
+    """Measured feature [px]: u and v of one point, or of several points in turn, such as the
+    corners of a marker. Where the feature is not visible, any value is allowed, even NaN."""
     feature_visible: Bool[Tensor, "*batch"]
     """True if the feature was found in the image."""
     dt: float | Float[Tensor, ""]
@@ -284,8 +284,8 @@ class Observation:
     feature_age: Float[Tensor, "*batch"] | None = None
     """Time since the image was taken [s]; None: zero."""
     image_joint_position: Float[Tensor, "*batch n"] | None = None
-    """Joint positions when the image was taken [rad]; None: the present ones. Pairing an image
-    with a later pose teaches the estimator a wrong Jacobian."""
+    """Joint positions when the image was taken [rad]; None: the present positions. Pairing an
+    image with a later pose teaches the estimator a wrong Jacobian."""
     joint_state_stale: Bool[Tensor, "*batch"] | None = None
     """True if the joint position is too old to be used; None counts as False."""
     human_distance: Float[Tensor, "*batch"] | None = None

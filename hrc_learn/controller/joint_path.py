@@ -223,8 +223,8 @@ _RETURN_GOALS, _CHECKED = 20, 51
 
 @pytree
 class DirectReturn:
-    """A straight joint motion back to a path that null-space motion cannot reach. The end
-    effector leaves its path meanwhile.
+    """A straight joint motion back to a path that null-space motion cannot reach. During this
+    motion, the end effector leaves its path.
     """
 
     start: Float[Tensor, "*batch n"]

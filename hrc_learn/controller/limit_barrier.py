@@ -182,7 +182,8 @@ class LimitBarrier(nn.Module):
         dt: float | Float[Tensor, "*#batch 1"],
         usable: tuple[Tensor, Tensor] | None = None,
     ) -> Float[Tensor, "*batch n"]:
-        """The acceleration nearest to `wanted` that keeps the limits now and later [rad/s^2].
+        """The acceleration that is nearest to `wanted` and keeps the limits now and later
+        [rad/s^2].
 
         Args:
             wanted: Acceleration wanted [rad/s^2].
@@ -225,9 +226,9 @@ def _reachable(wanted: Tensor, last: Tensor, limit: Tensor, reach: Tensor) -> Te
     """Acceleration nearest to `wanted`, within its limit and within `reach` of the last one
     [rad/s^2].
 
-    The clamp to the reach, which the jerk limit sets, comes last: outside the set, the barrier
-    may require an acceleration beyond the reach; and at the start, the acceleration may be so
-    far outside its limit that one step cannot bring it back.
+    The clamp to the reach, which the jerk limit sets, comes last for two reasons. Outside the
+    set, the barrier may require an acceleration beyond the reach. At the start, the
+    acceleration may be so far outside its limit that one step cannot bring it back.
     """
     return wanted.clamp(-limit, limit).clamp(last - reach, last + reach)
 

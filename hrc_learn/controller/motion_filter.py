@@ -18,7 +18,7 @@ _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
 _ROUNDING = 1 + 1e-6
 # Fraction of a velocity limit left unused, so that rounded sums do not exceed it.
 _UNUSED = 1e-12
-# Larger numbers count as invalid: squares of much larger ones overflow.
+# Larger numbers count as invalid: squares of much larger numbers overflow.
 _LARGEST_VALID = 1e50
 
 
@@ -167,7 +167,7 @@ class MotionFilter:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Velocity and acceleration of the requested motion, without its jumps. Where the
         request breaks a limit, the velocity approaches the slope of the request within the
-        acceleration limit, so that it nearly ignores single jumps but follows a new slope; the
+        acceleration limit: it nearly ignores single jumps, but follows a new slope. The
         returned acceleration is then zero.
         """
         dt, A = self.dt, self.acceleration

@@ -123,7 +123,7 @@ def null_space_slowdown(
     null_velocity: Float[Tensor, "*batch n"],
     elbow_speed: float,
 ) -> Float[Tensor, "*batch"]:
-    """Fraction of a null-space velocity at which the end effector can be kept in place.
+    """Fraction of a null-space velocity with which the end effector can be kept in place.
 
     The null space is curved. A motion in it at the speed s along a unit vector w accelerates
     the end effector by s^2 c. Here c is the derivative of J along w, times w. Late servos
@@ -166,7 +166,8 @@ def singularity_fade(
         null_velocity: Velocity in the null space at these joints [rad/s].
 
     Returns:
-        1 away from singularities and on the way out of one, 0 on the way into one.
+        1 away from singularities and for motions out of a singularity; it fades to 0 for
+        motions into a singularity.
     """
     # Intermediate postures count too: beyond a singularity the arm is regular again.
     ahead = joint_position + 2 * LOOK_AHEAD * _fractions_of(null_velocity)
@@ -250,7 +251,8 @@ def null_space_giving_way(
     lower: Float[Tensor, "*batch n"],
     upper: Float[Tensor, "*batch n"],
 ) -> Float[Tensor, "*batch n"]:
-    """The null-space velocity nearest to a given one that keeps task plus null space in bounds.
+    """Null-space velocity that keeps task plus null space in bounds and is nearest to a given
+    one.
 
     At a limit to which a person has pushed the arm, the null space thus gives way to the task.
     The correction has a single direction, which spans the whole null space of an arm with seven

@@ -93,10 +93,9 @@ def resolved_rate(
     singularity is estimated as |(J J^T)^-1|_F^(-1/2), which is at most sigma_min, and close to
     sigma_min where sigma_min is small.
 
-    N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. At a
-    singularity, the null space has more dimensions. N keeps only as many dimensions as
-    elsewhere, and the kept dimensions may change from one step to the next. The safety filter
-    limits the resulting acceleration.
+    N is never damped: |J N w| <= 1e-12 |w| in float64 for every J. At a singularity, the null space
+    has more dimensions than elsewhere. N keeps only as many as elsewhere, and may keep other
+    dimensions in the next step. The safety filter limits the resulting acceleration.
 
     An arm with fewer joints than rows has no null space. The position of its tool follows the
     twist, and the rotation follows as closely as possible (`position_first`).
@@ -147,10 +146,10 @@ def saturate_in_null_space(
     """Shift the motion of joints at a limit to the other joints.
 
     Joints that would exceed a limit move at the limit, and the other joints make up for the
-    rest of the twist: one iteration of the saturation in the null space (Flacco, De Luca and
-    Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015). Without it,
-    an arm may stop short of its goal: this happens where the smallest joint velocity for the
-    twist would move only a joint that is at its limit.
+    rest of the twist. This is one iteration of the saturation in the null space (Flacco, De
+    Luca and Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015).
+    Without saturation, an arm may stop short of its goal: this happens where the smallest joint
+    velocity for the twist would move only a joint that is at its limit.
 
     Args:
         task: Joint velocity of the task, by `resolved_rate` [rad/s].
@@ -327,7 +326,8 @@ def planned_motion(
     Limits may slow the motion down, and slowing down is not drift. Therefore only the fraction
     of the motion that the filtered joint velocity executes counts as planned. This fraction is
     measured on the whole twist: for a slow task, the correction of measurement noise is as
-    large as the task's own twist and would hide the fraction of the task alone.
+    large as the task's own twist, and would distort a fraction measured on the task's twist
+    alone.
 
     Args:
         task_twist: Twist of the task alone.
@@ -589,7 +589,7 @@ def validated_position(
     """Joint positions [rad]: measured, or expected where the measurement is NaN or stale.
 
     Returns:
-        The positions, and True where they are the expected ones.
+        The positions, and True where the expected positions are used.
     """
     q = observation.joint_position
     stale = ~is_number(q).all(-1)

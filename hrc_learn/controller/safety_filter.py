@@ -74,9 +74,9 @@ class SafetyFilter(nn.Module):
 
     A control barrier (`LimitBarrier`) keeps the limits for *any* sequence of commands, if the
     arm follows its commands with an error below the margins. Otherwise the limits of
-    acceleration and jerk hold, and the other limits hold again as soon as these two allow. A
-    joint outside its limits, or within their margin, does not move further out. It may rest
-    there, and returns when the command asks for it: a stop never causes a motion.
+    acceleration and jerk hold, and the other limits hold again as soon as these two limits
+    allow it. A joint outside its limits, or within their margin, does not move further out. It
+    may rest there, and returns when the command asks for it: a stop never causes a motion.
 
     A second barrier (`SpeedBarrier`) keeps the cap on the speed of tool, elbow and load. The
     cap may fall faster than the arm can brake, or the arm may be too fast at the start. If
@@ -98,7 +98,7 @@ class SafetyFilter(nn.Module):
         Args:
             limits: The arm or its chain, so that the speed of the elbow is capped as well; or
                 the joint limits alone.
-            config: Margins and caps; default: the recommended ones.
+            config: Margins and caps; default: the recommended settings.
         """
         super().__init__()
         self._arm = None
@@ -325,7 +325,9 @@ class SafetyFilter(nn.Module):
     def _validated_state(
         self, state: SafetyState, dt: float | Tensor
     ) -> tuple[SafetyState, float | Tensor, Tensor]:
-        """A finite state, the step to compute with, and a flag where either was invalid."""
+        """A finite state, the step to compute with, and True where the state or the step was
+        invalid.
+        """
         given, longest = state, self.config.longest_step
         state, invalid = self.restored(state), torch.zeros_like(state.fresh).unsqueeze(-1)
         if state is not given:
@@ -461,7 +463,9 @@ class SafetyFilter(nn.Module):
         return v + acceleration * dt
 
     def _keep_constraints(self, given: _Inputs, v: Tensor) -> tuple[Tensor, ConstraintReport]:
-        """The velocity nearest to a given one that keeps limits and distances, and a report."""
+        """The velocity that keeps limits and distances and is nearest to a given one, and a
+        report.
+        """
         state, command = given.state, given.command
         assert given.jacobian is not None
         # Fraction of the command that the arm has reached so far.

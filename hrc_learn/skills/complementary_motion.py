@@ -39,8 +39,8 @@ _EFFORT = 0.9
 _DIRECT_RETURN_AFTER = 5.0
 # Joints within this distance of the policy's posture count as being in that posture [rad].
 _SAME = 1e-6
-# While postures are queued, the policy counts as having waited, too, if its newest posture is
-# within this distance of its present one [rad].
+# If the policy's newest posture is within this distance of its present posture, the postures
+# queued between them are skipped [rad].
 _MET_AGAIN = 0.02
 # Reduction of the clearance in one step that counts as rounding [m].
 _ROUNDING = 1e-3
@@ -114,7 +114,7 @@ class ComplementaryMotion:
         self.posture = self.joints = None
         self.offset_velocity = still
         self._state = self._loop.initial_state(still)
-        # Queue of the policy's postures and gripper openings; the present one comes first.
+        # Queue of the policy's postures and gripper openings; the present posture comes first.
         # While the motion waits, the queue grows.
         self._wishes: deque[tuple[Tensor, float]] = deque()
         self._progress = 0.0

@@ -83,7 +83,7 @@ _AT_HOME = 0.05
 UNMARKED = CameraConfig(pixel_noise=1.0, min_step=0.012, bump=6.0)
 """Settings for a tool without markers: its reference point is found within 1 px, and errors of
 neighbouring images are alike. With a lower noise setting, the predicted error above the object
-was three times the true one."""
+was three times the true error."""
 # Settings of visual servoing for a tool without markers. Its reference point may be 0.4 m above
 # the object, so the predicted error is larger than with a marker. Larger errors are allowed,
 # since open fingers leave 15 mm on either side.
@@ -344,7 +344,7 @@ class Grasping:
             clearance: Clearance from objects on the path to the posture [m]; None: not checked.
 
         Returns:
-            The posture; None if there is none.
+            The posture; None if there is no such posture.
         """
         here, home = self._cell.joints, self._workplace.home_joints()
         for posture in self._workplace.hover_postures():

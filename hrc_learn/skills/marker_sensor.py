@@ -238,7 +238,8 @@ class DelayedDetection:
         self._pending.append(MarkerObservation(time=self._taken, joints=then, features=found))
 
     def newest(self, time: float) -> MarkerObservation | None:
-        """Newest observation that has arrived since the last call; None: none has arrived.
+        """Newest observation that has arrived since the last call; None: no observation has
+        arrived.
 
         Args:
             time: Present time [s].

@@ -113,7 +113,7 @@ class Workplace(Protocol):
         ...
 
     def hover_postures(self) -> Sequence[Float[Tensor, " joints"]]:
-        """Several joint positions at the hover pose, the preferred ones first [rad]."""
+        """Several joint positions at the hover pose, the preferred positions first [rad]."""
         ...
 
     def home_joints(
@@ -323,8 +323,8 @@ def follow_pose(
         start: Joint positions at the first pose [rad].
         poses: Desired poses of the end effector, (steps,).
         twist: Desired twists (linear [m/s], angular [rad/s]).
-        angle: Desired arm angles, continuous [rad]; None: the joint limits alone move the null
-            space, if there is one.
+        angle: Desired arm angles, continuous [rad]; None: only the joint limits move the null
+            space, if the arm has one.
         dt: Time between samples [s].
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)

@@ -257,7 +257,7 @@ class Receiving:
     def _await_hand(self, hand_offset: Float[np.ndarray, "3"], deadline: float) -> None:
         """Hold still until the person's hand rests at its demonstrated offset [m].
 
-        The offset is the position of the hand minus that of the end effector.
+        The offset is the position of the hand minus the position of the end effector.
         """
         cell, config, wait = self._cell, self._config, self._cell.pose
         still, there = torch.zeros(6, dtype=torch.float64), deque()

@@ -254,7 +254,7 @@ class ServoTarget:
 
     @property
     def tool_orientation(self) -> Float[Tensor, "4"]:
-        """Orientation of the end effector: aligned with the object, or that of `above`."""
+        """Orientation of the end effector: aligned with the object, or as in `above`."""
         return self.above.orientation if self.orientation is None else self.orientation
 
 
@@ -272,7 +272,7 @@ class ServoState:
     image_jacobian: Float[np.ndarray, "2 6"]
     """Estimated image Jacobian at the pose of the newest image [px/m, px/rad]."""
     chosen_turn: float | None = None
-    """Turn chosen for the present target [rad]; None: none so far."""
+    """Turn chosen for the present target [rad]; None: no turn so far."""
     image_jacobian_time: float = np.nan
     """Time of the image to which `image_jacobian` belongs [s]."""
     wanted_orientation: Float[Tensor, "4"] | None = None
@@ -329,8 +329,9 @@ class ServoStep:
             marker: ArUco number of the end effector's marker.
             config: Tolerances and regions.
             angle: Demonstrated turn relative to the object; None: the gripper does not turn.
-            refusal: Function that returns the reason why the arm cannot go to a pose requested
-                by a person, as a text for that person; the text is empty if the arm can.
+            refusal: Function that returns the reason why the arm cannot go to a pose that a
+                person requests. The reason is a text for this person; it is empty if the arm
+                can go there.
 
         Raises:
             ValueError: The controller estimates no camera.
@@ -458,7 +459,7 @@ class ServoStep:
         return self.tool_target(state, target).uncertainty(spread, state.image_jacobian)
 
     def turn_error(self, state: ServoState, pose: Pose, target: ServoTarget) -> float:
-        """Angle between the end effector's orientation and the wanted one [rad]."""
+        """Angle between the end effector's orientation and the wanted orientation [rad]."""
         goal = self.tool_target(state, target).tool_orientation
         return float(quaternion.angle(pose.orientation, goal))
 

@@ -402,8 +402,8 @@ class WorkCell:
                 also contains friction and an unknown load.
 
         Returns:
-            Pose of the end effector at the contact; None if there was none, or if the arm does
-            not estimate external torques.
+            Pose of the end effector at the contact; None if there was no contact, or if the arm
+            does not estimate external torques.
 
         Raises:
             TaskFailedError: The null space was pushed for longer than `longest_wait`.
