@@ -155,9 +155,10 @@ class AdaptiveController(nn.Module):
 
     u is the joint velocity, J the arm's Jacobian and N its null-space projector. The feedback
     is xi_x from vision (with the image Jacobian J_s_hat), xi_r from the tool pose and xi_q from
-    the joints; d is the null-space input. For real arms we extend the law: the twist is capped
-    with its direction kept, J^+ is damped near singularities, vision feedback fades in and out,
-    null-space motion yields to the task near limits, and a safety filter has the last word.
+    the joints; d is the null-space input, and c_d its damping (`null_damping`). For real arms
+    we extend the law: the twist is capped with its direction kept, J^+ is damped near
+    singularities, vision feedback fades in and out, null-space motion yields to the task near
+    limits, and a safety filter has the last word.
 
     Goals for a part of the tool pose (`Goals.task`) leave more null space. With a basis B of
     this part, J_t = B J and s = J_s_hat^T xi_x + xi_r, the law is

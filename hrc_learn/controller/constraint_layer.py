@@ -211,10 +211,11 @@ class ConstraintConfig:
     """Cost of stopping the task, relative to 1 rad/s of null-space motion. With 100, a change
     of the null-space velocity by 1 rad/s costs as much as a hundredth of the task's speed."""
     path_weight: float = 1e3
-    """Cost of leaving the path of the task by 1 rad/s, relative to stopping it."""
+    """Cost of leaving the path of the task by 1 rad/s, relative to stopping the task."""
     distance_weight: float = 1e2
     """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2,
-    the violation of conflicting distances exceeds the least possible one by 1 part in 1e4."""
+    the violation of conflicting distances exceeds the least possible violation by 1 part in
+    1e4."""
     steps: int = 16
     """Steps of the solver; the arm brakes where they are not enough. An arm that a person
     approached never needed more than 12; random limits need more than 16 in 4 % of the states,

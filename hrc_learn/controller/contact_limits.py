@@ -66,7 +66,8 @@ _TRANSIENT = 2.0
 # Cosine of 60 degrees: furniture clamps a person if, seen from the arm, the directions of
 # furniture and person differ by at most this angle.
 _FACING = 0.5
-# Distance of the arm from furniture below which its direction is undefined [m].
+# Distance of the arm from furniture below which the direction to the furniture is undefined
+# [m].
 _TOUCHING = 1e-6
 # Excess speed that counts as rounding of the constraint solver [m/s].
 _TOLERANCE = 1e-10

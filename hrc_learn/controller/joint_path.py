@@ -31,8 +31,9 @@ simulation, arms always returned to their path from 1.4 rad, where the elbow is 
 the path; from 2 rad some arms did not."""
 WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
 """Alignments (`return_alignment`): above `WELL_ALIGNED`, pushes are followed in full; below
-`POORLY_ALIGNED`, the null space may lead to a posture other than the path's. The alignment is
-0.7 when the elbow has moved a quarter of its circle, and 0 after half of the circle."""
+`POORLY_ALIGNED`, the null space may lead to a posture other than the path's. The null space
+moves the elbow on a circle: the alignment is 0.7 after a quarter of this circle, and 0 after
+half of it."""
 NARROW = 0.07
 """Lower bound on the smallest singular value of the Jacobian: below it, the joints may not
 leave their path. The damping of the inverse Jacobian begins at 0.05."""
@@ -187,7 +188,7 @@ def changed_rate(
     dt: float,
     direction: int | Int[Tensor, "*batch"] = 1,
 ) -> Float[Tensor, "*batch"]:
-    """Rate of a path one step later, changed smoothly.
+    """Rate of a path in the next step, which approaches the wanted rate smoothly.
 
     Args:
         rate: Fraction of the path's own speed, -1 to 1.

@@ -14,7 +14,7 @@ _USABLE = 0.8
 # that we tried, these are the fastest at which steps of 0.03 to 1 rad settle without overshoot
 # at 20 and 50 samples a second.
 _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
-# Factor on limits for differences of rounded numbers, also in float32.
+# Factor by which differences of rounded numbers may exceed a limit, also in float32.
 _ROUNDING = 1 + 1e-6
 # Fraction of a velocity limit left unused, so that rounded sums do not exceed it.
 _UNUSED = 1e-12

@@ -36,7 +36,7 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# `_ASIDE`: joints count as off the path if they are farther than this from its start [rad].
+# `_ASIDE`: when a path begins, joints farther than this from its start are off the path [rad].
 # `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
 # by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
@@ -334,7 +334,7 @@ class PathLaw:
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
         # Joints on the path that lag without a push are in contact with an object: they do not
-        # count as aside.
+        # count as off the path.
         stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)

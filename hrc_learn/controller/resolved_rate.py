@@ -1,9 +1,9 @@
 """Terms of the control law: regional feedback, and the joint velocity that realises its twist.
 
-*Feedback.* Two levels between 0 and 1 set the blend. The *vision level* fades vision feedback
-in, on top of Cartesian feedback, while the camera sees the feature. The *task level* fades from
-the joint-space approach of a posture over to task-space feedback. Invalid measurements are
-replaced before any feedback is computed.
+*Feedback.* Two levels between 0 and 1 blend the sources of feedback. The *vision level* fades
+vision feedback in, on top of Cartesian feedback, while the camera sees the feature. The *task
+level* replaces a joint-space approach to a posture by task-space feedback. Invalid measurements
+are replaced before any feedback is computed.
 
 *Resolved rate.* A tool twist and a null-space velocity become one joint velocity. The
 null-space projector is exact only to first order in the step, so the pose drift that null-space
@@ -37,7 +37,7 @@ from hrc_learn.pytree import pytree, zero_where
 from hrc_learn.regions import PostureRegion
 
 # Addition to the diagonal that keeps the Cholesky factorisation possible at a singularity. The
-# addition enters only the estimated distance from a singularity, never a solution.
+# addition affects only the estimated distance from a singularity, never a solution.
 _FLOOR = 1e-9
 _EYE = {rows: Constant(torch.eye(rows, dtype=torch.float64)) for rows in range(1, 7)}
 
@@ -90,12 +90,12 @@ def resolved_rate(
         J^+ v = J^T (J J^T + lambda^2 I)^-1 v,   N w = w - Q Q^T w,   J^T = Q R
 
     The damping lambda is exactly zero unless J is near a singularity. The distance from a
-    singularity is estimated as |(J J^T)^-1|_F^(-1/2), which is at most sigma_min, and close to
-    sigma_min where sigma_min is small.
+    singularity is estimated as |(J J^T)^-1|_F^(-1/2), which is at most the smallest singular
+    value, and close to this value where the value is small.
 
-    N is never damped: |J N w| <= 1e-12 |w| in float64 for every J. At a singularity, the null space
-    has more dimensions than elsewhere. N keeps only as many as elsewhere, and may keep other
-    dimensions in the next step. The safety filter limits the resulting acceleration.
+    N is never damped: |J N w| <= 1e-12 |w| in float64 for every J. At a singularity, the null
+    space has more dimensions than elsewhere. N keeps only as many as elsewhere, and may keep
+    other dimensions in the next step. The safety filter limits the resulting acceleration.
 
     An arm with fewer joints than rows has no null space. The position of its tool follows the
     twist, and the rotation follows as closely as possible (`position_first`).
@@ -159,8 +159,8 @@ def saturate_in_null_space(
         upper: Highest allowed velocity [rad/s].
 
     Returns:
-        The shifted velocity [rad/s], which may exceed bounds that the given velocity kept; or
-        the given velocity, if its twist after clamping is at least as near to `twist`.
+        The shifted velocity [rad/s]; it may exceed bounds that `task` keeps. If the twist of
+        `task`, after clamping, is at least as near to `twist`, `task` is returned instead.
     """
     cut = task.clamp(lower, upper)
     free = cut == task
@@ -386,7 +386,7 @@ class VisionBlending(nn.Module):
         self.config = config = config or BlendingConfig()
         size = torch.tensor(config.image_size, dtype=torch.float64)
         self.centre = nn.Buffer((size - 1) / 2)
-        """Middle of the image [px]; pixels count from 0, so it is also the half size."""
+        """Middle of the image [px]. Pixels count from 0, so this is also half of the size."""
 
     def initial_state(self, like: Float[Tensor, "*batch n"], points: int = 1) -> BlendingState:
         """State before the first image.

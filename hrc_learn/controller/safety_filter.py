@@ -255,7 +255,7 @@ class SafetyFilter(nn.Module):
             given = self._with_capped_points(given, load)
         target, fast, cut = self._limit_velocity(given)
         target, cap, speeding, near = self._cap_speed(given, target, human_distance)
-        # Constraints keep the bounds on the velocity themselves.
+        # With constraints, the quadratic program keeps the bounds on the velocity.
         own = given.bounds if self.config.constraints is None else None
         v, hard, jerky = self._limit_acceleration(given, target, own)
         report, excess = None, torch.zeros_like(given.state.dt)

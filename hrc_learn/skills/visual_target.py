@@ -3,10 +3,10 @@
 Demonstrations end with the end effector right above an object. The position of the object's
 marker in the tool frame at that moment is learned from the pixels of both markers. In a new
 scene, the estimated camera turns the object's pixel into a ray, which is intersected with the
-plane at the demonstrated height of objects. At the goal of the end effector, this intersection
-has the learned position in the tool frame. The target in the image is the pixel that the end
-effector's marker will have at the goal. Calibration errors cancel if they move both markers
-alike.
+plane at the demonstrated height of objects. The goal of the end effector is the pose at which
+this intersection has the learned position in the tool frame. The target in the image is the
+pixel that the end effector's marker will have at the goal. Calibration errors cancel if they
+move both markers alike.
 """
 
 import math
