@@ -84,8 +84,8 @@ def arm_from_file(
             None: the flange itself.
         limits: Limits that replace or complete those of the file; None: the TOML file with the
             same stem, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
-        ready: A comfortable posture [rad, m]; None: the file's `home`, or a posture near the
-            middle of the joints' ranges and far from singularities.
+        ready: A comfortable posture [rad, m]; None: the file's `home`, or without it a random
+            posture that is far from limits and singularities.
         body: Capsules and overlapping links; None fits capsules on first use.
         base_turn: Turn of the base link about its z axis, for a file whose arm does not extend
             along the x axis [rad].
@@ -343,7 +343,7 @@ def _comfortable(chain: SerialChain) -> Float[Tensor, " joints"]:
     """
     rng = torch.Generator().manual_seed(_SEED)
     lower, upper = chain.limits.lower, chain.limits.upper
-    # Joints with more than one revolution are sampled around their middle.
+    # A joint with a range above one revolution is sampled around the middle of the range.
     half = ((upper - lower) / 2).clamp(max=torch.pi)
     random = torch.rand(_POSTURES, len(lower), generator=rng, dtype=torch.float64)
     q = chain.limits.middle + (2 * random - 1) * half

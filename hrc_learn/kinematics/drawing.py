@@ -73,7 +73,7 @@ def arm_bodies(
     joint_position: Float[np.ndarray, "time joints"],
     opening: Float[np.ndarray, " time"] | None = None,
 ) -> tuple[Body, ...]:
-    """Links, hand and fingers of an arm along a motion, as meshes or, if unknown, capsules.
+    """Links, hand and fingers of an arm along a motion: meshes, or capsules without meshes.
 
     Args:
         robot: The arm.

@@ -32,7 +32,7 @@ class PageStatus(RecorderStatus):
     """
 
     title: str = ""
-    """Name of the guided arm."""
+    """Name of the guided arm, or title of the autonomous task."""
     doing: str = ""
     """Present activity of an autonomous arm; empty if a person guides and records."""
     interventions: Mapping[str, int] = field(default_factory=dict)
