@@ -2,7 +2,7 @@
 
 Tensors, NumPy arrays and nested lists of integers or floats are accepted everywhere. `...`
 stands for any number of leading batch axes. The axis names in the aliases (`_T`, `_D`) only
-document the layout and are not checked, because the arguments of a call broadcast and the
+document the layout. They are not checked, because the arguments of a call broadcast and the
 demonstrations in a list differ in length. Sizes that have to agree are compared where the
 values are used.
 """
@@ -81,7 +81,7 @@ def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 def readable(*tensors: Tensor) -> bool:
     """True if Python may branch on the values of the tensors.
 
-    It may not during tracing, in a `torch.func` transform or in a forward derivative.
+    It must not do so during tracing, in a `torch.func` transform or in a forward derivative.
     """
     if torch.compiler.is_compiling():
         return False
@@ -102,14 +102,14 @@ _transform_level = getattr(
 )
 """Function that returns the nesting level of `torch.func` transforms, None outside of them.
 
-Where PyTorch lacks it, the code acts as if it always ran inside a transform.
+If PyTorch lacks the function, the code acts as if it always ran inside a transform.
 """
 
 
 def transforming() -> bool:
     """True inside `torch.func` transforms and forward derivatives.
 
-    NumPy cannot read tensors there.
+    Inside of them, NumPy cannot read tensors.
     """
     return _transform_level() is not None or forward_ad._current_level >= 0
 
@@ -133,7 +133,7 @@ def refuse_nested_forward(s: Tensor) -> None:
 
 
 def fits_numpy(detached: Tensor, *others: Any) -> bool:
-    """True if NumPy may compute with the tensors: without tracing, `vmap` or gradients.
+    """True if NumPy may compute with the tensors: no tracing, no `vmap`, no gradients.
 
     For a few numbers, NumPy takes a third of the time of PyTorch, where dispatch dominates.
 
@@ -192,7 +192,7 @@ def finite(name: str, values: Tensor) -> Tensor:
     # Reading from another device would wait for all work queued there.
     if not values.is_cpu or not readable(values):
         return values
-    # For a few numbers, Python's sum takes half the time of PyTorch's. Inside a transform,
+    # For a few numbers, Python's sum takes half the time of a sum in PyTorch. In a transform,
     # PyTorch 2.8 refuses `tolist`, even for tensors from outside.
     few = values.ndim == 1 and values.numel() <= 32 and not transforming()
     if not math.isfinite(sum(values.tolist()) if few else values.detach().sum().item()):

@@ -11,16 +11,16 @@ primitive:
     tau z_dot = alpha (beta (g - y) - z) + f + lead tau C_dot,   tau y_dot = z + C
 
 Here f is the forcing term, z the scaled velocity, and C = tau gain error; `lead` adds damping
-(see `velocity_coupling`). If the wanted force cannot be reached at the goal g, the spring still
-pulls towards g. At rest, feedback alone then leaves the fraction 1 / (1 + K gain) of the error.
-K is k tau / beta in contact with a surface of stiffness k, and 2 tau / beta between two arms.
-If the next repetition of the motion applies this feedback as feed-forward, the error decreases
-by the same factor again. A coupling is constant over each step, which causes an error of first
-order in the length of the step.
+(see `velocity_coupling`). If the wanted force requires another position than the goal g, the
+spring opposes it. At rest, feedback alone then leaves the fraction 1 / (1 + K gain) of the
+error. K is k tau / beta in contact with a surface of stiffness k, and 2 tau / beta between two
+arms. If the next repetition of the motion applies this feedback as feed-forward, the error
+decreases by the same factor again. A coupling is constant over each step, which causes an error
+of first order in the length of the step.
 
 To keep two arms at the positions `position` and `other` a wanted offset apart, the error is
-wanted - (other - position). The first arm receives minus the error, the
-second arm plus the error. If one arm follows the other, only the follower receives the error.
+wanted - (other - position). The first arm receives minus the error, and the second arm plus the
+error. If one arm follows the other, only the follower receives the error.
 """
 
 import torch
@@ -69,11 +69,12 @@ def steering(
     neither side is nearer.
 
     Args:
-        position: [m].
-        velocity: [m/s].
+        position: Position of the motion [m].
+        velocity: Velocity v [m/s].
         obstacles: Points to avoid [m].
-        gain: gamma [1/s].
-        sharpness: beta [1/rad]; larger values narrow the cone ahead in which obstacles act.
+        gain: Gain gamma [1/s].
+        sharpness: Decay beta over the angle [1/rad]; larger values narrow the cone ahead in
+            which obstacles act.
         reach: Distance [m] over which the effect fades to 1 / e; None: no fading, as published.
     """
     towards = obstacles - position[..., None, :]
@@ -98,14 +99,14 @@ def repulsion(
 ) -> Float[Tensor, "*batch 3"]:
     """Acceleration away from obstacles closer than `reach` [m/s^2].
 
-    It is minus the gradient of U = gain / 2 (1 / d - 1 / reach)^2 at the distance d (Khatib
-    1986, "Real-time obstacle avoidance for manipulators and mobile robots").
+    It is minus the gradient of the potential U = gain / 2 (1 / d - 1 / reach)^2 at the distance
+    d (Khatib 1986, "Real-time obstacle avoidance for manipulators and mobile robots").
 
     Args:
-        position: [m].
+        position: Position of the motion [m].
         obstacles: Nearest point of each obstacle [m].
         reach: Distance below which obstacles act [m].
-        gain: [m^4/s^2].
+        gain: Factor on the potential U [m^4/s^2].
     """
     away = position[..., None, :] - obstacles
     distance = away.norm(dim=-1, keepdim=True)
@@ -131,10 +132,11 @@ def velocity_coupling(
     elimination of z.
 
     Args:
-        velocity: V, such as gain * (wanted - measured force) [m/s].
-        acceleration: V_dot, such as -gain * (rate of the measured force) [m/s^2].
+        velocity: Velocity V, for example gain * (wanted - measured force) [m/s].
+        acceleration: Its derivative V_dot, for example -gain * (rate of the measured force)
+            [m/s^2].
         spring: Gains of the primitive.
-        duration: tau of the motion [s], `state.duration`.
+        duration: Duration tau of the motion [s], `state.duration`.
         lead: Additional weight of C_dot on the acceleration (c_2 / tau in the source), for more
             damping.
     """

@@ -43,8 +43,9 @@ def check_count(count: int) -> None:
 class SpringDamper:
     """y'' = alpha (beta (g - y) - y'), solved exactly for any gains.
 
-    This is the unforced equation (eq_tf) of the paper; primes are derivatives with respect to
-    s = t / tau. With x = (y - g, y') it reads x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
+    This is the unforced equation (eq_tf) of the paper for a position y and a goal g; primes are
+    derivatives with respect to s = t / tau. With x = (y - g, y') it reads x' = A x,
+    A = [[0, 1], [-alpha beta, -alpha]].
     """
 
     alpha: float = 25.0
@@ -176,7 +177,7 @@ class GaussianBasis:
     psi_i(x) = exp(-(x - c_i)^2 / (2 sigma_i^2)),  phi_i = psi_i z / sum_j psi_j
 
     Centres are equally spaced in time, s_i = (i - 1) / (N - 1), so that early and late detail
-    is resolved equally well; sigma_i is `width` times the distance to the next centre.
+    is resolved equally well. sigma_i is `width` times the distance to the next centre.
 
     In the domain `"time"`, x = s, and one more Gaussian without a weight follows the last one.
     After the end it dominates the sum, so the forcing term vanishes and the motion settles at
@@ -398,7 +399,7 @@ def restored_basis(config: dict[str, Any]) -> Basis:
 def balanced_units(
     basis: Basis, A: Float[Tensor, "rows M"], others: int
 ) -> Float[Tensor, "unknown"]:
-    """Units of the unknowns in which a ridge penalises all unknowns alike.
+    """Units of the unknowns in which a ridge penalises all unknowns equally.
 
     The columns of A are the weights, then `others` unknowns such as the start velocity. Late
     weights act through a small phase, so the unit of a weight is 1 / phase at its centre. The

@@ -32,7 +32,7 @@ from hrc_learn.geometry import Pose, quaternion
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
 TRACED_BATCH = 3
-"""Batch size during tracing: any but 0 and 1, which the tracer would treat as constants."""
+"""Batch size during tracing: any except 0 and 1, which the tracer would treat as constants."""
 ROUNDINGS = 8
 """Angles up to this many machine epsilons count as zero: quaternion products round 7 times."""
 TRACED_STEP = 1e-3
@@ -47,7 +47,8 @@ class ExportedDMP:
 
     dmp: MotionPrimitive
     stepper: Stepper | None
-    """NumPy stepper of a joint primitive (float64); None for other kinds: use `program`."""
+    """NumPy stepper (float64) of a joint primitive; None for other kinds, which use
+    `program`."""
     program: ExportedProgram
     """Program that maps (state, dt, inputs) to the next state.
 
@@ -132,7 +133,7 @@ def state_tensors(state: Any) -> Tensors:
 
 
 def _named(state: Any) -> Tensors:
-    """Tensors of a state by name, including those of its columns."""
+    """Tensors of a state by name, including the tensors of its columns."""
     tensors: Tensors = {}
     for name, part in vars(state).items():
         tensors |= _named(part) if isinstance(part, DMPState) else {name: part}

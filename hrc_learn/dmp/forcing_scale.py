@@ -8,7 +8,7 @@ With the start y_0 and the goal g:
   distance to the goal, and is mirrored if the goal lies on the other side. The scaling is
   undefined for demonstrations with g = y_0.
 - `"amplitude"`: factor equal to the range of each coordinate in the demonstration. Weights are
-  dimensionless, so a scaled demonstration has the same weights; also defined for g = y_0.
+  dimensionless, so a scaled demonstration has the same weights. It is also defined for g = y_0.
 - `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
   space; see `_rotated`.
 """
@@ -92,7 +92,7 @@ class Scaling:
         """Scale weights, forces or the states that they cause.
 
         Args:
-            values: (*batch, K, D).
+            values: K values of each of the D coordinates, (*batch, K, D).
             start: y_0 of the motion, (*batch, D).
             goal: g of the motion, (*batch, D).
             reference: The demonstration.

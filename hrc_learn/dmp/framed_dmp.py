@@ -79,10 +79,10 @@ class Frames:
 class FramedDMP:
     """Gaussians over the coordinates of a primitive relative to each of F frames (float64).
 
-    x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M numbers for each of
-    D columns. The covariance of the n demonstrations is extended by smooth deviations in all
-    directions. They are as large as the observed deviations and count as one demonstration
-    more.
+    The coordinates are x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M
+    numbers for each of D columns. The covariance of the n demonstrations is extended by smooth
+    deviations in all directions. They are as large as the observed deviations and count as one
+    demonstration more.
     """
 
     primitive: JointDMP
@@ -108,11 +108,11 @@ class FramedDMP:
         """Learn from demonstrations whose frames differ.
 
         Args:
-            time: [s], (T,), (n, T) or a list of (T_i,).
-            position: (n, T, D) or a list of (T_i, D).
+            time: Timestamps [s], (T,), (n, T) or a list of (T_i,).
+            position: Positions, (n, T, D) or a list of (T_i, D).
             frames: Frames of each demonstration, (n, F).
-            n_basis: N, as in `JointDMP.fit`.
-            mask: (n, T), false at samples to ignore.
+            n_basis: Number N of basis functions, as in `JointDMP.fit`.
+            mask: Mask (n, T), false at samples to ignore.
             tolerance: Smallest standard deviation of the demonstrations in every frame, in the
                 units of the motion. None: 0.1 % of the largest range.
             joint_names: D names.

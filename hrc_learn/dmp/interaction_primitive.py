@@ -57,7 +57,7 @@ class InteractionPrimitive:
         """Learn from demonstrations of a person and a robot.
 
         Args:
-            time: [s], (T,), (B, T) or a list of (T_i,), the same for person and robot.
+            time: Timestamps [s] of person and robot, (T,), (B, T) or a list of (T_i,).
             person: Observed columns of the person, (B, T, H) or a list of (T_i, H).
             robot: Columns of the robot, (B, T, R) or a list of (T_i, R).
             kinds: Kind of each demonstration; None: all are of one kind.

@@ -50,8 +50,9 @@ class FitOptions(TypedDict, total=False):
     """Options that `fit` of every kind of primitive accepts."""
 
     method: str
-    """`"trajectory"` (default), least squares on the positions, the closest reproduction;
-    `"ridge"`, regression on the force; `"lwr"`, the paper's method."""
+    """`"trajectory"` (default): least squares on the positions, which reproduces the samples
+    most closely. `"ridge"`: ridge regression on the force. `"lwr"`: locally weighted regression
+    on the force, as in the paper by Yan et al."""
     approach: float | int | None
     """Fraction of the motion, 0 to 1, over which it adapts smoothly to a new start and goal; 0:
     the spring alone adapts it, as in the paper. None (default): 1, but 0 for rhythms and for
@@ -153,17 +154,17 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
 
         Args:
             time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
-            position: (T, D) or (*B, T, D); D = 1 if its shape is that of `time`. For
-                demonstrations of different lengths, a list of (T_i, D), with a list of (T_i,)
-                as `time`. The primitive has the floating-point dtype of the positions; the
-                fit runs in float64.
+            position: Positions, (T, D) or (*B, T, D); D = 1 if they have the shape of `time`.
+                For demonstrations of different lengths, a list of (T_i, D), with a list of
+                (T_i,) as `time`. The primitive has the floating-point dtype of the positions;
+                the fit runs in float64.
             n_basis: Number N of basis functions, unless `basis` is given. None: 50 functions,
                 and noise is removed from the samples; see `FitOptions.smooth`. If there are at
                 most 1.5 N samples, the motion follows piecewise cubics between them.
             velocity: Recorded velocity per second, shaped like `position`. Without it, the
                 default method also fits the start velocity, and the other methods differentiate
                 the positions.
-            mask: (*B, T), false at samples to ignore, such as padding and dropouts.
+            mask: Mask (*B, T), false at samples to ignore, such as padding and dropouts.
             scaling: Scaling of the forcing term: `"none"`, `"paper"`, `"amplitude"` or
                 `"rotation"`.
             joint_names: D names, stored with the primitive.
@@ -274,10 +275,10 @@ def select_basis_count(
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).
-        position: (T,), (T, D) or (*B, T, D).
+        position: Positions, (T,), (T, D) or (*B, T, D).
         candidates: Numbers of basis functions to try.
         n_folds: Number of fits per candidate.
-        mask: (*B, T), false at samples to ignore.
+        mask: Mask (*B, T), false at samples to ignore.
         scaling: Scaling of the forcing term.
         options: Options of the fit; see `FitOptions`.
 
@@ -330,8 +331,9 @@ def fit_shared(
     of their separate primitives.
 
     The least-squares problem min |A X - B|^2, with unknowns X and one row of A and B for each
-    sample, is solved from [A B]'[A B]. This product is a sum over the rows, in any order. Each
-    of several processes reads its part of the demonstrations; all return the same result.
+    sample, is solved from [A B]'[A B]. This product is a sum over the rows, in any order. In a
+    distributed run, each process reads a part of the demonstrations, and all processes return
+    the same result.
 
     Args:
         demonstrations: Timestamps (T,) [s] and positions (T, D) of each. They are read one by

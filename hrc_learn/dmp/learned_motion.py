@@ -1,7 +1,7 @@
 """Learning of a motion with the model that best predicts each demonstration from the others.
 
-A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n.
-All models except the one with frames compute the coordinates for a context c (known before the
+A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n. All
+models except the one with frames compute the coordinates for a context c (known before the
 motion) as x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest
 demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
 regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
@@ -221,7 +221,7 @@ class LearnedMotion:
 
         Args:
             start: Start of one motion, in the form that `rollout` of the primitives accepts.
-            goal: Goal.
+            goal: Goal of the motion, in the same form.
             duration: Duration [s].
             context: Context of the motion, (C,), if the demonstrations had contexts.
             frames: Frames of the motion, (F,), if the model uses frames.

@@ -190,7 +190,7 @@ class LinearPrimitive(nn.Module):
 
         Args:
             coordinates: As returned by `coordinates`; the result has their batch shape.
-            duration: [s]; None keeps the value of this primitive, here and below.
+            duration: Duration [s]; None keeps the value of this primitive, here and below.
             amplitude: Range of each column.
             timestamps: Normalised times of the default rollout.
 
@@ -226,7 +226,7 @@ class LinearPrimitive(nn.Module):
 
         Args:
             x: Weights, start velocity dy/ds, start and goal, as from `coordinates`.
-            duration: [s].
+            duration: Duration [s].
             amplitude: Range of each column.
             timestamps: Normalised times of the default rollout.
             response: Response of basis and spring.
@@ -283,7 +283,7 @@ class LinearPrimitive(nn.Module):
 
         Args:
             boundary: Start, goal and start velocity, in columns.
-            duration: [s].
+            duration: Duration [s].
             time: Time since the start [s], (T,) or (*batch, T).
             forcing_gain: Factor on the forcing term, (*batch).
         """

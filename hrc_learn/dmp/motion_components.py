@@ -135,7 +135,8 @@ class MotionComponents(nn.Module):
             start: Start, (*batch, D). None: the mean start if the components were fitted with
                 known starts, else the start that the parameters encode.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
-                components were fitted with start velocities, else the encoded velocity.
+                components were fitted with start velocities, else the velocity that the
+                parameters encode.
             order: Derivative with respect to time, 0, 1 or 2.
 
         Raises:

@@ -1,11 +1,12 @@
 """The last layer of a network that plans motions: it maps parameters to trajectories.
 
-A head needs no demonstration. Its parameters are whitened: if they are independent and unit
-normal, motions deviate by a given amplitude from the straight minimum-jerk path to the goal, in
-orthogonal modes, the smoothest first. Networks and searches thus see numbers of similar size.
-The motion is linear in all parameters but duration and delay, so a Gaussian over parameters is
-a Gaussian over motions, with density, divergence and samples in closed form (Li et al. 2023,
-"ProDMP: A unified perspective on dynamic and probabilistic movement primitives").
+A head needs no demonstration. Its parameters are whitened, so that networks and searches see
+numbers of similar size. If the parameters are independent and unit normal, motions deviate by a
+given amplitude from the straight minimum-jerk path to the goal. They deviate in orthogonal
+modes, the smoothest first. The motion is linear in all parameters except duration and delay, so
+a Gaussian over parameters is a Gaussian over motions. Its density, divergence and samples have
+closed forms (Li et al. 2023, "ProDMP: A unified perspective on dynamic and probabilistic
+movement primitives").
 """
 
 import math
@@ -83,9 +84,9 @@ class MotionHead(nn.Module):
             duration: Duration [s], or the range (shortest, longest) from which a parameter
                 selects, on a logarithmic scale.
             delay: Longest delay before a motion [s]; 0: no delay, and no parameter for it.
-            amplitude: Root mean square deviation over a motion for unit normal weights, and
-                standard deviation of the goal for a unit normal parameter, in the units of the
-                columns; (D,) or one for all.
+            amplitude: Amplitude in the units of the columns, (D,) or one for all. It is the
+                root mean square deviation over a motion for unit normal weights, and the
+                standard deviation of the goal for a unit normal parameter.
             goal_centre: Centre of the goals, (D,); None: the start of each motion.
 
         Raises:
@@ -421,8 +422,8 @@ class MotionDistribution:
         """Log density of the positions of one motion observed with noise.
 
         Args:
-            time: [s], (T,) or (*batch, T).
-            position: (*batch, T, D).
+            time: Times of the positions [s], (T,) or (*batch, T).
+            position: Observed positions, (*batch, T, D).
             noise: Standard deviation of each value, independent of the others.
         """
         known = self._observed(time, noise)
@@ -481,7 +482,7 @@ def _each_column(amplitude: Any, columns: int) -> Float[Tensor, "D"]:
 def _modes(response: Response) -> Float[Tensor, "N N"]:
     """Weights of orthogonal motions, smoothest first, with a mean square of one in total.
 
-    The relative sizes of the modes are those that white noise as forcing would cause.
+    The relative sizes of the modes are as if the forcing term were white noise.
     """
     N = response.basis.count
     s = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)

@@ -1,8 +1,8 @@
 """The interface of all movement primitives, and their common implementation.
 
 A linear primitive describes the motion of columns. Each kind of primitive maps its values to
-columns and back: joints are columns themselves, an orientation becomes its error to a
-reference, a pose becomes position, orientation error and body, and joints with a moving goal
+columns and back. Joints are columns themselves. An orientation becomes its error to a
+reference, and a pose becomes position, orientation error and body. Joints with a moving goal
 become positions relative to this goal.
 """
 
@@ -95,7 +95,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         Args:
             given: Start, goal and start velocity from the caller; None for a demonstrated
                 value.
-            duration: [s].
+            duration: Duration of the motion [s].
             options: Arguments of this kind.
         """
         return given, None
@@ -204,7 +204,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             speed: Speed relative to the demonstration, instead of a duration.
             dt: Sampling interval [s], instead of `time`. The samples run from zero to the first
                 sample at or after the end of the longest motion.
-            forcing_gain: Factor on the forcing term, (*batch): the amplitude of a rhythm.
+            forcing_gain: Factor on the forcing term, (*batch); it scales the amplitude of a
+                rhythm.
             options: Further arguments of this kind of primitive.
         """
         given = Boundary(start, goal, start_velocity)
@@ -257,7 +258,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
         Args:
             state: From `initial_state` or the last step.
-            dt: [s], (*batch).
+            dt: Time step [s], (*batch).
             goal: New goal from now on, (*batch).
             goal_filter: Rate, per duration, at which the goal approaches the commanded goal, to
                 avoid a jump of the acceleration. None: the goal jumps.
@@ -297,7 +298,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
 
         Args:
             state: Current state.
-            goal: (*batch).
+            goal: New goal, (*batch); None keeps the goal.
             goal_body: Goal of the body, (*batch, K); poses only.
             filtered: False if the next step has no `goal_filter`; this is faster for
                 orientations.
@@ -354,7 +355,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         the given orientation, or at the orientation of the motion if none is given.
 
         Args:
-            time: [s], (*batch, n).
+            time: Times of the via points [s], (*batch, n).
             value: Joints (*batch, n, D); unit quaternions (*batch, n, 4); or a `Pose` of
                 (*batch, n). NaN leaves a coordinate free; a quaternion with a NaN leaves the
                 orientation free.
@@ -406,8 +407,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     def reversed[S: "MotionPrimitive"](self: S) -> S:
         """Primitive that moves along the same path backwards, from the goal to the start.
 
-        Its motion at time t is that of this primitive at duration - t, fitted with the same
-        basis. It accepts new starts and goals.
+        At time t, its motion has the position of this primitive at duration - t. The motion is
+        fitted with the same basis. It accepts new starts and goals.
 
         Raises:
             ValueError: A rhythm, which has no end to start from.

@@ -2,10 +2,11 @@
 
 y'' = alpha (beta (g + (s - 1) v - y) + v - y') + f,   s = t / tau
 
-(Kober et al. 2010, "Movement templates for learning of hitting and batting", with the goal's
-velocity also in the damping term); primes are derivatives with respect to s. The goal passes g
-at s = 1 with the velocity v per duration. The relative motion x = y - (s - 1) v obeys the
-equation with a goal at rest, so rollouts and steps stay exact.
+This is the equation of Kober et al. 2010, "Movement templates for learning of hitting and
+batting", but with the goal's velocity also in the damping term. Primes are derivatives with
+respect to s. The goal passes g at s = 1 with the velocity v per duration. The motion relative
+to this goal, x = y - (s - 1) v, obeys the equation with a goal at rest, so rollouts and steps
+stay exact.
 """
 
 from dataclasses import dataclass

@@ -418,7 +418,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
                 must be less than half a turn apart.
             n_basis: Number N of basis functions, unless `basis` is given; None as for
                 `JointDMP.fit`.
-            mask: (*B, T), false at samples to ignore.
+            mask: Mask (*B, T), false at samples to ignore.
             formulation: `"log"`, or `"ude"` for the formulation of Ude et al. 2014.
             options: Options of the fit; see `FitOptions`.
 

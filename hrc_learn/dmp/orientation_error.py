@@ -1,9 +1,10 @@
 """Orientation errors to a goal: coordinates in which an orientation primitive is linear.
 
-e = log(g * conj(q)), a rotation vector [rad] in the base frame, so that q = exp(-e) * g
-(Koutras and Doulgeri 2019, "A correct formulation for the orientation dynamic movement
-primitives for robot control in the Cartesian space"; their logarithm is half of ours). At the
-goal, e = 0. If the tool frame is rotated at start and goal alike, e does not change.
+The error of an orientation q to the goal g is e = log(g * conj(q)), a rotation vector [rad] in
+the base frame. Hence q = exp(-e) * g. This follows Koutras and Doulgeri 2019, "A correct
+formulation for the orientation dynamic movement primitives for robot control in the Cartesian
+space", whose logarithm is half of ours. At the goal, e = 0. A rotation of the tool frame that
+applies to start and goal leaves e unchanged.
 """
 
 import math
@@ -92,7 +93,8 @@ def nearest_turn(
 ) -> Float[Tensor, "*batch 3"]:
     """The same rotation as `error`, with the whole turns that bring it closest to `reference`.
 
-    Motions to a new start or goal thereby rotate in the same direction as the demonstration.
+    With these turns, motions to a new start or goal rotate in the direction of the
+    demonstration.
     """
     error, reference = torch.broadcast_tensors(error, reference)
     own = error.norm(dim=-1, keepdim=True) > _NO_AXIS
@@ -273,7 +275,7 @@ def _without_gaps(
 def _checked(
     time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 4"], Bool[Tensor, "*B T"]]:
-    """Unit quaternions, and a mask of the valid ones."""
+    """Unit quaternions, and a mask of the valid samples."""
     samples = check_samples(time, orientation, mask=mask, name="orientation")
     if samples.position.shape[-2] != 4:
         raise ValueError(

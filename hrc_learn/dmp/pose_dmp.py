@@ -91,9 +91,9 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
     columns of one linear primitive. The body, such as a redundant joint or an arm angle, moves
     as demonstrated when the pose moves to another goal.
 
-    Values are `Pose`s; velocities are twists (linear [m/s], angular [rad/s]), (*batch, 6);
-    couplings are accelerations of the position [m/s^2], (*batch, 3), or of the pose,
-    (*batch, 6), with the angular part in the base frame. `rollout`, `initial_state` and
+    Values are `Pose`s, and velocities are twists (linear [m/s], angular [rad/s]), (*batch, 6).
+    A coupling is an acceleration of the position [m/s^2], (*batch, 3), or of the pose,
+    (*batch, 6). Angular parts are in the base frame. `rollout`, `initial_state` and
     `with_boundary` also take `start_body` and `goal_body`, (*batch, K); `step` takes
     `goal_body`.
 
@@ -124,13 +124,13 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
 
         Args:
             time: Timestamps [s], (T,) or (*B, T).
-            position: (*B, T, 3) [m]. The primitive has the floating-point dtype of the
-                positions.
+            position: Positions [m], (*B, T, 3). The primitive has the floating-point dtype of
+                the positions.
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
             n_basis: Number N of basis functions, unless `basis` is given; None as for
                 `JointDMP.fit`.
             body: Body coordinates, (*B, T, K), or (T,) for one.
-            mask: (*B, T), false at samples to ignore.
+            mask: Mask (*B, T), false at samples to ignore.
             scaling: Scaling of the position's forcing term, as for `JointDMP.fit`;
                 `"rotation"` turns and scales the path with the displacement.
             options: Options of the fit; see `FitOptions`.

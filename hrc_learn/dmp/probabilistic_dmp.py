@@ -50,8 +50,8 @@ KNOWN_DURATION = 1e-6
 """Standard deviation of the logarithm of a duration that is given as known."""
 GAUSSIAN = ("mean", "spread", "timing")
 SAME_ORIENTATION = 1e-9
-"""Angle [rad] below which orientations count as equal: no sensor resolves it, and rounding is
-smaller."""
+"""Angle [rad] below which orientations count as equal. It is larger than rounding errors and
+smaller than the resolution of any sensor."""
 
 
 def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
@@ -145,11 +145,12 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     """Primitive with the common spring, basis, duration, names and reference."""
     mean: Float[Tensor, "D M"]
     spread: Float[Tensor, "DM rank"]
-    """Square root of the covariance, with columns for demonstrations and free forcing."""
+    """Square root of the covariance: one column for each demonstration, then the columns that
+    `slack` adds."""
     timing: Float[Tensor, "rank"]
     """Deviation of the logarithm of the duration for each column of `spread`."""
     dependence: float = 1.0
-    """Factor, 0 to 1, on the dependence of paths on start and goal in `at`."""
+    """Factor, 0 to 1, that `at` applies to the covariance between paths and their ends."""
 
     @classmethod
     def fit(cls, primitives: P, slack: float = 0.0) -> "ProbabilisticDMP[P]":
@@ -199,7 +200,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Args:
             primitive: A single primitive, fitted with `scaling="none"`.
             slack: Standard deviation of the forcing term, equal at all times. Its unit is the
-                force of the spring when a coordinate is as far from its goal as its range.
+                spring force at a distance from the goal equal to the range of the coordinate.
         """
         motion = primitive.motion
         certain = _linear_coordinates(motion)
@@ -359,7 +360,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def at(
         self, start: Any = None, goal: Any = None, duration: float | None = None
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian given a start and a goal, by default those of the mean.
+        """Gaussian given a start and a goal; by default, the start and goal of the mean.
 
         A few demonstrations do not show reliably how a path depends on start and goal. The
         covariance between the path and its ends is therefore multiplied by `dependence`, the
@@ -368,7 +369,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
 
         Args:
             start: Start of one motion, in the form that `rollout` of the primitive accepts.
-            goal: Goal.
+            goal: Goal of the motion, in the same form.
             duration: Known duration [s].
 
         Raises:
@@ -385,8 +386,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         E, k = spread[:, -2:].flatten(0, 1), self.dependence
         back = torch.linalg.pinv(E, rtol=SINGULAR)
         z = k * (back @ (ends - self.mean[:, -2:]).flatten())
-        # Square root of I - k^2 P. P projects factors on the columns of the spread onto those
-        # that start and goal determine.
+        # Square root of I - k^2 P. The unknowns are factors on the columns of the spread, and P
+        # projects onto the subspace of factors that start and goal determine.
         left = torch.eye(len(z)).to(E) - (1 - (1 - k**2) ** 0.5) * (back @ E)
         mean = torch.cat([(self.mean + spread @ z)[:, :-2], ends], dim=1)
         remaining = torch.nn.functional.pad(spread[:, :-2] @ left, (0, 0, 0, 2))
@@ -404,7 +405,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         """Gaussian of all columns at `PATH_TIMES` evenly spaced times of the motion, followed
         by the logarithm of the duration, observed with independent noise.
 
-        Its entropy, log density, samples and divergences are those of the motion with its
+        Its entropy, log density, samples and divergences apply to the motion together with its
         duration, in float64.
         """
         s = torch.linspace(0, 1, PATH_TIMES).to(self.mean)

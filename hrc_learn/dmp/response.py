@@ -177,7 +177,7 @@ class Response:
         """Integrate the response to all coordinates.
 
         Args:
-            spring: Gains.
+            spring: Gains of the spring-damper.
             basis: Basis of the forcing term.
             approach: Fraction of the motion over which start and goal act along a minimum-jerk
                 curve, see `dynamics.py`; 0: they act through the spring alone, as in the paper.
@@ -269,7 +269,7 @@ class Response:
         table = self.forced.to(s.device)
         forced = self.spring.propagator(self.coasting(s)) @ table(s)
         if self.basis.periodic:
-            # From rest: the initial distance to the limit cycle decays.
+            # The motion starts at rest: its initial distance to the limit cycle decays.
             forced = forced - E @ table(torch.zeros_like(s))
         if self.approach:
             start = -approach_state(s, self.approach)[..., None]
@@ -378,9 +378,9 @@ def named_response(name: str) -> Response:
 def numpy_limit() -> int:
     """Number of multiplications up to which NumPy beats PyTorch on one thread.
 
-    One motion of 7 x 1000 samples and 50 functions (371,000 multiplications) takes OpenBLAS
-    5 us with kernels for small matrices and 25 us without (Haswell), and PyTorch's MKL 15 us
-    (AMD EPYC with AVX-512).
+    The measured example is one motion of 7 x 1000 samples and 50 functions, which takes 371,000
+    multiplications. OpenBLAS needs 5 us with kernels for small matrices and 25 us without them
+    (Haswell). PyTorch with MKL needs 15 us (AMD EPYC with AVX-512).
     """
     from threadpoolctl import threadpool_info
 

@@ -40,16 +40,16 @@ def fit_rhythmic(
 ) -> JointDMP:
     """Fit a rhythm to each demonstration of at least one cycle.
 
-    The result is a `JointDMP` on a `PeriodicBasis`: its duration is the period, its goal the
-    centre of the oscillation. From any start, its motion converges to the limit cycle;
+    The result is a `JointDMP` on a `PeriodicBasis`: its duration is the period, and its goal is
+    the centre of the oscillation. From any start, its motion converges to the limit cycle;
     `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).
-        position: (T, D) or (*B, T, D).
+        position: Positions, (T, D) or (*B, T, D).
         n_basis: Number of basis functions per period.
-        period: [s]; by default estimated from the positions.
-        mask: (*B, T), false at samples to ignore.
+        period: Period [s]; by default estimated from the positions.
+        mask: Mask (*B, T), false at samples to ignore.
         joint_names: D names, stored with the primitive.
         units: Units of the coordinates.
 
@@ -172,8 +172,8 @@ def fit_rhythmic_orientation(
         orientation: Unit quaternions (w, x, y, z), (*B, T, 4), within half a turn of their
             mean; signs may flip.
         n_basis: Number of basis functions per period.
-        period: [s]; by default estimated from the motion.
-        mask: (*B, T), false at samples to ignore.
+        period: Period [s]; by default estimated from the motion.
+        mask: Mask (*B, T), false at samples to ignore.
 
     Raises:
         ValueError: Bad samples (the message names them), samples of less than one period, or a

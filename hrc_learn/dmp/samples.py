@@ -1,10 +1,11 @@
 """Recorded samples of demonstrations, checked, batched and smoothed, and residuals of a fit.
 
 Noise is removed by penalised splines (Eilers and Marx 1996, "Flexible smoothing with B-splines
-and penalties"): y = B c + noise, with a penalty on the third differences of c, which stand for
-the jerk. The strength of the penalty maximises the restricted likelihood of the samples (Wood
-2011) for Gaussian jerks, in each column separately. The same likelihood gives the standard
-deviation of the noise, whether it comes from encoders, a tracker or a trembling hand.
+and penalties"). The samples are y = B c + noise, with splines B and control points c. A penalty
+applies to the third differences of c, which stand for the jerk. The strength of the penalty
+maximises the restricted likelihood of the samples (Wood 2011) for Gaussian jerks, in each
+column separately. The same likelihood gives the standard deviation of the noise, whether it
+comes from encoders, a tracker or a trembling hand.
 """
 
 import math
@@ -207,7 +208,7 @@ def check_samples(
 
     Args:
         time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
-        position: (T,), (T, D) or (*B, T, D); D = 1 if its shape is that of `time`.
+        position: Positions, (T,), (T, D) or (*B, T, D); D = 1 if they have the shape of `time`.
         velocity: Same shape as `position`, or None.
         mask: Same shape as `time`, true at valid samples. Invalid samples may have any value,
             NaN included. None: all samples are valid.

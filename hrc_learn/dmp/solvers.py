@@ -303,10 +303,10 @@ def fit_ridge(
     """Minimise |Y - A [a B]'|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
 
     The constant a is not penalised, so that a strong penalty leads to the mean of the targets.
-    A fit to all samples but one, at the same penalty P, needs no second solution. The omitted
-    sample i has the residual e_i / (1 - H_ii), with its residual e_i in the fit to all samples
-    and the hat matrix H = A (A'A + P)^-1 A' (PRESS; Allen 1974, "The relationship between
-    variable selection and data augmentation").
+    Fits without one sample, at the same penalty P, follow from the fit to all samples. If
+    sample i is omitted, its residual is e_i / (1 - H_ii), where e_i is its residual in the fit
+    to all samples and H = A (A'A + P)^-1 A' is the hat matrix (PRESS; Allen 1974, "The
+    relationship between variable selection and data augmentation").
 
     Args:
         features: Features of n >= 2 samples.

@@ -115,8 +115,8 @@ class Stepper:
 
         Args:
             state: From `initial_state` or the last step.
-            dt: [s].
-            goal: New goal; the goal jumps there.
+            dt: Time step [s].
+            goal: New goal, to which the goal jumps.
             coupling: External acceleration [1/s^2].
             phase_stopping: Number p >= 0; the clock runs slower by the factor 1 + p.
         """

@@ -1,10 +1,10 @@
 """Tokens of integer vectors: a code in which every sequence of tokens is valid.
 
-Each token answers a series of questions about the integers, in order: is the first one zero,
-is it positive, is its magnitude above a threshold, is the next one zero, ... The questions of a
+Each token answers a series of questions about the integers, in order: is the first one zero, is
+it positive, is its magnitude above a threshold, is the next one zero, ... The questions of a
 token form a binary tree with one leaf for each token of the vocabulary. Splitting the most
 probable leaf until the vocabulary is used up makes all tokens about equally probable (Tunstall
-1967, "Synthesis of noiseless compression codes"), so that each carries nearly as much
+1967, "Synthesis of noiseless compression codes"), so that each token carries nearly as much
 information as possible. Every leaf stands for possible integers: no sequence is invalid, and a
 prefix determines the first integers.
 

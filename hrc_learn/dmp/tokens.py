@@ -81,7 +81,7 @@ class MotionTokenizer(nn.Module):
                 integers, in steps.
             components: Components of all other columns.
             code: Code of the integers.
-            levels: (steps, L).
+            levels: Values of the columns of steps, (steps, L).
         """
         super().__init__()
         self.config, self.components, self._code = config, components, code
@@ -117,9 +117,9 @@ class MotionTokenizer(nn.Module):
         """Learn components and the probabilities of their values from motions.
 
         Args:
-            time: [s], (T,), (N, T) or a list of (T_i,). Durations that differ by more than 1 %
-                are encoded.
-            motions: (N, T, D) or a list of (T_i, D); the first sample is the start.
+            time: Timestamps [s], (T,), (N, T) or a list of (T_i,). Durations that differ by
+                more than 1 % are encoded.
+            motions: Motions, (N, T, D) or a list of (T_i, D); the first sample is the start.
             vocabulary_size: Number of tokens.
             start_velocity: Velocity at the start [1/s], (N, D), if it will be known whenever a
                 motion is encoded or decoded; this saves about 7 % of the tokens.
@@ -192,8 +192,8 @@ class MotionTokenizer(nn.Module):
         """Tokens of recorded motions, padded with token 0.
 
         Args:
-            time: [s], (T,) or (*batch, T).
-            motion: (*batch, T, D), from the start on.
+            time: Timestamps [s], (T,) or (*batch, T).
+            motion: Motions from the start on, (*batch, T, D).
             start_velocity: Velocity at the start [1/s], (*batch, D), if the tokenizer was
                 fitted with it; zero by default.
             length: Length L of all sequences; longer ones are cut, which makes motions coarser.
@@ -240,7 +240,7 @@ class MotionTokenizer(nn.Module):
             start: Start, (*batch, D). None: the mean start if the tokenizer was fitted with
                 known starts, otherwise the encoded start.
             start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
-                tokenizer was fitted with velocities, otherwise the encoded one.
+                tokenizer was fitted with velocities, otherwise the encoded velocity.
             order: Derivative with respect to time, 0, 1 or 2; zero for columns of steps.
 
         Raises:

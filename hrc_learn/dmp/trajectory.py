@@ -174,9 +174,9 @@ class ContinuedTrajectory(Trajectory):
     y(s) = H(s) x + E(s - s_0) [state - (H, H')(s_0) x]
 
     H x is the motion with the coordinates x, from which the state may differ. The difference
-    decays like the unforced spring, whose transition matrix is E. The motion is exact,
-    linear in x and the state, and starts with the given position and velocity. If the state
-    lies on H x, the motion is the remainder of H x.
+    decays like the unforced spring, whose transition matrix is E. The motion is exact, linear
+    in x and the state, and starts with the given position and velocity. If the state lies on H
+    x, the motion is the remainder of H x.
     """
 
     def __init__(

@@ -83,15 +83,15 @@ class UdePrimitive(JointDMP):
         return super().config() | {"formulation": "ude"}
 
     def coordinates(self) -> Tensor:
-        """Refuse: the motion is not a linear map of coordinates.
+        """Raise ValueError, because the motion is not a linear map of coordinates.
 
         Raises:
-            ValueError: Always.
+            ValueError: Raised in every call.
         """
         raise ValueError("formulation 'ude' is not linear: fit with 'log' instead")
 
     def with_coordinates(self, *_: Any, **__: Any) -> Any:
-        """Refuse, as `coordinates` does."""
+        """Raise ValueError, as `coordinates` does."""
         return self.coordinates()
 
     def rollout_columns(
