@@ -107,7 +107,7 @@ def check_positive(settings: object) -> None:
 
 
 def check_choice(name: str, value: object, known: Collection[object]) -> None:
-    """Raise ValueError unless a value is one of the known ones."""
+    """Raise ValueError unless a value is among the known values."""
     if value not in known:
         text = " or ".join(x if isinstance(x, str) and x else repr(x) for x in known)
         raise ValueError(f"{name} must be {text}, but is {value!r}")
@@ -160,7 +160,7 @@ def arctan_ratio(
     small = sine_square < _ARCTAN_THRESHOLD * cosine * cosine
     s = torch.sqrt(torch.where(small, 1.0, sine_square))
     c = torch.where(small, cosine, 1.0)
-    tangent_square = sine_square / (c * c)  # only has to be finite if not small
+    tangent_square = sine_square / (c * c)  # if not small, it only has to be finite
     series = polynomial(tangent_square, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9)) / c
     return torch.where(small, series, torch.atan2(s, cosine) / s)
 

@@ -65,7 +65,10 @@ def normalize(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 
 
 def canonical(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Choose the sign with a positive first non-zero component (w >= 0: shortest rotation)."""
+    """Choose the sign so that the first non-zero component is positive.
+
+    With w >= 0, the quaternion belongs to the shortest rotation.
+    """
     order = (torch.sign(q) * _LEXICOGRAPHIC.like(q)).sum(-1, keepdim=True)
     return q * torch.sign(order)
 
@@ -177,8 +180,7 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
 
     `log` jumps to the opposite axis where the angle passes pi. This function adds whole turns
     about the axis of each sample, so that `exp` of the result is unchanged and neighbours are
-    close.
-    The first sample is kept. Neighbours must be less than half a turn apart.
+    close. The first sample is kept. Neighbours must be less than half a turn apart.
 
     Args:
         v: Rotation vectors of consecutive orientations [rad].
@@ -247,7 +249,7 @@ def drift_free_rate(
     """Solve e' = v + n(e, v) for v, given e' = `rate`; v is minus the angular velocity.
 
     The result is J_l(e)^T e', with the left Jacobian J_l. This product also converts a gradient
-    with respect to small rotations to one with respect to e.
+    with respect to small rotations to a gradient with respect to e.
     """
     square = (e * e).sum(-1, keepdim=True)
     cross = torch.linalg.cross(e, rate)
@@ -262,7 +264,8 @@ def drift_free_slope(
     """Solve for v', given e' = `rate` and e'' = `curvature`: minus the angular acceleration."""
     square = (e * e).sum(-1, keepdim=True)
     h, k = _h(square), _k(square)
-    # h' = dh/da a' with a a' = e e'; likewise k'. The closed forms cancel at small a.
+    # h' = dh/da a' with a a' = e e', and likewise k'. At small a, the closed forms lose digits
+    # to cancellation.
     far, near = square.clamp_min(_SMALL), square.clamp_max(_SMALL)
     _, sinc = cos_and_sinc(far)
     h_series = polynomial(near, (-1 / 12, 1 / 180, -1 / 6720, 1 / 453600, -1 / 47900160))

@@ -29,11 +29,11 @@ class Capsule:
     """A cylinder with round ends, in the frame of the body that carries it."""
 
     start: tuple[float, float, float]
-    """[m]"""
+    """Centre of the first round end [m]."""
     end: tuple[float, float, float]
-    """[m]"""
+    """Centre of the second round end [m]."""
     radius: float
-    """[m]"""
+    """Radius of cylinder and ends [m]."""
     colour: Colour = PLAIN
 
 
@@ -42,9 +42,9 @@ class Box:
     """A box aligned with the axes of the body that carries it, or of the base frame."""
 
     centre: tuple[float, float, float]
-    """[m]"""
+    """Centre [m]."""
     half_size: tuple[float, float, float]
-    """[m]"""
+    """Half of each edge length [m]."""
     colour: Colour = (0.75, 0.62, 0.45, 1.0)
     name: str = ""
 
@@ -60,12 +60,12 @@ class Line:
     """A line or an arrow in the base frame, drawn into a picture."""
 
     start: Float[np.ndarray, "3"]
-    """[m]"""
+    """First end [m]."""
     end: Float[np.ndarray, "3"]
-    """[m]"""
+    """Second end, which is the tip of an arrow [m]."""
     colour: Colour
     width: float = 0.006
-    """[m]"""
+    """Width of the line [m]."""
     head: bool = False
     """True for an arrow."""
 
@@ -76,9 +76,9 @@ class MeshFile:
 
     path: Path
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """[m]"""
+    """Origin of the file's frame in the frame of the body [m]."""
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Unit quaternion (w, x, y, z)."""
+    """Orientation of the file's frame, a unit quaternion (w, x, y, z)."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors on the coordinates in the file, along the axes of the file."""
     colour: Colour | None = None
@@ -105,7 +105,7 @@ class MeshPart:
     """Triangles of one colour."""
 
     vertices: Float[np.ndarray, "vertices 3"]
-    """[m]"""
+    """Positions of the vertices [m]."""
     normals: Float[np.ndarray, "vertices 3"]
     """Unit normals; at a sharp edge, each side has its own vertices."""
     faces: Int[np.ndarray, "faces 3"]

@@ -83,11 +83,12 @@ class CameraConfig:
     """Standard deviation of a marker shift on the tool since the demonstrations [m]."""
     residual: float = 8.0
     """Prior standard deviation of the mean of the residual image Jacobian [px/m]: half a
-    percent of an ordinary image Jacobian, the effect of encoder zeros off by 2 mrad."""
+    percent of an ordinary image Jacobian. Encoder zeros that are off by 2 mrad cause as
+    much."""
     bump: float = 4.0
     """Error above which the camera may have been moved [px], plus five standard deviations."""
     surprises: int = 3
-    """Number of consecutive images with such an error that count as a moved camera."""
+    """Number of consecutive images with such errors after which the camera counts as moved."""
 
     __post_init__ = check_positive
 
@@ -190,7 +191,7 @@ class CameraEstimator(ImageJacobianEstimator):
         self.reference = nn.Buffer(camera, persistent=False)
         """Camera of the demonstrations, (13,)."""
         self.precision = nn.Buffer(precision, persistent=False)
-        """Prior precision of optics and marker, zero for the rest, (13, 13)."""
+        """Prior precision of optics and marker, zero for other components of c, (13, 13)."""
         self.residual = nn.Buffer(torch.block_diag(*[one] * 6), persistent=False)
         """Prior covariance of the weights of one image row, (P, P)."""
         self.scale = nn.Buffer(scale, persistent=False)
@@ -225,7 +226,7 @@ class CameraEstimator(ImageJacobianEstimator):
     def jacobian(
         self, state: CameraState, r: Pose | Float[Tensor, "*batch 6"]
     ) -> Float[Tensor, "*batch rows 6"]:
-        """Estimated image Jacobian J_s_hat at a pose: that of the camera, plus the residual."""
+        """Estimated image Jacobian J_s_hat at a pose: the camera's, plus the residual."""
         pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
         first = camera_jacobian(state.best, pose[..., None]).squeeze(-3)
         return first + evaluate(state.weight, self.network.basis(pose))

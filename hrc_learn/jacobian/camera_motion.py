@@ -6,10 +6,10 @@ prediction by e = L (w, v), to first order. L is the interaction matrix: the der
 pixel with respect to the camera twist. One motion (w, v) is fitted to the differences e of the
 last second.
 
-The displacement L (w, v), as root mean square over the frames, is compared with a threshold:
-2.5 times the largest displacement in demonstrations that were held out of the camera's fit. The
-threshold covers errors of calibration, lens and time stamps. Outside the region of the
-demonstrations these errors are unknown, so frames there are ignored.
+The root mean square of L (w, v) over the frames, called the displacement, is compared with a
+threshold. This is 2.5 times the largest displacement in demonstrations that were held out of
+the camera's fit. The threshold covers errors of calibration, lens and time stamps. Outside the
+region of the demonstrations these errors are unknown, so frames there are ignored.
 
 `CameraCorrection` maps pixels of the moved camera to pixels of the camera before its motion.
 For the marker, it uses the tool pose. For an object, it uses the plane on which the objects of
@@ -90,7 +90,7 @@ class CameraMotion:
         twist: Float[Tensor, "6"],
         points: Float[Tensor, "frames 3"],
     ) -> CameraMotion:
-        """Camera motion by a twist, with the displacement of points in the camera frame [m]."""
+        """Camera motion by a twist; its displacement is that of points in the camera frame."""
         displacement = _root_mean_square(motion_jacobian(camera, points) @ twist)
         return CameraMotion(twist=twist, displacement=displacement)
 
@@ -227,7 +227,7 @@ class CameraWatch:
         Frames outside the region of the demonstrations are ignored.
 
         Args:
-            time: Time of the image [s], later than that of the last frame.
+            time: Time of the image [s], later than the time of the last frame.
             pose: Pose of the tool when the image was taken, unbatched.
             pixel: Pixel of the marker [px].
 

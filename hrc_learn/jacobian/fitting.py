@@ -165,7 +165,7 @@ class MotionSamples:
         Args:
             basis: Function from poses to activations of the neurons, (pairs, K).
         """
-        # The mean of both frames is accurate to second order, like the value half-way.
+        # The mean over both frames is accurate to second order, as is the value half-way.
         theta = (basis(self.before) + basis(self.after)) / 2
         return (self.dr[:, :, None] * theta[:, None, :]).flatten(-2)
 
@@ -411,10 +411,10 @@ class ImageJacobianFitConfig(KeyFrameConfig):
 
     @classmethod
     def of_residual(cls) -> ImageJacobianFitConfig:
-        """Settings for the residual of a fitted camera: thousandths of the image Jacobian.
+        """Settings for the residual of a fitted camera.
 
-        Key frames are a centimetre apart: for smaller motions, the noise of the marker detector
-        exceeds the residual.
+        The residual is some thousandths of the image Jacobian. Key frames are a centimetre
+        apart: for smaller motions, the noise of the marker detector exceeds the residual.
         """
         return cls(pixel_noise=0.1, bias_std=5.0, weight_std=2.0, min_step=0.01)
 
@@ -429,7 +429,7 @@ class ImageJacobianFitReport:
     pairs: int
     """Number of pairs of key frames."""
     motion: float
-    """Motion of the feature [px]; this is also the error of a prediction of no motion."""
+    """Motion of the feature [px], which equals the error of predicting no motion."""
     error: float
     """Error over the fitted pairs [px]."""
     held_out_error: float

@@ -193,7 +193,7 @@ def on_plane(
     """Points of a horizontal plane that the camera sees at pixels, in the base frame [m].
 
     Args:
-        camera: Camera.
+        camera: Vector c of the camera.
         pixel: Pixels (u, v) [px].
         height: Height of the plane in the base frame [m].
     """
@@ -513,7 +513,7 @@ def motion_jacobian(
     translation.
 
     Args:
-        camera: Camera.
+        camera: Vector c of the camera.
         points: Points in the camera frame [m].
     """
     _, by_point = pixels_and_depth(camera, points)
@@ -525,7 +525,7 @@ def motion_jacobian(
 def moved(
     camera: Float[Tensor, "*#batch 13"], twist: Float[Tensor, "*#batch 6"]
 ) -> Float[Tensor, "*batch 13"]:
-    """Camera turned about its axes [rad] and moved [m] along these axes as before the turn."""
+    """Camera after a turn about its axes [rad] and a shift along its former axes [m]."""
     back = quaternion.exp(-twist[..., :3])
     turn = quaternion.log(quaternion.multiply(back, quaternion.exp(camera[..., ROTATION])))
     shift = quaternion.rotate(back, camera[..., SHIFT] - twist[..., 3:])

@@ -70,7 +70,7 @@ class PositionRegion(Region):
     2 k_c f (r - c)/h^2 grows as the box shrinks. Near a wall, the distance past the wall decays
     at the rate 4 k_c/h^2 [1/s].
 
-    Far from a small box this pull grows with the cube of the distance. The axis with the
+    Far from a small box, the pull of P grows with the cube of the distance. The axis with the
     largest offset then dominates, and a cap on the twist leaves almost nothing for rotation.
     `formulation="saturated"` has the same potential up to twice the half size, f = 3. Beyond,
     its pull grows linearly, so the tool moves straight to the box:
@@ -323,8 +323,9 @@ class JointRegion(Region):
         f_i = delta_i - margin,   f_ri = delta_i - reference_margin
         P   = sum_i k_q/2 min(0, f_i)^2 + k_r/2 min(0, f_ri)^2           (jointxp)
 
-    `formulation="paper"` is Table I's f_i = delta_i^2 - margin^2. Its push vanishes at the
-    limit and points outwards past the limit, because the square loses the sign of delta_i.
+    With `formulation="paper"`, f_i = delta_i^2 - margin^2, as in Table I of the paper. Its push
+    vanishes at the limit and points outwards past the limit, because the square loses the sign
+    of delta_i.
     """
 
     centre: Float[Tensor, "*#batch n"]
