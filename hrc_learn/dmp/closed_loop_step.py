@@ -2,7 +2,7 @@
 
 The equation of motion is linear, so each term (forcing, goal filter, coupling) has a particular
 solution, which is known before and after a step. The difference between the state and the sum
-of these solutions decays as the unforced spring does. Steps of any length are therefore exact.
+of these solutions decays like the unforced spring. Steps of any length are therefore exact.
 """
 
 import math
@@ -32,7 +32,7 @@ class DMPState:
     """State of a primitive in closed loop; every step returns a new one.
 
     It is a pytree that passes through `torch.func` and `torch.export`. To follow a robot that
-    was pushed, replace the position by the measured one.
+    was pushed, replace the position by the measured position.
     """
 
     position: Float[Tensor, "*batch D"]
@@ -50,7 +50,7 @@ class DMPState:
     pace: Float[Tensor, "*batch"]
     """Relative speed of the clock in the last step: 1 if undisturbed, less if slowed."""
     s: Float[Tensor, "*batch"]
-    """Normalised time, 1 at the end of the motion (float64: rounding adds up over steps)."""
+    """Normalised time, 1 at the end of the motion; float64, as rounding adds up over steps."""
     forced: Float[Tensor, "*batch 2 D"]
     """State (y, dy/ds) caused so far by the unscaled forcing term alone."""
 

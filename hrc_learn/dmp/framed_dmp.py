@@ -82,7 +82,7 @@ class FramedDMP:
     The coordinates are x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M
     numbers for each of D columns. The covariance of the n demonstrations is extended by smooth
     deviations in all directions. They are as large as the observed deviations and count as one
-    demonstration more.
+    additional demonstration.
     """
 
     primitive: JointDMP

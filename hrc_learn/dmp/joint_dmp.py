@@ -83,9 +83,9 @@ def _fit(
     """Fit in float64; arguments as in `FitOptions`.
 
     Returns:
-        Response of spring and basis; the fitted samples, without noise if it was removed; the
-        standard deviation (B, D) of the removed noise, or None; weights (B, D, N) of the
-        unscaled forcing term; and start velocities dy/ds (B, D).
+        Five results. The response of spring and basis. The fitted samples, without noise if it
+        was removed. The standard deviation (B, D) of the removed noise, or None. The weights
+        (B, D, N) of the unscaled forcing term. The start velocities dy/ds (B, D).
     """
     chosen = n_basis is not None or basis is not None
     if basis is None:

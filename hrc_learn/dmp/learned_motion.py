@@ -76,8 +76,9 @@ class Candidate:
     shrinkage: float
     """Factor on the deviation from the straight motion: 0 leaves only the straight motion."""
     error: Float[Tensor, "n"]
-    """Root mean square error of each demonstration, predicted from all others. The error of a
-    column is relative to the largest range among columns of its kind (`_scale`)."""
+    """Root mean square error of each demonstration, predicted from all other demonstrations.
+    The error of a column is relative to the largest range among columns of its kind
+    (`_scale`)."""
 
     @property
     def kind(self) -> Kind:

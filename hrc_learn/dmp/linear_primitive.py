@@ -567,7 +567,7 @@ class LinearPrimitive(nn.Module):
 
 
 def check_names(joint_names: Sequence[str] | None, D: int) -> None:
-    """Raise ValueError if there are names, but not D different ones."""
+    """Raise ValueError unless the names, if there are any, are D different names."""
     if joint_names is not None and len(joint_names) != D:
         raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
     if joint_names is not None and len({*joint_names}) != D:

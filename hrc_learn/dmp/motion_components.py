@@ -43,8 +43,8 @@ DEGREE = 3
 class MotionComponents(nn.Module):
     """Map from P parameters and a start to motions of D columns, linear within the limits.
 
-    Parameters have unit variance; if all are zero, the motion is the most likely one from that
-    start. The map is computed in float64 and differentiable in parameters and start.
+    Parameters have unit variance; if all are zero, the motion is the most likely one from the
+    given start. The map is computed in float64 and differentiable in parameters and start.
     """
 
     centre: Tensor
@@ -197,7 +197,8 @@ class MotionComponents(nn.Module):
             begun.append(begun[0] + rate / (DEGREE * (self.points - DEGREE)))
         points = [*begun, *points[len(begun) - self.known :]]
         if len(begun) == KNOWN_STATE:
-            # If the start velocity leads beyond a limit, turn back before reaching the limit.
+            # If the start velocity puts the second control point beyond a limit, the third
+            # turns the motion back before it reaches the limit.
             low, high = low[..., 0, :], high[..., 0, :]
             turned = points[1].clamp(low, high) * (1 + TURN) - TURN * points[1]
             turned = turned.clamp(low, high)
@@ -221,7 +222,7 @@ class MotionComponents(nn.Module):
         rate = 0 if velocity is None else velocity * samples.duration[:, None]
         second = y[:, 0] + rate / (DEGREE * (self.points - DEGREE))
         fixed = torch.stack([y[:, 0], second], 1)[:, : self.known]
-        shared = slice(0, 1 if samples.shared_grid else None)  # one solve serves all
+        shared = slice(0, 1 if samples.shared_grid else None)  # one solution serves all
         weight = samples.mask[shared, :, None] / samples.mask[shared].sum(-1)[:, None, None]
         B = spline(samples.s[shared], self.points)
         rough = torch.diff(torch.eye(self.points).to(y), n=2, dim=0)

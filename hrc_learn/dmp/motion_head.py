@@ -2,11 +2,11 @@
 
 A head needs no demonstration. Its parameters are whitened, so that networks and searches see
 numbers of similar size. If the parameters are independent and unit normal, motions deviate by a
-given amplitude from the straight minimum-jerk path to the goal. They deviate in orthogonal
-modes, the smoothest first. The motion is linear in all parameters except duration and delay, so
-a Gaussian over parameters is a Gaussian over motions. Its density, divergence and samples have
-closed forms (Li et al. 2023, "ProDMP: A unified perspective on dynamic and probabilistic
-movement primitives").
+given amplitude from the straight minimum-jerk path to the goal. The deviations are sums of
+orthogonal modes, ordered from smooth to rough. The motion is linear in all parameters except
+duration and delay, so a Gaussian over parameters is a Gaussian over motions. Its density,
+divergence and samples have closed forms (Li et al. 2023, "ProDMP: A unified perspective on
+dynamic and probabilistic movement primitives").
 """
 
 import math
@@ -390,7 +390,7 @@ class PlannedTrajectory(ContinuedTrajectory):
 
 @dataclass(frozen=True, eq=False)
 class MotionDistribution:
-    """Gaussian over the motions of a head, from Gaussian parameters and an exact state."""
+    """Gaussian over the motions of a head, for Gaussian parameters and a known state."""
 
     head: MotionHead
     parameters: Float[Tensor, "*batch P"]
@@ -424,7 +424,7 @@ class MotionDistribution:
         Args:
             time: Times of the positions [s], (T,) or (*batch, T).
             position: Observed positions, (*batch, T, D).
-            noise: Standard deviation of each value, independent of the others.
+            noise: Standard deviation of the noise, which is independent for each value.
         """
         known = self._observed(time, noise)
         y = to_tensor(position, known.loc.dtype, known.loc.device)
@@ -480,7 +480,7 @@ def _each_column(amplitude: Any, columns: int) -> Float[Tensor, "D"]:
 
 
 def _modes(response: Response) -> Float[Tensor, "N N"]:
-    """Weights of orthogonal motions, smoothest first, with a mean square of one in total.
+    """Weights of orthogonal motions, smoothest first, with a total mean square of one.
 
     The relative sizes of the modes are as if the forcing term were white noise.
     """

@@ -520,8 +520,8 @@ def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
         if different := [name for name in first if other[name] != first[name]]:
             name = different[0]
             raise ValueError(
-                f"primitives of one batch must be alike, but {name} of primitive {i} is "
-                f"{other[name]}, of the first {first[name]}"
+                f"primitives of one batch must be alike, but {name} is {other[name]} in "
+                f"primitive {i} and {first[name]} in primitive 0"
             )
     tensors = [primitive.tensors() for primitive in primitives]
     # Some primitives may lack parts of the fit report.

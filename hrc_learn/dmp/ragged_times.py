@@ -72,7 +72,7 @@ class CoefficientTable:
     Each piece has K coefficients: of the powers 1, u, u^2 ... with u from -1 to 1 along the
     piece, and of functions of time that are not polynomial. One more piece covers all times
     after the forcing. The state at the end of the forcing, relative to the goal, decays there
-    as the unforced spring does.
+    like the unforced spring.
     """
 
     response: Response

@@ -127,7 +127,7 @@ def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
     crossed = (similar < 0).cummax(0).values
     peak = (similar[1:-1] >= similar[:-2]) & (similar[1:-1] >= similar[2:]) & crossed[1:-1]
     if not peak.any():
-        raise ValueError("no period found in these positions: give one, or record more cycles")
+        raise ValueError("no period found in the positions: give `period` or more cycles")
     # Every multiple of the period has a peak of equal height: take the first high one.
     high = peak & (similar[1:-1] >= HIGH_PEAK * similar[1:-1][peak].max())
     return even[1 + high.long().argmax()]
@@ -139,7 +139,7 @@ def _solve(
     """Coordinates of the closest rhythm: weights, start velocity dy/ds, start, and centre."""
     centre = _mean_of_whole_cycles(s, y)
     H = response.state(s)[:, 0]
-    # Units in which the ridge penalises all columns alike.
+    # Units in which the ridge penalises all columns equally.
     A = H[:, :-1]
     size = A.norm(dim=0)
     residual = y - H[:, -1:] * centre

@@ -92,7 +92,7 @@ class Samples:
 
     @cached_property
     def shared_grid(self) -> bool:
-        """True if all demonstrations have the same normalised times: one solve serves all."""
+        """True if all demonstrations have the same normalised times; one fit serves all."""
         if len(self.s) == 1 or not self.complete:
             return self.complete
         # Timestamps with different origins differ by rounding, below 1e-12 of the duration.
@@ -312,7 +312,11 @@ def _check_count(mask: Bool[Tensor, "B T"], batch: Sequence[int]) -> None:
 def _check_finite(
     name: str, values: Float[Tensor, "B D T"], mask: Bool[Tensor, "B T"], batch: Sequence[int]
 ) -> Tensor:
-    """Values with masked NaN and infinities zeroed; ValueError if a valid sample holds one."""
+    """Values with zeros at masked samples that are not finite.
+
+    Raises:
+        ValueError: A valid sample is not finite.
+    """
     # A finite sum proves that all values are finite. Finite values may overflow in a sum, so a
     # sum that is not finite proves nothing yet.
     if math.isfinite(values.sum().item()):
@@ -427,7 +431,7 @@ class _Spline:
     """Splines on a time grid, in coordinates that diagonalise both samples and penalty."""
 
     first: Int[Tensor, "T"]
-    """First of the four splines that are not zero at each sample."""
+    """Index of the first of the four splines that are not zero at each sample."""
     values: Float[Tensor, "T 4"]
     """Values of these four splines."""
     V: Float[Tensor, "K K"]

@@ -1,7 +1,7 @@
 """Least-squares fits of weights and start velocities to samples, and ridge regression.
 
-Demonstrations with the same normalised times are fitted by one matrix product, demonstrations
-with different times by batched normal equations.
+Demonstrations with the same normalised times are fitted by one matrix product. Demonstrations
+with different times are fitted by batched normal equations.
 """
 
 import math
@@ -166,8 +166,8 @@ def _orthonormal_columns(
     """Mixtures of the first n columns of the response that are orthonormal on an even grid.
 
     Returns:
-        Coordinates that cause each mixture (columns after n stay as they are), and the singular
-        values of the balanced design matrix.
+        Coordinates that cause each mixture, one mixture per column (columns after n are those
+        of the identity), and the singular values of the balanced design matrix.
     """
     N = response.basis.count
     count = SAMPLES_PER_FUNCTION * N + 1
@@ -311,7 +311,7 @@ def fit_ridge(
     Args:
         features: Features of n >= 2 samples.
         targets: Targets of the samples.
-        regularization: Positive; 1 gives penalty and data equal weight.
+        regularization: Strength of the penalty, positive; at 1 it weighs as much as the data.
         standardize: True to divide features by their standard deviation. False suits
             features in one unit; features that hardly vary then have little effect.
 

@@ -65,8 +65,8 @@ class Stepper:
         """
         if type(dmp) is not JointDMP:  # a subclass may move differently
             raise ValueError(
-                f"a stepper takes a JointDMP, got {type(dmp).__name__}: use the program of "
-                "export_dmp"
+                f"a stepper takes a JointDMP, got {type(dmp).__name__}: use the program that "
+                "export_dmp makes"
             )
         if dmp.duration.ndim:
             raise ValueError(
@@ -171,7 +171,7 @@ def _checked(name: str, values: Any, like: Vector) -> np.ndarray:
     values = np.asarray(values)
     if values.dtype.kind not in "fiu" or values.shape != like.shape:
         raise ValueError(f"{name} must hold {len(like)} real numbers, got {values}")
-    # For so few numbers Python's sum takes a third of the time.
+    # For so few numbers, Python's sum takes a third of the time of NumPy's.
     if not math.isfinite(sum(values.tolist())):
         raise ValueError(f"{name} must be finite, got {values}")
     return values

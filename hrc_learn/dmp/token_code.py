@@ -149,7 +149,8 @@ class TokenCode:
         if root in self._trees:
             return self._trees[root]
         tree = _Tree(array("i"), array("i"), array("i"), [], [])
-        # Probability, order, state, decided integers, and the branch that leads to the leaf.
+        # Entries: minus the probability, the order, the state, the decided integers, and the
+        # branch that leads to the leaf.
         heap: list[tuple[float, int, Interval, tuple[Interval, ...], int]] = []
         heap.append((-1.0, 0, root, (), -1))
         done = []

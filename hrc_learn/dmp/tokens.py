@@ -265,7 +265,7 @@ class MotionTokenizer(nn.Module):
         return whole
 
     def length(self, ids: Sequence[int]) -> int:
-        """Number of tokens that a network has to predict; more would not change the motion."""
+        """Number of tokens that determine the motion; further tokens would not change it."""
         for i in range(1, len(ids) + 1):
             if ids[i - 1] == END or self._code.decode(ids[:i])[1]:
                 return i
@@ -493,7 +493,10 @@ def _switches(
 
 
 def _rounded(x: Float[Tensor, "B P"], bits: Tensor | None) -> Float[Tensor, "B P"]:
-    """Integers that minimise squared error plus the price of `bits`, (P, M) by magnitude."""
+    """Integers that minimise the squared error plus the price of their bits.
+
+    `bits` holds the information of each magnitude, (P, M); None: the price is not counted.
+    """
     if bits is None:
         return x.round()
     size = x.abs()

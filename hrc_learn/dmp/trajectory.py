@@ -147,7 +147,7 @@ class Trajectory(ArrayOutputs):
     def _at_ragged_times(self, X: Tensor, order: int) -> Float[Tensor, "*batch T D"]:
         s, (D, M) = self.s.double(), X.shape[-2:]
         if X.ndim == 2:
-            # All times of the batch belong to the one motion.
+            # All times of the batch belong to one motion.
             y = motion(self._response, s.reshape(1, -1), X[None], order).view(*s.shape, D)
         else:
             batch = broadcast_shapes(X.shape[:-2], s.shape[:-1])

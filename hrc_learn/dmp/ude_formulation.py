@@ -68,7 +68,7 @@ class UdePrimitive(JointDMP):
             if (e.norm(dim=-1) >= 2 * torch.pi).any():
                 raise ValueError(
                     "orientation is a whole turn or more from its end: formulation 'ude' "
-                    "cannot follow that, use 'log'"
+                    "cannot follow such a motion, use 'log'"
                 )
             v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, second)
             force = slope - second + motion.spring.alpha * (v - rate)

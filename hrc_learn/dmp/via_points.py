@@ -157,7 +157,8 @@ def _change_curve(
     knots, order = _knots(via, window)
     values = torch.nn.functional.pad(missing, (0, 0, 0, 0, 1, 1))
     values = torch.take_along_dim(values, order[..., None, None], dim=-3)
-    # Where only a rate is given, the curve keeps the position, which may change nevertheless.
+    # Where only a rate is given, the curve leaves the position unchanged. The fitted motion may
+    # change it slightly.
     active = ~values.isnan().all(-2)
     value, rate = values.nan_to_num().unbind(-2)
     return piecewise_quintic(s, knots, value, rate, active)
@@ -166,7 +167,7 @@ def _change_curve(
 def _window(
     motion: LinearPrimitive, within: tuple[float | int, float | int] | None
 ) -> tuple[float, float]:
-    """Window in normalised time: start and end of the time in which the motion may change."""
+    """Start and end of the interval in which the motion may change, in normalised time."""
     if within is None:
         return 0.0, 1.0
     duration = motion.duration.double().reshape(-1)
