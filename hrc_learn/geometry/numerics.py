@@ -101,7 +101,7 @@ def check_settings(
 
 
 def check_positive(settings: object) -> None:
-    """`check_settings` for settings whose numbers are all positive."""
+    """`check_settings` for settings whose numbers must all be positive."""
     numbers = [name for name, value in vars(settings).items() if isinstance(value, float | int)]
     check_settings(settings, positive=numbers)
 

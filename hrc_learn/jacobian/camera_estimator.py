@@ -9,8 +9,8 @@ pose r_i, the marker's pixel is
 
 Here dr is the motion of the tool between two key frames, theta are the activations of the
 neurons, and (x) is the Kronecker product. W enters linearly and has a Gaussian prior with
-covariance P, so it is integrated out: the covariance of the errors of frames i and j is Phi_i^T
-P Phi_j. The camera follows from Gauss-Newton steps of generalised least squares. The search
+covariance P, so it is integrated out: errors of frames i and j have the covariance Phi_i^T P
+Phi_j. The camera follows from Gauss-Newton steps of generalised least squares. The search
 starts from several hypotheses, which differ in the rotation about the optical axis. Given the
 camera, W has a closed form. Camera and W together are the maximum a posteriori estimate.
 
@@ -62,7 +62,7 @@ class CameraConfig:
     """Window, noise and prior of the estimate."""
 
     frames: int = 56
-    """Key frames in the window."""
+    """Number of key frames in the window."""
     min_step: float = 0.006
     """Least motion between key frames [m]; `rotation_scale` converts rotations."""
     max_step: float = 0.1

@@ -7,8 +7,8 @@ pixel with respect to the camera twist. One motion (w, v) is fitted to the diffe
 last second.
 
 The root mean square of L (w, v) over the frames, called the displacement, is compared with a
-threshold. This is 2.5 times the largest displacement in demonstrations that were held out of
-the camera's fit. The threshold covers errors of calibration, lens and time stamps. Outside the
+threshold. The threshold is 2.5 times the largest displacement in demonstrations that were held
+out of the camera's fit. It covers errors of calibration, lens and time stamps. Outside the
 region of the demonstrations these errors are unknown, so frames there are ignored.
 
 `CameraCorrection` maps pixels of the moved camera to pixels of the camera before its motion.
@@ -59,9 +59,9 @@ _MARGIN = 2.5
 # Episodes count as recorded with different camera placements if they differ by more than this
 # multiple of the median difference between neighbouring episodes.
 _APART = 6.0
-# Gauss-Newton steps: three are enough for ten degrees.
+# Gauss-Newton steps: three are enough for a rotation by ten degrees.
 _REFINEMENTS = 5
-# Frames of the marker used for the motion estimate: half a minute at 20 Hz.
+# Number of marker frames kept for the motion estimate: half a minute at 20 Hz.
 _KEPT_FRAMES = 600
 # Number of frames that `CameraCorrection` needs to detect a motion. It is one, because wrong
 # pixels soon guide the arm out of the region of the demonstrations, where detection ends.
@@ -90,7 +90,7 @@ class CameraMotion:
         twist: Float[Tensor, "6"],
         points: Float[Tensor, "frames 3"],
     ) -> CameraMotion:
-        """Camera motion by a twist; its displacement is that of points in the camera frame."""
+        """Camera motion by a twist; points in the camera frame determine its displacement."""
         displacement = _root_mean_square(motion_jacobian(camera, points) @ twist)
         return CameraMotion(twist=twist, displacement=displacement)
 
@@ -364,8 +364,8 @@ def _explained(
 ) -> tuple[Float[Tensor, "6"], float]:
     """Most probable camera motion, given the pixels of points, and its rms displacement [px].
 
-    `already` is the motion applied to the points so far. The prior applies to the sum of both
-    motions.
+    `already` is the motion applied to the points so far. The prior applies to the sum of
+    `already` and the result.
     """
     errors = pixels - pixels_and_depth(camera, points)[0]
     size = errors.norm(dim=-1)

@@ -185,7 +185,7 @@ class LearningConfig(KeyFrameConfig):
 
 @pytree
 class MotionSample:
-    """Motion from the key frame to the present frame; zero if they are not a valid pair."""
+    """Motion from the key frame to the present frame; zero if the two are no valid pair."""
 
     twist: Float[Tensor, "*batch 6"]
     """Motion of the tool, linear [m] and angular [rad]."""
@@ -297,7 +297,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         config = self.config
         twist = key.pose.twist_to(measurement.pose)
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
-        # At rest there is nothing to learn from, even where every frame is a key frame.
+        # At rest there is nothing to learn from, even if every frame is a key frame.
         moved = measurement.valid & key.present & (distance >= max(config.min_step, _REST))
         valid = moved & (distance <= config.max_step)
         now, before = map(self.network.first_pixel, (measurement.pose, key.pose))

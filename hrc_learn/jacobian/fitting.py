@@ -39,7 +39,7 @@ FOLDS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFrameConfig:
-    """Choice of key frames, the frames that are compared."""
+    """Choice of key frames, which are the frames that are compared."""
 
     min_step: float = 2e-4
     """Least motion between key frames [m]; `rotation_scale` converts rotations. Choose at least
@@ -173,7 +173,7 @@ class MotionSamples:
 def component_scale(like: Tensor, rotation_scale: float) -> Float[Tensor, "6"]:
     """Metres per unit of each component of a twist: 1 for metres, `rotation_scale` for radians.
 
-    dr times the scale is in metres; a Jacobian divided by it is in px/m.
+    dr times the scale is in metres; a Jacobian divided by the scale is in px/m.
     """
     return like.new_tensor([1.0] * 3 + [rotation_scale] * 3)
 
@@ -399,7 +399,7 @@ class ImageJacobianFitConfig(KeyFrameConfig):
 
     pixel_noise: float = 0.5
     """Standard deviation of the measured feature [px]; dx is a difference of two measurements.
-    A larger held-out error replaces this noise, since the network is then too coarse."""
+    If the held-out error is larger, it replaces this noise: the network is then too coarse."""
     bias_std: float = 1500.0
     """Prior standard deviation of the mean Jacobian of the workspace [px/m]."""
     weight_std: float = 500.0
@@ -423,7 +423,7 @@ class ImageJacobianFitConfig(KeyFrameConfig):
 class ImageJacobianFitReport:
     """Prediction errors of a fitted image Jacobian for feature motion between key frames.
 
-    Errors are root mean squares of the error's length [px].
+    Errors are root mean squares of the length of the error vector [px].
     """
 
     pairs: int

@@ -233,7 +233,7 @@ class RBFImageJacobian(nn.Module):
         )
 
     def uncertainty(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of each column of J_s_hat, the larger of its two rows.
+        """Posterior standard deviation of each column of J_s_hat, for the less certain row.
 
         Args:
             r: Pose, as for `forward`.

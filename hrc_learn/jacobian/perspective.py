@@ -45,9 +45,9 @@ _FOCAL_SPREAD = 0.5
 _CENTER_SPREAD = 0.02
 # Prior standard deviation of the radial coefficient: all lenses except fisheyes are within it.
 _RADIAL_SPREAD = 0.2
-# Prior standard deviations. `_ANY_TURN`, `_ANY_PLACE`: of the camera's rotation [rad] and shift
-# [m], so wide that any value is possible. `_MARKER_SPREAD`: of the marker's offset from the
-# tool centre point [m].
+# Prior standard deviations of three quantities. `_ANY_TURN` and `_ANY_PLACE` apply to rotation
+# [rad] and shift [m] of the camera, and are so wide that any value is possible.
+# `_MARKER_SPREAD` applies to the offset of the marker from the tool centre point [m].
 _ANY_TURN, _ANY_PLACE, _MARKER_SPREAD = 10.0, 10.0, 0.2
 # Initial focal lengths of the search, relative to the image width.
 _FOCAL_STARTS = (0.6, 1.0, 1.7)
