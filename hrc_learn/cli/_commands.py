@@ -118,7 +118,7 @@ def find(words: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def name_leading(options: Sequence[str], words: Sequence[str]) -> list[str]:
-    """Insert the names of leading options, whose values may come first without them."""
+    """Insert the names of leading options whose values were given without names."""
     count = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
     values, named = list(words[:count]), []
     for i, option in enumerate(options):

@@ -221,8 +221,8 @@ class Import(Measured):
     """Convert recordings of any format to a LeRobot dataset.
 
     Reads .npz, .npy, text tables (.csv, .tsv, .txt), Parquet, HDF5 (ALOHA, robomimic and
-    others), zarr, .mat, RLDS, bags of ROS 1 and 2, MCAP, and folders of these with videos. A
-    preview lists the meaning assigned to each field; options or a mapping file correct it.
+    others), zarr, .mat, RLDS, bags of ROS 1 and 2, MCAP, and folders of such files with videos.
+    A preview lists the meaning assigned to each field; options or a mapping file correct it.
     Recorded commands become actions.
 
         hrc import pour.npz --out pour --joints q --time t
@@ -456,11 +456,12 @@ class Play(Written):
     model: Path
     """Folder written by `hrc fit`."""
     goal: tuple[str, ...]
-    """Joint positions, position [m], or pose with quaternion (w, x, y, z), distinguished by the
-    count of numbers or by the word joints, position or pose before them. Or the end of a
-    demonstration, such as: episode 2."""
+    """Joint positions, position [m], or pose with quaternion (w, x, y, z). The kind follows
+    from the count of numbers, or from the word joints, position or pose before them. The end of
+    a demonstration is a goal, too, such as: episode 2."""
     start: tuple[str, ...] = ()
-    """Start, in the same form; an episode gives its first frame. Default: the model's."""
+    """Start, in the same form as the goal; an episode stands for its first frame. Default: the
+    model's."""
     robot: str = ""
     """Arm, given as in `hrc demo`. Default: no arm."""
     duration: float | None = None

@@ -43,7 +43,7 @@ from hrc_learn.viz.report import show_command, software_versions
 MODELS = Path("outputs/demo")
 """Folder of the demo, whose models are used if none are given."""
 _APPLIES: dict[str, list[str]] = read_toml(Path(__file__).with_name("option_experiments.toml"))
-"""Experiments that an option belongs to."""
+"""Experiments to which each option applies."""
 _SIMULATED = (
     *("robot", "imperfections", "ideal", "seed", "trials", "markerless", "serve", "page"),
     *("pulls", "camera_moved", "worker", "handover"),

@@ -180,7 +180,7 @@ class Multiplication:
 
     @property
     def judged_by(self) -> str:
-        """Judge in words."""
+        """Description of the judge."""
         if self.judge.scene:
             return f"physics: {self.judge.scene}"
         return "kinematics alone (reach, limits, collisions of the arm), without physics"
@@ -315,7 +315,7 @@ def _judge(config: JudgeConfig, task: str) -> JudgeConfig:
 
 
 def _between_cells(taught: Any, job: Multiplication) -> Callable[[Pose], Pose]:
-    """Function that moves poses from the demonstrated scene to that of another arm.
+    """Function that moves poses from the demonstrated scene to the scene of another arm.
 
     Between work cells, distances are scaled with the hand, as the objects are.
     """

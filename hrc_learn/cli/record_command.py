@@ -53,7 +53,7 @@ _APPLIES = {
     "overwrite": ("placing", "servoing"),
     "seed": ("placing", "servoing", "expert"),
 }
-"""Kinds of demonstrations that have an option."""
+"""Kinds of demonstrations to which each option applies."""
 
 
 @dataclass(frozen=True, kw_only=True)

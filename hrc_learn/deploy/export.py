@@ -107,8 +107,8 @@ def _few_arms(
     batch = step.layouts.state.batch
     if not batch:
         return step, observation
-    # An unbatched field that happens to have this size would count as batched: try sizes until
-    # the layouts equal those of the whole batch.
+    # An unbatched field may have the chosen size by chance, and would then count as batched.
+    # Try sizes until the layouts equal those of the whole batch.
     for size in (2, 3, 5, 11):
         part = (slice(size), *(slice(1) for _ in batch[1:]))
         few = _pytree.tree_map_only(

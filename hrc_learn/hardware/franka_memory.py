@@ -60,9 +60,9 @@ class Numbers:
 class Mailbox[Line: Numbers]:
     """The newest line of numbers that one process writes and others read, without a lock.
 
-    The memory holds two lines, and the number of lines written so far, whose parity selects the
-    newest line. The writer overwrites the older line, then increases the number. A reader
-    therefore always finds a complete line, even if the writer is suspended or dies while
+    The memory holds two lines and the number of lines written so far. The parity of this number
+    selects the newest line. The writer overwrites the older line, then increases the number. A
+    reader therefore always finds a complete line, even if the writer is suspended or dies while
     writing.
     """
 

@@ -49,14 +49,14 @@ class Load:
 class CollisionConfig:
     """Estimated external load above which the arm stops by a reflex.
 
-    The defaults are those of the maker's example for joint velocities (libfranka,
-    examples/generate_joint_velocity_motion.cpp), for both contacts and collisions.
+    The defaults come from the maker's example for joint velocities (libfranka,
+    examples/generate_joint_velocity_motion.cpp); they apply to both contacts and collisions.
     """
 
     torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
     """Threshold on each joint [N m]."""
     force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
-    """Threshold at the end effector: forces along x, y, z [N], torques about them [N m]."""
+    """Threshold at the end effector: forces along x, y, z [N], torques about these axes [N m]."""
 
     def __post_init__(self) -> None:
         for name, number in (("torque", 7), ("force", 6)):

@@ -96,8 +96,8 @@ class GripperThread(Connected):
             threading.Thread(target=work, name=f"gripper {name}", daemon=True)
             for name, work in (("reader", self._read), ("mover", self._carry_out))
         ]
-        # Join the threads before the interpreter exits: if it ends a thread inside driver code,
-        # a signal kills the process.
+        # Join the threads before the interpreter exits: if it ended a thread inside driver
+        # code, a signal would kill the process.
         atexit.register(self.close)
         for thread in self._threads:
             thread.start()

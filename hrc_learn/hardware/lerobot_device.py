@@ -28,7 +28,8 @@ def open_device(kind: Literal["robot", "teleop"], settings: Mapping[str, Any]) -
 
     Args:
         kind: Robot or teleoperator.
-        settings: LeRobot's settings, such as type, port and id, without "robot." or "teleop.".
+        settings: LeRobot's settings, such as type, port and id, without the prefix "robot." or
+            "teleop.".
 
     Raises:
         ValueError: There is no such type or setting, or one is missing.

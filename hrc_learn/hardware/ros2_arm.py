@@ -1,7 +1,7 @@
 """Drive an arm over ROS 2 topics: joint states come in, commands go to standard controllers.
 
-Tested over real middleware against our simulated arm; NOT RUN ON HARDWARE. If the system's
-ROS 2 has been sourced, this ROS 2 is used, otherwise the wheels of `hrc-learn[ros2]`.
+Tested over real middleware against our simulated arm; NOT RUN ON HARDWARE. The system's ROS 2
+is used if it has been sourced; otherwise, the wheels of `hrc-learn[ros2]` are used.
 """
 
 from __future__ import annotations
@@ -289,7 +289,8 @@ class Ros2Arm(Connected):
         """
         now, config, rest = time.monotonic(), self.config, self.config.timeout
         elapsed = now - self._moved_at
-        # Distance that the goal has moved since, as a time at the previous velocity.
+        # Distance that the goal has moved since then, expressed as a time at the previous
+        # velocity.
         coast = np.clip(elapsed - self._hold, 0, self._brake)
         moved = min(elapsed, self._hold) + coast * (1 - 0.5 * coast / rest)
         here, limits = state.joint_position, self._chain.limits
@@ -302,7 +303,7 @@ class Ros2Arm(Connected):
             ahead = led_goal(goal + self._hold * velocity, *bounds)
             self._commands.publish(self._trajectory(ahead, velocity))
         else:
-            # The arm has waited at the last position: a sudden catch-up would be a jump.
+            # The arm has waited at the last position, and must not jump to catch up.
             self._hold = float(np.clip(self._commanded_at + rest - now, 0, rest / 3))
             values = velocity if config.interface == "velocity" else goal
             self._commands.publish(self._numbers(data=values.tolist()))

@@ -267,7 +267,9 @@ class ControllerNode:
             self._report(now)
 
     def _checked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Wrap a callback so that its errors are logged; else they would end the thread."""
+        """Wrap a callback so that its errors are logged; otherwise, they would end the
+        thread.
+        """
 
         def guarded(message: Any) -> None:
             try:

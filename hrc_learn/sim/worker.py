@@ -72,7 +72,7 @@ _SECOND = np.array([[_FOREARM], [_FOREARM], [_SHANK], [_SHANK]])
 _GRIP = 0.9
 # Backward shift of the pelvis for balance, as a fraction of the stature times sin(lean).
 _BALANCE = 0.06
-# Lean of the head as a fraction of the trunk's: people look up while they lean.
+# Lean of the head as a fraction of the trunk's lean: people look up while they lean.
 _HEAD_LEANS = 0.7
 _LIFT = 0.04  # height of a foot in its swing, as a fraction of the stature
 # Time over which velocities are averaged [s]: three images, a compromise between noise and lag.
@@ -108,7 +108,7 @@ class Posture:
     place: Float[np.ndarray, "*time 2"]
     """Point of the floor under the pelvis, in the base frame [m]."""
     heading: Float[np.ndarray, "*time"]
-    """Heading: angle of the worker's x axis from the base's [rad]."""
+    """Angle from the base's x axis to the worker's x axis [rad]."""
     lean: Float[np.ndarray, "*time"]
     """Forward lean of the trunk [rad]."""
     stride: Float[np.ndarray, "*time"]
@@ -292,7 +292,9 @@ def _two_links(
     second: np.ndarray,
     bent_to: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint and end of two links that reach from a start as near to an end as they can."""
+    """Joint and tip of two links that begin at `start` and reach as near to `end` as they
+    can.
+    """
     way = end - start
     distance = np.linalg.norm(way, axis=-1, keepdims=True)
     towards = way / distance

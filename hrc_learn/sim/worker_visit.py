@@ -17,7 +17,8 @@ from jaxtyping import Float
 from hrc_learn.geometry import Box
 from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
 
-# Half the step of central differences for velocities [s]; they err by 0.1 mm/s at most.
+# Half the step of central differences for velocities [s]; the velocities err by 0.1 mm/s at
+# most.
 _HALF_STEP = 1e-4
 # Length of a walking step, as a fraction of the stature; two steps make a stride.
 STEP = 0.40
@@ -294,7 +295,7 @@ class BenchScript(PoseWriter):
         self.go(place=self.stand)
 
     def own(self, point: np.ndarray) -> np.ndarray:
-        """A point of the base frame in the frame of the worker at the bench [m]."""
+        """Convert a point from the base frame to the frame of the worker at the bench [m]."""
         return in_worker_frame(self._worker, self.stand, self.facing, point)
 
     def hands(self, target: np.ndarray, side: int) -> np.ndarray:
@@ -400,7 +401,7 @@ def random_visit(
 
 
 def _hand_for(target: np.ndarray) -> int:
-    """Number of the hand on the side of a point to reach: 0 left, 1 right."""
+    """Hand on the same side as the point to reach: 0 left, 1 right."""
     return int(target[1] < 0)
 
 
@@ -431,7 +432,7 @@ def _marker(
 def in_worker_frame(
     worker: Worker, stand: Float[np.ndarray, "2"], facing: float, point: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """A point of the base frame in the frame of a standing worker [m]."""
+    """Convert a point from the base frame to the frame of a standing worker [m]."""
     c, s = np.cos(facing), np.sin(facing)
     x, y = point[:2] - stand
     return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])

@@ -31,7 +31,8 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
     return torch.tensor(values, dtype=torch.float64)
 
 
-# Posture with the upper arm forward: in this branch, joint 1 stays away from both its limits.
+# Posture with the upper arm forward: in this branch of the inverse kinematics, joint 1 stays
+# away from both of its limits.
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 
@@ -40,9 +41,10 @@ _SCALES = (1.0, 0.85, 0.7, 0.55)
 # An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint,
 # and the wrists of some other arms turn little out of this plane. For such arms, the cabinet
 # stands straight to the side of this axis, at the multiples `_BESIDE` of the scaled distance.
-# Home lies on the way there, at the fractions `_ON_THE_WAY` of the cabinet's distance. As the
-# wrist is right above the tool, the arm works lower over the table (`_HOVER_BESIDE`), and the
-# camera stands farther out (`_CAMERA_BESIDE`), so that it sees the marker from the far side.
+# Home lies on the way to the cabinet, at the fractions `_ON_THE_WAY` of the cabinet's distance.
+# As the wrist is right above the tool, the arm works lower over the table (`_HOVER_BESIDE`),
+# and the camera stands farther out (`_CAMERA_BESIDE`), so that it sees the marker from the far
+# side.
 _BESIDE, _ON_THE_WAY = (1.4, 1.6, 1.2), (0.55, 0.65)
 _HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
 # Scales in the order of their evaluation; True: with the cabinet straight to the side.
@@ -85,7 +87,8 @@ class Workplace:
     """Joint 7 of Franka's arms at home [rad]: the elbow leans to the left, away from the
     cabinet."""
     home_posture: tuple[float, ...] = ()
-    """Joint positions of other arms at home, the start of their inverse kinematics [rad]."""
+    """Joint positions of other arms at home, the initial guess of their inverse kinematics
+    [rad]."""
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     table_reach: tuple[float, float] = (0.14, 0.14)
@@ -97,8 +100,8 @@ class Workplace:
     hover_q7: float = -0.1
     """Joint 7 of Franka's arms above the table [rad]."""
     hover_posture: tuple[float, ...] = ()
-    """Joint positions of other arms above the table, the start of their inverse kinematics
-    [rad]."""
+    """Joint positions of other arms above the table, the initial guess of their inverse
+    kinematics [rad]."""
     fingertip: float = 0.012
     """Length of the fingers beyond the tool centre point, which is in the middle of the pads
     [m]."""
@@ -138,7 +141,7 @@ class Workplace:
 
     @property
     def robot(self) -> Arm:
-        """The arm that works there."""
+        """Arm of the workplace."""
         return self.scene.arm.robot
 
     @property
@@ -375,7 +378,9 @@ def layout_for(robot: Arm) -> CellLayout:
 
 
 def _candidates(robot: Arm) -> Iterator[tuple[list[Workplace], _Above]]:
-    """Workplaces that suit an arm, with postures above their table; the likely ones first."""
+    """Workplaces that suit an arm, with postures above their table; the most promising ones
+    first.
+    """
     unlikely = []
     for reach in _REACHES:
         for scale, beside in _SCALED:
@@ -472,7 +477,7 @@ def _placed(
         front=depth - level_at,
         shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
         top=size * cabinet.top + higher,
-        # The door tests null-space motion of the elbow, which six joints do not have.
+        # The door tests null-space motion of the elbow, which arms with six joints do not have.
         door_reach=scale * cabinet.door_reach * (usual.arm.robot.null_space != "none"),
     )
     (x, y, z), (a, b, c) = table.centre, table.half_size

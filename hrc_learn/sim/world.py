@@ -31,7 +31,8 @@ _FLAT = math.cos(math.radians(3.0))
 # Orientation of an object in the tool's frame: its x axis is parallel to the closing direction
 # of the fingers, and its top points to the gripper.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-# Number of latest touches that `touched_since` searches: more than begin in any control step.
+# Number of latest touches that `touched_since` searches: more than can begin in one control
+# step.
 _REMEMBERED = 64
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 

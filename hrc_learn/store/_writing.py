@@ -83,7 +83,8 @@ class Claim:
             return
         try:
             self.clear()
-            # Deleted while locked: a process that has just opened the file notices and retries.
+            # Delete the file while it is locked: a process that has just opened it notices this
+            # and retries.
             (self.workspace / _LOCK).unlink(missing_ok=True)
         finally:
             self._lock.close()
@@ -293,7 +294,9 @@ def recover(path: str | os.PathLike[str]) -> list[str]:
 
 
 def settle(path: str | os.PathLike[str]) -> None:
-    """Complete an interrupted replacement that left nothing at `path`. Call before reading."""
+    """Complete an interrupted replacement that left nothing at `path`; call this before
+    reading.
+    """
     place = resolved(path)
     while not place.exists():
         if _is_interrupted(place):
@@ -364,7 +367,7 @@ def replacing(
         source: Identifier of the source, for `source_of`.
 
     Yields:
-        Path that does not exist yet.
+        Path to write to, which does not exist yet.
 
     Raises:
         BusyError: Another process is writing this folder.
@@ -386,12 +389,12 @@ def new_folder(
 
     Args:
         path: Path of the folder.
-        made_by: Inputs of the results, saved in the folder as JSON. Values that JSON does not
-            have become text.
+        made_by: Inputs of the results, saved in the folder as JSON. Values without a JSON type
+            are saved as text.
         overwrite: Replace an older folder of results.
 
     Yields:
-        Empty folder.
+        Empty folder to write to.
 
     Raises:
         BusyError: Another process is writing this folder.

@@ -76,7 +76,7 @@ def annotated(
 
     Args:
         picture: RGB image.
-        text: Caption below.
+        text: Caption below the picture.
         clock: Time, to the right of the caption.
         labels: Names and colours ("#RRGGBB") of the legend, at the top left.
         inset: Image at the bottom right, above the caption.

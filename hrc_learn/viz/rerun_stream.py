@@ -76,7 +76,7 @@ class StaticShapes:
 def seconds(
     time: Float[np.ndarray, " time"], timelines: Sequence[str] = (TIMELINE,)
 ) -> list[rr.TimeColumn]:
-    """The index of columns sampled at these times, on one timeline or several."""
+    """Time index for columns that are sampled at these times, on one timeline or several."""
     durations = np.rint(1e9 * time).astype("timedelta64[ns]")
     return [rr.TimeColumn(timeline, duration=durations) for timeline in timelines]
 
@@ -266,7 +266,7 @@ def dashboard(
     """Layout of a dashboard: views above one another, with further columns to their right.
 
     Args:
-        left: The views; without any, the columns have the whole width.
+        left: Views above one another; if there are none, the columns take the whole width.
         right: The columns.
         row_shares: Heights of the views, in proportion.
         column_shares: Widths of all columns, in proportion.
@@ -301,7 +301,8 @@ def frame_view(
     direction: tuple[float, float, float] = (1.05, 0.65, 0.6),
     nearest: float = 0.5,
 ) -> rrb.EyeControls3D:
-    """Viewpoint that shows the whole path, by default in front of the robot, to its left.
+    """Viewpoint that shows the whole path, by default from in front of the robot and to its
+    left.
 
     Args:
         path: Points to show [m].
@@ -419,7 +420,7 @@ class CameraStream:
 
 
 def _cross(pixel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2 2"]]:
-    """Two strokes across a pixel; none without a target."""
+    """Two strokes across a pixel; no strokes if there is no target."""
     if not np.isfinite(pixel).all():
         return []
     return [

@@ -158,8 +158,8 @@ class DMPPolicy(MotionPolicy):
         present = ~batch[f"{ACTION}_is_pad"]
         square = difference.square().mean(-1) * present
         rmse = {"rmse": float((square.detach().sum() / present.sum()).sqrt())}
-        # Average over chunks, not over the actions before the end of the episode: then the mean
-        # over processes is correct.
+        # Average over chunks, not over the actions before the episode's end: otherwise, the
+        # mean over several processes would be biased.
         each = square.mean(-1)
         return (each if reduction == "none" else each.mean()), rmse
 

@@ -177,7 +177,8 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
     Limits are the 99.9th percentiles of differences of the actions within episodes. Positions
     are not limited. If the demonstrated velocity is constant, the limit of acceleration lets
     the velocity change from zero to its limit within one action period. If the demonstrated
-    acceleration is constant, the limit of jerk does the same for the acceleration.
+    acceleration is constant, the limit of jerk lets the acceleration change from zero to its
+    limit within one action period.
 
     Args:
         dataset: LeRobot dataset that the policy was trained on.

@@ -429,7 +429,8 @@ class SmoothRobot(Robot):
     def _phase(self, now: float) -> float:
         """Time since the newest action of the path, in action periods; appends due actions.
 
-        The first action is due when it comes, each further action one action period later.
+        The first action is due when it comes. Each further action is due one action period
+        after the previous one.
         """
         fps = self.upsampler.limits.fps
         if self._started is None:
