@@ -134,7 +134,8 @@ class Repair(Columns, OnDataset):
 
     Work that a killed process left unfinished in DATASET or in a folder below it is completed
     first, in place: an interrupted recording becomes a dataset of its saved episodes, and an
-    interrupted replacement is completed. In this case a copy is written only with --out.
+    interrupted replacement is completed. If there was such work, a copy is written only with
+    --out.
 
         hrc repair broken repaired
         hrc repair killed_recording
@@ -745,8 +746,8 @@ class Serve(WithDriver):
     Hz; with --arm, a real arm moves. The report lists the time from reading the joints to the
     command, the delay of each tick, and missed ticks. The first start takes about 10 s to
     compile the step; `--config step=eager` skips this. With --ros2, the controller is a
-    lifecycle node instead: it receives goals, images and pushes on topics and commands a
-    standard ROS 2 controller.
+    lifecycle node instead: it receives goals, images and pushes from topics, and sends its
+    commands to a standard ROS 2 controller.
 
         hrc serve --ros2 --robot /robot_description:tool0
     """

@@ -1,10 +1,10 @@
 """Compile a scalar program (see `scalar_program`) with LLVM, and run its machine code.
 
 For a batch, the code computes as many arms at once as a vector register holds numbers. For one
-arm, it computes successive elements of a tensor at once if their operands are successive
-elements, too, or equal. The code is a sequence of short functions, so that the compile time is
-only proportional to the length of the program. A value that a later function reads is kept in a
-slot of the workspace, a small array that the caller provides.
+arm, it computes successive elements of a tensor at once if their operands are equal, or are
+successive elements as well. The code is a sequence of short functions, so that the compile time
+is only proportional to the length of the program. A value that a later function reads is kept
+in a slot of the workspace, a small array that the caller provides.
 """
 
 import ctypes

@@ -56,7 +56,8 @@ class CollisionConfig:
     torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
     """Threshold on each joint [N m]."""
     force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
-    """Threshold at the end effector: forces along x, y, z [N], torques about these axes [N m]."""
+    """Threshold at the end effector: forces along x, y, z [N], and torques about the same axes
+    [N m]."""
 
     def __post_init__(self) -> None:
         for name, number in (("torque", 7), ("force", 6)):

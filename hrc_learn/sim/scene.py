@@ -305,7 +305,8 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.compiler.degree = False
     spec.option.timestep = config.timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Elliptic cones, a stiff friction constraint and the no-slip pass hold a grasp still.
+    # Elliptic cones, a stiff friction constraint and the no-slip pass keep a grasped object
+    # from slipping.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
     spec.option.noslip_iterations = 3

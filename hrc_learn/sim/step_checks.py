@@ -24,7 +24,7 @@ _INDEXED = {
     int(mujoco.mjtWarning.mjWARN_BADQVEL): "qvel",
     int(mujoco.mjtWarning.mjWARN_BADQACC): "qacc",
 }
-"""Array to which the index in a warning belongs, by the kind of the warning."""
+"""Name of the array that the index in a warning refers to, by the kind of the warning."""
 
 
 def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
