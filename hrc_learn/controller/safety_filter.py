@@ -339,8 +339,8 @@ class SafetyFilter(nn.Module):
             return replace(state, dt=length), length.unsqueeze(-1), invalid | ~valid
         if not 0 < dt <= longest:
             raise ValueError(
-                f"the safety filter needs a step dt in (0, {longest:g}] s to "
-                f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
+                f"the safety filter needs a step dt in (0, {longest:g}] s to guarantee the "
+                f"limits, but got {dt:g} s; step faster or lower the filter's rate"
             )
         return replace(state, dt=torch.full_like(state.dt, dt)), dt, invalid
 

@@ -53,8 +53,8 @@ class ReceivingConfig:
     tolerance: float = 0.06
     """Standard deviation of the meeting point at which the speed is halved [m]."""
     near: float = 0.09
-    """Largest difference between the measured and the demonstrated position of the hand
-    relative to the end effector [m]."""
+    """Largest deviation of the hand, relative to the end effector, from its demonstrated
+    position [m]."""
     still: float = 0.5
     """Time for which the hand has to stay near the demonstrated position before the fingers
     close [s]."""
@@ -155,7 +155,8 @@ class Receiving:
         Args:
             cell: Arm and gripper.
             tracker: Tracker of the person.
-            model: Joint model of hand and end effector, positions in the base frame [m].
+            model: Model of the motions of hand and end effector together, with positions in the
+                base frame [m].
             parts: Names of the capsules of a tracked body.
             wait: Pose of the end effector while it waits.
             config: Recognition and response.

@@ -303,7 +303,7 @@ def test_rounding_is_no_intervention(beyond: float, flagged: bool):
 @pytest.mark.parametrize("dt", [0.0, -0.01, 0.3])
 def test_a_step_that_voids_the_guarantee_is_refused(dt: float):
     safety = SafetyFilter(LIMITS)
-    with pytest.raises(ValueError, match="lower its rate"):
+    with pytest.raises(ValueError, match="lower the filter's rate"):
         safety.step(safety.initial_state(READY), READY, READY, dt)
 
 
