@@ -149,7 +149,7 @@ class _Motion(NamedTuple):
 
 @final
 class AdaptiveController(nn.Module):
-    """The control law of the paper, one step at a time.
+    """The control law of the paper (equation globalControl), one step at a time.
 
     u = -J^+ (J_s_hat^T xi_x + xi_r) + N c_d^-1 (d - xi_q)               (globalControl)
 

@@ -6,8 +6,8 @@ A step is a pure function `(state, reading, request) -> (command, state, report)
    is retraced, depending on people near the arm and on how well the arm tracks the path.
 2. *Act* on a request: a joint path, a pose of the end effector, a joint velocity, or a command
    of the adaptive controller becomes a joint velocity. The null space yields to the push, and
-   the safety filter has the last word. The pace of the task drops by the fraction of the motion
-   that people prevented.
+   the safety filter has the last word. The pace of the task (`TaskPace`) drops by the fraction
+   of the motion that people prevented.
 
 States, readings and requests have any number of leading batch dimensions. Drivers, clocks, logs
 and messages to people belong to the caller.

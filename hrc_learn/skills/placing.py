@@ -2,8 +2,9 @@
 
 The motion was demonstrated for one shelf. For another shelf it is planned in one of two spaces.
 In joint space, the goal of the joint primitive is shifted, as in the paper; the path into the
-shelf is then bent. In pose space, the pose primitive moves the end effector and the learned arm
-angle moves the null space; the path then stays straight.
+shelf is then bent. In pose space, the pose primitive moves the end effector, and the learned
+arm angle (of the elbow about the line from shoulder to wrist) moves the null space; the path
+then stays straight.
 """
 
 from collections.abc import Iterator, Sequence
