@@ -5,8 +5,8 @@
       +---------+---- start over ----+
 
 In "servo", the arm approaches in joint space and is then controlled by vision, as in the paper.
-In "interact", servoing continues while a person pulls the elbow, if the job has time for a
-person. Recoveries from failures are noted in the job:
+In "interact", servoing continues while a person pulls the elbow, for
+`GraspJob.time_for_person`. Recoveries from failures are noted in the job:
 
 - occluded marker of the end effector: the controller holds the end effector until the marker is
   detected again; after a timeout the arm goes home and starts over;
