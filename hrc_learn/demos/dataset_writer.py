@@ -184,7 +184,7 @@ class DatasetWriter:
         Raises:
             RuntimeError: No episode is open.
             ValueError: The episode is empty, holds values that are not finite, or its time
-                does not increase. It is then discarded.
+                does not increase. The episode is then discarded.
         """
         task = self._open_task()
         try:

@@ -155,7 +155,7 @@ def extract_features(
     camera: str | None = None,
     progress: Progress | None = None,
 ) -> Extraction:
-    """Find a feature in every image of a camera and keep it next to the dataset.
+    """Find a feature in every image of a camera, and keep the result next to the dataset.
 
     Episodes are skipped if their present videos were searched before: call this function again
     after an interruption, or after recording more. Episodes without an intact video are left

@@ -419,7 +419,7 @@ def equalise_durations(demos: DemonstrationSet) -> DemonstrationSet:
 def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demonstration:
     """Shift fields to the times at which they were measured.
 
-    An image that is stamped 40 ms after its exposure shows the arm as it was 40 ms before.
+    An image that is stamped 40 ms after its exposure shows the arm 40 ms before the stamp.
 
     Args:
         demo: The demonstration.

@@ -259,7 +259,8 @@ def _moved(
 def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
     """Mask of components whose sign can change while the orientation stays the same.
 
-    These are quaternions, and rotation vectors near half a turn in any episode.
+    Such components belong to quaternions, or to rotation vectors that are near half a turn in
+    any episode.
     """
     # The last part of a name decides: `object.qy` has the meaning of `qy`.
     meanings = [meaning_of_component(name.rpartition(".")[2]) for name in feature.names]

@@ -370,7 +370,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     smooth, seen = fix_signs(_unwrapped_all(edit)), None
     if {"feature", "feature_visible"} <= edit.selections.keys():
         seen = edit.quantities["feature_visible"] > 0
-        pixels = edit.quantities["feature"]  # need not be finite while it is not visible
+        pixels = edit.quantities["feature"]  # pixels need not be finite while not visible
         sound = np.where(np.isfinite(pixels) | seen, pixels, 0.0)
         smooth = smooth.with_quantity("feature", sound)
     frames = {

@@ -220,9 +220,9 @@ def log_dimensionless_jerk(
 ) -> float:
     """Natural logarithm of the integral of the squared jerk times duration^5 / length^2.
 
-    It depends on neither units, speed nor size, and is smaller for smoother motions (Hogan and
-    Sternad 2009, "Sensitivity of smoothness measures to movement duration, amplitude, and
-    arrests").
+    The measure depends on neither units, speed nor size of the motion, and is smaller for
+    smoother motions (Hogan and Sternad 2009, "Sensitivity of smoothness measures to movement
+    duration, amplitude, and arrests").
 
     Args:
         time: Increasing times [s].

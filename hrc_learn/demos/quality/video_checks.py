@@ -16,7 +16,7 @@ from hrc_learn.demos.videos import VideoSegment, image_at, read_segments, video_
 _MOST_FILES = 2000
 """Largest number of files whose packets are counted: reading a terabyte takes an hour."""
 _MOST_DECODED = 60
-"""Images are decoded from this number of files, or up to twice as many."""
+"""Approximate number of files from which images are decoded; at most twice as many."""
 _MOST_EPISODES = 8
 """Largest number of episodes of a file from which images are decoded."""
 
@@ -119,7 +119,7 @@ def read_stream(path: Path) -> _Stream:
 
 
 def _digest(path: Path) -> str:
-    """Digest of size, beginning and end: it identifies copies without reading whole files."""
+    """Digest of a file's size, beginning and end, by which copies are found quickly."""
     with path.open("rb") as stream:
         head = stream.read(2**16)
         size = stream.seek(0, 2)

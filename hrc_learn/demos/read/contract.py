@@ -3,7 +3,7 @@
 LeRobot declares neither units, meanings nor reference frames, and drops unknown fields from its
 own files. A sidecar, `meta/hrc_learn.json`, holds what the writer declared, and the contract:
 role, unit, range, sign and delay of each component, with the evidence and a confidence. The
-contract may be edited there, and every reader of the dataset obeys it.
+contract may be edited there, and every reader of the dataset uses it.
 """
 
 import hashlib
@@ -156,7 +156,9 @@ class Contract:
         }
 
     def keeping(self, kept: "Contract") -> "Contract":
-        """This contract with the names and roles of an older contract, which may be edited.
+        """This contract with the names and roles of an older contract.
+
+        The older contract may have been edited.
 
         A component that is now read as another quantity keeps its new role. A component of a
         quantity keeps its unit, which was already decided with the older contract. Every other

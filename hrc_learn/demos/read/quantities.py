@@ -134,7 +134,7 @@ def transforms(values: Float64[Tensor, "frames 16"]) -> Tensor:
 
 
 def _rotations(matrices: Tensor) -> Tensor:
-    """The matrices, if they are rotations and no reflections; a ValueError otherwise."""
+    """Return the matrices; raise ValueError unless all are rotations without reflection."""
     product = matrices @ matrices.mT
     # The tolerance allows for float32 and for few printed digits.
     wrong = ((product - torch.eye(3, dtype=product.dtype)).abs() > 1e-2).flatten(1).any(1)

@@ -283,7 +283,7 @@ def guess_fingers(
     arm_unit: str,
     hobby: bool,
 ) -> list[str]:
-    """Unit of each component if it is a finger, from its size and the unit of the arm."""
+    """Unit that each component has if it is a finger, from its size and the arm's unit."""
     # All fingers of a hand have the same unit, even those that move little.
     counted = hand & sizes.whole & (sizes.peak > _FINGER_RATIO) & (sizes.peak <= _BYTE)
     counted &= (sizes.peak[counted] > _PERCENT).any()
