@@ -51,7 +51,7 @@ def reproduction_error(
 
     Args:
         demos: Demonstrations.
-        column: Column of the reproduced joint positions or positions.
+        column: Field of `demos` whose joint positions or positions were reproduced.
         made: Reproductions at the time stamps of the demonstrations, with a `position`, an
             `orientation` or both.
     """

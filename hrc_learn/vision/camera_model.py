@@ -168,7 +168,7 @@ class CameraModel:
         Args:
             point: The point in the base frame [m].
             origin: Point of the body to which the linear velocity refers, in the base frame
-                [m]; None: `point` itself, which then does not move with the rotation.
+                [m]; None: `point` itself, so that a rotation does not move the point.
 
         Returns:
             J_s: derivative with respect to the twist (linear, angular) in the base frame

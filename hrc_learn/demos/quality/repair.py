@@ -55,7 +55,7 @@ class RepairOptions:
     trim: bool = True
     """Shorten the standstill before and after the motion to 0.1 s."""
     drop_late: bool = True
-    """Drop frames whose true stamp is not later than all earlier ones."""
+    """Drop frames whose measured time is not later than all earlier times."""
     drop_repeats: bool = False
     """Drop frames that repeat the previous one, commands included, for up to 0.1 s."""
     unwrap: bool = True

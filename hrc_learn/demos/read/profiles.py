@@ -1,9 +1,8 @@
 """Robust statistics of one episode's columns, and of how the state follows the command.
 
 Apart from the lowest and highest value, no statistic depends on a single value: sizes are
-quantiles, delays and slopes use all frames.
-The contract (`contract`) and the consistency checks (`quality.consistency_checks`) compare
-these profiles over episodes.
+quantiles, delays and slopes use all frames. The contract (`contract`) and the consistency
+checks (`quality.consistency_checks`) compare these profiles over episodes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,11 +41,11 @@ LOST = 0.4
 _SAME_SLOPE = 0.3
 """Largest relative difference from the typical slope, for components in the same unit."""
 _SAME_UNIT, _LATE = np.log(2.0), 0.75
-"""`_SAME_UNIT`: largest logarithm of the slope (a factor of 2) for a state that follows
-commanded positions. `_LATE`: largest delay of such a state [s]."""
+"""`_SAME_UNIT`: largest absolute logarithm of the slope, here a factor of 2, of a state that
+follows commanded positions. `_LATE`: largest delay of such a state [s]."""
 PROMPT = 0.2
-"""Delay within which an arm follows [s]. Longer delays are doubtful: a slow motion resembles
-its own rate of change if the delay is longer."""
+"""Delay within which an arm follows its command [s]. Longer delays are doubtful: a slow motion
+that is delayed by more than this resembles its own rate of change."""
 RATE_WINDOW = 0.2
 """Averaging time for joint rates and for the commands that are compared with them [s]. A change
 from frame to frame is mostly noise."""
@@ -189,7 +188,7 @@ def is_discrete(profile: ColumnProfile, length: int) -> np.ndarray:
     # Up to 12 levels in long episodes: grippers with several openings.
     few = profile.distinct <= max(4, min(12, length // 20))
     span = np.maximum(profile.levels[-1] - profile.levels[0], 1e-12)
-    # Mostly at rest, then a fifth of the range in one step, and not many values.
+    # A switch rests in most frames, jumps by at least a fifth of the range, and has few values.
     switching = (profile.flat > 0.9) & (profile.step > 0.2 * span) & (profile.distinct < 50)
     return few | switching
 
@@ -408,7 +407,7 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
 def _means(
     values: Float64[np.ndarray, "frames components"], window: int
 ) -> Float64[np.ndarray, "_windows components"]:
-    """Mean of `window` frames from each frame on, except for the last `window` frames."""
+    """Moving mean: entry k is the mean of the frames k to k + `window` (exclusive)."""
     sums = np.cumsum(values, axis=0)
     return (sums[window:] - sums[:-window] - values[window:] + values[:-window]) / window
 
