@@ -64,10 +64,11 @@ class DatasetWriter:
 
         Args:
             root: Folder of the dataset; it must not exist, except with `append`.
-            fps: Frame rate [1/s]. The true stamps are stored as well if frames have a `time`.
+            fps: Frame rate [1/s]. If frames have a `time`, these measured stamps are stored
+                too.
             robot_type: Name of the robot in LeRobot's metadata.
-            joint_names: Joints, in the order of the values of all joint quantities.
-            features: Further features: key, such as "observation.shelf" -> component names.
+            joint_names: Joint names, in the order of the values of every joint quantity.
+            features: Further features: key (such as "observation.shelf") -> component names.
             cameras: Cameras whose images are stored as videos: name -> height, width [px].
             frames: Reference frames of the poses, such as
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.

@@ -157,9 +157,9 @@ def extract_features(
 ) -> Extraction:
     """Find a feature in every image of a camera, and keep the result next to the dataset.
 
-    Episodes are skipped if their present videos were searched before: call this function again
-    after an interruption, or after recording more. Episodes without an intact video are left
-    out and listed in the result.
+    Episodes are skipped if their present videos were searched before, so this function can be
+    called again after an interruption, or after more episodes were recorded. Episodes without
+    an intact video are left out and listed in the result.
 
     Args:
         path: The dataset.

@@ -219,7 +219,7 @@ def camera_images(
         segment = reader.segment(demo.episode, camera)
         try:
             encoded = None if segment is None else videos.encoded_samples(segment)
-            if encoded is not None:  # videos have the nominal rate, robots have true stamps
+            if encoded is not None:  # images are 1/fps apart, frames have measured stamps
                 nominal = (
                     np.linspace(0, reader.entry(demo.episode).length - 1, len(demo)) / demo.fps
                 )

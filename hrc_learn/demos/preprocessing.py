@@ -455,9 +455,10 @@ def warp(
 
     D[i, j] = cost[i, j] + min(D[i-1, j-1], D[i-1, j], D[i, j-1])
 
-    Entries of an anti-diagonal depend only on earlier anti-diagonals, so they are computed
-    together. The result is exact and takes about 0.1 s for 1000 by 1000 samples. No library is
-    used: `dtaidistance` accepts no cost matrix, and `tslearn` needs numba, scikit-learn and
+    D[i, j] is the least cost of a path that ends with the pair i, j. Entries of an
+    anti-diagonal depend only on earlier anti-diagonals, so they are computed together. The
+    result is exact and takes about 0.1 s for 1000 by 1000 samples. No library is used:
+    `dtaidistance` accepts no cost matrix, and `tslearn` needs numba, scikit-learn and
     statsmodels.
 
     Args:
@@ -492,7 +493,7 @@ def warp(
 
 
 _BAND = 0.2
-"""Largest difference in timing, as a fraction of the duration."""
+"""Largest difference in phase between paired frames, as a fraction of the duration."""
 _VELOCITY_WINDOW = 0.1
 """Width of the neighbourhood for smoothing warped times and for estimating velocities [s]."""
 

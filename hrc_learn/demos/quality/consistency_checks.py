@@ -127,7 +127,8 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     noisy = (noise > 10 * feature.median("noise")) & (noise > 0.005 * span) & moving
     frames = feature.lengths[:, None]
     levels = feature.stack("distinct") / frames
-    # Fewer than a fifth of the usual levels: values were rounded, or the encoder lost bits.
+    # With less than a fifth of the usual number of distinct values, values were rounded, or the
+    # encoder lost bits.
     coarse = (levels < 0.2 * np.median(levels, axis=0)) & moving
     coarse &= feature.stack("held") / frames < 0.1  # a component at rest is not coarse
     for odd, what in ((noisy, "is far noisier"), (coarse, "has far fewer levels")):
@@ -166,8 +167,8 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     """Report columns that are exchanged, negated, offset or reversed in time in one episode.
 
     An episode is described by five figures per component: 5, 50 and 95 % quantiles, start and
-    goal. The figures are compared with their medians over all episodes. Differences are
-    measured in spreads over the episodes.
+    goal. The figures are compared with their medians over all episodes. The unit of these
+    differences is the spread over the episodes.
     """
     if not feature.key.startswith(("observation.", "state", "action")):
         return

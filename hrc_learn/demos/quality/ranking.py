@@ -54,8 +54,8 @@ class EpisodeQuality:
     reasons: list[str] = field(default_factory=list)
     """Reasons: findings of the check, then faults of reading, then unusual measures."""
     place: tuple[float, float] | None = None
-    """Place on a map of the episodes, the first two principal components of their motions.
-    Similar episodes are close."""
+    """Place on a map of the episodes: the first two principal components of the motion. Similar
+    episodes are close."""
     start: int = 0
     """First frame of the motion; the arm rests before."""
     stop: int = 0

@@ -328,7 +328,7 @@ def _describe(
 ) -> ComponentContract:
     """Complete the contract of a component that a quantity uses."""
     role = decision.role
-    # If a quantity has two roles, the second is for fingers.
+    # If a quantity has two roles in contracts, the second role is for fingers.
     roles = [known for known, quantity in _QUANTITIES.items() if quantity == role] or [role]
     part = replace(
         part,

@@ -331,7 +331,7 @@ def _row_group(pages: Sequence[_Page], model: Sequence[_Struct]) -> tuple[int, _
 
 
 def _column(model: _Struct, pages: Sequence[_Page]) -> _Struct:
-    """Metadata of the pages of a column, with the type, name and codec of a model."""
+    """Metadata of the pages of a column; type, name and codec are those of `model`."""
     sizes = {
         5: sum(page.values for page in pages),
         6: sum(page.plain_size for page in pages),
