@@ -157,9 +157,10 @@ def describe_difference(given: Collection[str], expected: Collection[str]) -> st
 
 
 def complete(episode: Episode, fps: float) -> Episode:
-    """The episode with default stamps and visibility where its frames gave none.
+    """The episode with default stamps and visibility if its frames gave none.
 
-    An image feature need not be finite while it is not visible; such values become zero.
+    An image feature need not be finite while it is not visible; values that are not finite
+    then become zero.
     """
     length = len(next(iter(episode.values())))
     episode = {"time": np.arange(length) / fps, **episode}

@@ -119,7 +119,7 @@ def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
 
 
 def _numpy_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and arrays of a .npz or .npy file; the content tells the format, not the name."""
+    """Names and arrays of a .npz or .npy file; its content decides on the format."""
     name = None
     with path.open("rb") as stream:
         single = stream.read(6) == b"\x93NUMPY"
@@ -268,7 +268,7 @@ def _within(value: Any, place: str = "") -> Iterator[tuple[str, np.ndarray]]:
 def _frames_first(one: Recording) -> Recording:
     """The recording with the frames of all arrays along the first axis.
 
-    The number of frames is the most frequent length among the longest axes of the arrays.
+    The number of frames is the most frequent length of an array's longest axis.
     """
     fields = one.fields
     lengths = [max(f.shape) for f in fields.values() if len(f.shape) <= 2]

@@ -36,8 +36,9 @@ _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 joints. `_CHECK_RATE`: frame rate of the comparison [1/s] for topics, and for recordings whose
 rate is unknown."""
 _ALIKE = 0.3
-"""Ratio of the distances from a joint to the nearest and to the second nearest unnamed command.
-The order of the commands is clear if the ratio of every joint is smaller."""
+"""Bound on a ratio: the distance from a joint to the nearest unnamed command, divided by the
+distance to the second nearest. The order of the commands is clear if every joint stays below
+the bound."""
 
 
 @dataclass(kw_only=True)

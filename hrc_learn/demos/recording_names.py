@@ -100,7 +100,7 @@ def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str,
 
 
 class FieldSearch:
-    """Features made of the numeric fields of an episode, and fields that become no features.
+    """Features made of the numeric fields of an episode; other fields are left out.
 
     Attributes:
         features: Features by key.
@@ -108,7 +108,7 @@ class FieldSearch:
         actions: Fields that hold an action, but do not name its content.
         fingers: Fingers among the joints, each as (True for a command, name, column).
         two_fingers: Field with the positions of a gripper's two fingers, "" if there is none.
-        left_out: Field -> reason.
+        left_out: Field that is left out -> reason.
     """
 
     def __init__(self, first: Recording, hinted: bool):

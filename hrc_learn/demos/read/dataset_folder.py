@@ -245,8 +245,8 @@ def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
 def places_v2(episode: int, chunks_size: int) -> dict[str, int]:
     """Fields of a path template in version 2, which keeps one file per episode.
 
-    A chunk is a folder of `chunks_size` files. Some converters use the name of version 3 for
-    the number of the chunk.
+    A chunk is a folder of `chunks_size` files. Some converters call the number of the chunk
+    `chunk_index`, as version 3 does.
     """
     chunk = episode // chunks_size
     return {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": episode}

@@ -50,8 +50,8 @@ def read_each(
 ) -> Iterator[RawFrames | DatasetError]:
     """Read columns of every episode; for an episode that cannot be read, give the error.
 
-    At most about 65,000 frames are held at a time, or one row group if that is larger. No row
-    group is read twice unless it is damaged.
+    At most about 65,000 frames are in memory at a time, or one row group if that is larger. No
+    row group is read twice unless it is damaged.
 
     Args:
         folder: The dataset.
@@ -82,7 +82,10 @@ def read_each(
 def _batches(
     entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
 ) -> Iterator[list[EpisodeEntry]]:
-    """Split the episodes of a file into batches, at row groups, gaps and backward jumps."""
+    """Batches of a file's episodes.
+
+    A batch ends at a gap, at a backward jump, or, with `_BATCH_ROWS` rows, at a row group.
+    """
     batch: list[EpisodeEntry] = []
     rows, last_group = 0, -1
     for entry in entries:

@@ -26,7 +26,7 @@ from hrc_learn.demos.read.naming import names_joint_quantity, role_of_key
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 NUMERIC = ("float", "int", "uint", "bool")
-"""Prefixes of the dtypes of numbers."""
+"""Prefixes of numeric dtypes."""
 # Largest numbers of components and of axes of a numeric column. The force field of a wrist
 # sensor has several hundred components.
 _WIDEST, _MOST_AXES = 100_000, 8

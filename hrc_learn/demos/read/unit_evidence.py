@@ -306,7 +306,7 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
     """The guess, less certain if columns without clear names may not be joints at all.
 
     Args:
-        guess: Unit, if the columns are joints.
+        guess: Guess of the unit, provided that the columns are joints.
         sizes: Sizes of all components.
         labels: Names of the columns.
         numbered: True if the dataset gives no names.
