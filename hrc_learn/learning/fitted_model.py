@@ -22,8 +22,8 @@ CHANNELS = ("joint", "pose", "position")
 _RAD = {"rad": 1.0, "deg": math.pi / 180}
 """Radians per unit, for joint units of a fixed size."""
 _SAME_TOOL = 0.02
-"""Largest distance [m] between two positions of the tool: the start of the model's pose
-primitive, and the tool of the arm at the start of the model's joint primitive."""
+"""Largest distance [m] between two positions of the tool: at the start of the model's pose
+primitive, and by the arm's kinematics at the start of the model's joint primitive."""
 KINDS = "joints", "position", "pose"
 """Kinds of goals."""
 

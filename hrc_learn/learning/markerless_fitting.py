@@ -344,7 +344,7 @@ def _cameras(
 def _points(
     tracks: _Tracks, pose: Pose, camera: Float[Tensor, "13"], width: int
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " tracks"]]:
-    """Point of each track in the frame of a link [m], and True if it moves with the link.
+    """Point of each track in the frame of a link [m]; True if the track moves with the link.
 
     With p and T the position and rotation matrix of the link, a point m of the link lies at
     p + T m. A camera at e sees the point in direction d, so d x (p + T m - e) = 0. These

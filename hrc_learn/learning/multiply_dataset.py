@@ -71,7 +71,7 @@ class _Lead(NamedTuple):
 
         Args:
             shown: Measured and commanded positions of each demonstration, (T, n).
-            most: Largest number of frames.
+            most: Largest lead that is tried [frames].
         """
         found: list[tuple[float, int, Self]] = []
         for frames in range(1 + round(min(most, min(len(q) for q, _ in shown) / 2))):

@@ -196,8 +196,8 @@ def _end(demo: Demonstration, source: str) -> _End:
 def _marker_angle(
     ends: Sequence[_End], camera: Float[Tensor, "13"], target: VisualTarget
 ) -> MarkerAngle | None:
-    """Turn of the end effector relative to the object's marker; None if no demonstration has
-    a direction of that marker.
+    """Turn of the end effector relative to the object's marker; None if no demonstration gives
+    the direction of that marker.
     """
     known = [end for end in ends if end.angle is not None and np.isfinite(end.angle)]
     if not known:
