@@ -81,7 +81,8 @@ def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 def readable(*tensors: Tensor) -> bool:
     """True if Python may branch on the values of the tensors.
 
-    It must not do so during tracing, in a `torch.func` transform or in a forward derivative.
+    Branching is impossible during tracing, in a `torch.func` transform and in a forward
+    derivative.
     """
     if torch.compiler.is_compiling():
         return False

@@ -105,7 +105,7 @@ class SpringDamper:
             C = xp.exp(-half * s)
             return C, s * C
         if discriminant > 0:
-            # Both exponents are negative, so nothing overflows at large s; cosh would.
+            # Both exponents are negative, so nothing overflows at large s; cosh would overflow.
             slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
             return (slow + fast) / 2, (slow - fast) / (2 * rate)
         envelope = xp.exp(-half * s)

@@ -8,7 +8,8 @@ With the start y_0 and the goal g:
   distance to the goal, and is mirrored if the goal lies on the other side. The scaling is
   undefined for demonstrations with g = y_0.
 - `"amplitude"`: factor equal to the range of each coordinate in the demonstration. Weights are
-  dimensionless, so a scaled demonstration has the same weights. It is also defined for g = y_0.
+  dimensionless, so a scaled demonstration has the same weights. The scaling is also defined for
+  g = y_0.
 - `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
   space; see `_rotated`.
 """
@@ -24,8 +25,8 @@ from torch import Tensor
 from hrc_learn.dmp.samples import demo_label
 
 MINIMUM_DISPLACEMENT = 1e-3
-"""Smallest |g - y_0|, relative to the range, by which weights may be divided. Division by less
-would give weights more than a thousand times as large as division by the range."""
+"""Smallest |g - y_0|, relative to the range, by which weights may be divided. A smaller
+divisor would give weights more than a thousand times as large as division by the range."""
 HALF_TURN = 1e-3
 """Difference [rad] from half a turn below which a rotation counts as half a turn."""
 NO_DIRECTION = 1e-24

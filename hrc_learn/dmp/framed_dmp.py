@@ -4,9 +4,9 @@ Each demonstration is expressed in every frame, and a Gaussian is fitted in each
 frame determines the motion, the demonstrations agree in that frame. For new frames, the
 Gaussians are transformed to the base frame and multiplied, as in task-parameterised models
 (Calinon 2016, "A tutorial on task-parameterized movement learning and retrieval", eqs. 5 and
-6). There, a Gaussian describes single times. Here it describes the coordinates of a primitive,
-and thereby whole motions: a motion that deviates at its start continues to deviate. The result
-is an ordinary primitive.
+6). There, each Gaussian describes a single time. Here, each Gaussian describes the coordinates
+of a primitive, and thereby whole motions: a motion that deviates at its start continues to
+deviate. The result is an ordinary primitive.
 """
 
 import math
@@ -81,8 +81,8 @@ class FramedDMP:
 
     The coordinates are x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M
     numbers for each of D columns. The covariance of the n demonstrations is extended by smooth
-    deviations in all directions. They are as large as the observed deviations and count as one
-    additional demonstration.
+    deviations in all directions. The smooth deviations are as large as the observed deviations
+    and count as one additional demonstration.
     """
 
     primitive: JointDMP

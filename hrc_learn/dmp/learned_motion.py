@@ -2,7 +2,7 @@
 
 A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n. All
 models except the one with frames compute the coordinates for a context c (known before the
-motion) as x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. They are the mean, the nearest
+motion) as x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. These models are the mean, the nearest
 demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
 regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
 trajectory database"). If demonstration i is held out, the weights of the other demonstrations

@@ -407,8 +407,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
     def reversed[S: "MotionPrimitive"](self: S) -> S:
         """Primitive that moves along the same path backwards, from the goal to the start.
 
-        At time t, its motion has the position of this primitive at duration - t. The motion is
-        fitted with the same basis. It accepts new starts and goals.
+        At time t, its motion has the position of this primitive at duration - t. The result is
+        fitted with the same basis, and accepts new starts and goals.
 
         Raises:
             ValueError: A rhythm, which has no end to start from.

@@ -1,10 +1,10 @@
 """Orientation errors to a goal: coordinates in which an orientation primitive is linear.
 
 The error of an orientation q to the goal g is e = log(g * conj(q)), a rotation vector [rad] in
-the base frame. Hence q = exp(-e) * g. This follows Koutras and Doulgeri 2019, "A correct
-formulation for the orientation dynamic movement primitives for robot control in the Cartesian
-space", whose logarithm is half of ours. At the goal, e = 0. A rotation of the tool frame that
-applies to start and goal leaves e unchanged.
+the base frame. Hence q = exp(-e) * g. This definition follows Koutras and Doulgeri 2019, "A
+correct formulation for the orientation dynamic movement primitives for robot control in the
+Cartesian space", whose logarithm is half of ours. At the goal, e = 0. A rotation of the tool
+frame that applies to start and goal leaves e unchanged.
 """
 
 import math

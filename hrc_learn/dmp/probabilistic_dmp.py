@@ -50,8 +50,8 @@ KNOWN_DURATION = 1e-6
 """Standard deviation of the logarithm of a duration that is given as known."""
 GAUSSIAN = ("mean", "spread", "timing")
 SAME_ORIENTATION = 1e-9
-"""Angle [rad] below which orientations count as equal. It is larger than rounding errors and
-smaller than the resolution of any sensor."""
+"""Angle [rad] below which orientations count as equal. The bound is larger than rounding errors
+and smaller than the resolution of any sensor."""
 
 
 def mean_primitive[P: MotionPrimitive](primitives: P) -> P:

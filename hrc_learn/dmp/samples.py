@@ -35,8 +35,8 @@ LIKELIHOOD_MARGIN = 1.0
 """Twice the logarithm of the largest likelihood ratio that is not significant. A margin of two
 standard deviations would be 4."""
 CLEAN = 2e-5
-"""Samples with less noise than this, relative to the range, stay unchanged. It is the accuracy
-of a fit with fifty functions."""
+"""Samples with less noise than this, relative to the range, stay unchanged. The bound is the
+accuracy of a fit with fifty functions."""
 ORDER = 3
 """Order of the penalised differences; third differences are zero for motions without jerk."""
 SAMPLES_EACH = 1.5

@@ -8,11 +8,12 @@ rotation vector with the full angle. With e = log(g conj q) and v = -eta,
 
     v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
 
-with the factor c of `quaternion.axis_drift`. This is the linear primitive except for the drift
-n, which is zero while the axis of rotation is constant. The linear part is solved exactly, and
-n is integrated by the Runge-Kutta method of order 4 in the frame of the linear motion (Lawson
-1967, "Generalized Runge-Kutta processes for stable systems"). A step is stable at any length
-and exact for rotations about one axis. The logarithm is continuous over time.
+with the factor c of `quaternion.axis_drift`. The equations are those of the linear primitive
+except for the drift n, which is zero while the axis of rotation is constant. The linear part is
+solved exactly, and n is integrated by the Runge-Kutta method of order 4 in the frame of the
+linear motion (Lawson 1967, "Generalized Runge-Kutta processes for stable systems"). A step is
+stable at any length and exact for rotations about one axis. The logarithm is continuous over
+time.
 """
 
 from dataclasses import replace

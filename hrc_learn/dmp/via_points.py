@@ -3,8 +3,8 @@
 In Zhou, Gao and Asfour 2019, "Learning via-movement primitives", a motion is an elementary
 trajectory plus the shape that a demonstration adds, and via points change the elementary
 trajectory piecewise. Here the change is a piecewise polynomial curve, and the weights are
-changed to follow it, so that the result is an ordinary primitive. It follows the curve as
-closely as the basis allows, and passes exactly through the via points and the end.
+changed to follow it, so that the result is an ordinary primitive. Its motion follows the curve
+as closely as the basis allows, and passes exactly through the via points and the end.
 `MotionPrimitive.condition` does this for values of any kind.
 """
 

@@ -336,9 +336,9 @@ def null_projection(
 ) -> Float[Tensor, "*batch n"]:
     """The null-space part N w of w, up to rounding: |J N w| is at most about 1e-14 |J| |w|.
 
-    It uses a Householder QR of J^T, which is as accurate for a singular J as for a regular one;
-    solving with J J^T would square the condition number. If the rank is below m, the projection
-    still removes m directions: the range of J^T and some of the null space.
+    The function uses a Householder QR of J^T, which is as accurate for a singular J as for a
+    regular J. Solving with J J^T would square the condition number. If the rank is below m, the
+    projection still removes m directions: the range of J^T and some of the null space.
 
     Args:
         J: Jacobian with at least as many columns as rows.

@@ -111,9 +111,9 @@ def to_matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
 def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternion of a rotation matrix; its sign is arbitrary.
 
-    It builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
-    (Markley 2008, "Unit quaternion from rotation matrix"). The result is accurate at every
-    angle, and a unit quaternion even if R is a rotation only up to rounding.
+    The function builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its
+    largest row (Markley 2008, "Unit quaternion from rotation matrix"). The result is accurate
+    at every angle, and a unit quaternion even if R is a rotation only up to rounding.
     """
     if torch.compiler.is_compiling():
         return _written_out_from_matrix(R)

@@ -173,8 +173,8 @@ class OrientationRegion(_Cone):
 
     With `coordinates="rotation_vector"` the gradient suits the analytic Jacobian: it is the
     derivative of P with respect to the rotation vector of x. It equals J_l^T times the gradient
-    above, with the left Jacobian J_l of rotations. With `formulation="paper"`, it is twice this
-    derivative. This is the product of the printed derivatives (PartialV2Quat) and
+    above, with the left Jacobian J_l of rotations. With `formulation="paper"`, the gradient is
+    twice as large. It then equals the product of the printed derivatives (PartialV2Quat) and
     (JacobianQuatAngAxisDetailed) wherever their divisions by components of quaternions are
     defined.
     """
@@ -323,9 +323,9 @@ class JointRegion(Region):
         f_i = delta_i - margin,   f_ri = delta_i - reference_margin
         P   = sum_i k_q/2 min(0, f_i)^2 + k_r/2 min(0, f_ri)^2           (jointxp)
 
-    With `formulation="paper"`, f_i = delta_i^2 - margin^2, as in Table I of the paper. Its push
-    vanishes at the limit and points outwards past the limit, because the square loses the sign
-    of delta_i.
+    With `formulation="paper"`, f_i = delta_i^2 - margin^2, as in Table I of the paper. The push
+    then vanishes at the limit and points outwards past the limit, because the square loses the
+    sign of delta_i.
     """
 
     centre: Float[Tensor, "*#batch n"]
