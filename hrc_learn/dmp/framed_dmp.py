@@ -115,7 +115,7 @@ class FramedDMP:
             mask: Mask (n, T), false at samples to ignore.
             tolerance: Smallest standard deviation of the demonstrations in every frame, in the
                 units of the motion. None: 0.1 % of the largest range.
-            joint_names: D names.
+            joint_names: Names of the D coordinates.
             units: Units of the coordinates.
             options: Options of the fit; see `FitOptions`.
 

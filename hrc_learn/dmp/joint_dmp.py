@@ -167,7 +167,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             mask: Mask (*B, T), false at samples to ignore, such as padding and dropouts.
             scaling: Scaling of the forcing term: `"none"`, `"paper"`, `"amplitude"` or
                 `"rotation"`.
-            joint_names: D names, stored with the primitive.
+            joint_names: Names of the D coordinates, stored with the primitive.
             units: Units of the coordinates.
             options: Options of the fit; see `FitOptions`.
 
@@ -339,7 +339,7 @@ def fit_shared(
         demonstrations: Timestamps (T,) [s] and positions (T, D) of each. They are read one by
             one, so a sequence that loads them on demand is enough.
         n_basis: Number N of basis functions.
-        joint_names: D names, stored with the primitive.
+        joint_names: Names of the D coordinates, stored with the primitive.
         units: Units of the coordinates.
 
     Returns:

@@ -275,7 +275,7 @@ class LearnedMotion:
     def _primitives(
         self, x: Float[Tensor, "q D M"], w: Float[Tensor, "q n"]
     ) -> MotionPrimitive:
-        """Primitives with shrunk coordinates `x` and weighted geometric means of durations."""
+        """Primitives from coordinates `x`, shrunk, with weighted geometric mean durations."""
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x, self.chosen.shrinkage)
         middle, reference = mean_primitive(self.each).motion, common_reference(self.each)
@@ -438,7 +438,7 @@ def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor
 
 
 def _from_frames(each: JointDMP, frames: Frames) -> Float[Tensor, "n D M"]:
-    """Coordinates of each demonstration, predicted from its frames and the other n - 1."""
+    """Coordinates of each demonstration, predicted from its frames and the others' motions."""
     n, made = len(each), []
     for i in range(n):
         rest = torch.arange(n) != i

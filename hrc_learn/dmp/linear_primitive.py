@@ -110,10 +110,10 @@ class LinearPrimitive(nn.Module):
 
         Args:
             weights: Weights of the scaled forcing term.
-            start: y_0, start of the demonstration.
-            goal: g, end of the demonstration.
+            start: Start y_0 of the demonstration.
+            goal: End g of the demonstration.
             start_velocity: Velocity at the start [1/s], for the given `duration`.
-            duration: tau [s].
+            duration: Duration tau [s].
             amplitude: Range of each column.
             timestamps: Normalised times of the default rollout.
             basis: Basis of the forcing term.
@@ -121,7 +121,7 @@ class LinearPrimitive(nn.Module):
             scaling: Scaling of the forcing term; see `forcing_scale.py`.
             approach: Fraction of the motion over which it adapts to a new start and goal; 0:
                 the spring alone adapts it.
-            joint_names: D names.
+            joint_names: Names of the D columns.
             units: Units of the columns.
             fit_report: Residuals of the fit.
         """

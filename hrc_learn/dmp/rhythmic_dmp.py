@@ -50,7 +50,7 @@ def fit_rhythmic(
         n_basis: Number of basis functions per period.
         period: Period [s]; by default estimated from the positions.
         mask: Mask (*B, T), false at samples to ignore.
-        joint_names: D names, stored with the primitive.
+        joint_names: Names of the D coordinates, stored with the primitive.
         units: Units of the coordinates.
 
     Raises:

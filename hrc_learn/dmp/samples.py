@@ -209,9 +209,9 @@ def check_samples(
     Args:
         time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
         position: Positions, (T,), (T, D) or (*B, T, D); D = 1 if they have the shape of `time`.
-        velocity: Same shape as `position`, or None.
-        mask: Same shape as `time`, true at valid samples. Invalid samples may have any value,
-            NaN included. None: all samples are valid.
+        velocity: Recorded velocities, shaped like `position`, or None.
+        mask: Mask shaped like `time`, true at valid samples. Invalid samples may have any
+            value, NaN included. None: all samples are valid.
         name: Name of `position` in error messages.
 
     Raises:
@@ -289,7 +289,11 @@ def _floating(values: Points) -> Tensor:
 
 
 def expanded(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:
-    """Values in this shape; ValueError, with the shape of `position`, if they do not fit."""
+    """Values expanded to this shape.
+
+    Raises:
+        ValueError: The values do not fit; the message names the shape of `position` too.
+    """
     try:
         return values.expand(shape)
     except RuntimeError:

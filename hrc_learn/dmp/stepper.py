@@ -116,7 +116,7 @@ class Stepper:
         Args:
             state: From `initial_state` or the last step.
             dt: Time step [s].
-            goal: New goal, to which the goal jumps.
+            goal: New goal, which replaces the goal at once.
             coupling: External acceleration [1/s^2].
             phase_stopping: Number p >= 0; the clock runs slower by the factor 1 + p.
         """

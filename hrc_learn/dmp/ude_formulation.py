@@ -136,7 +136,7 @@ def to_reference(state: DMPState, old: Tensor, new: Tensor) -> DMPState:
 class UdeMotion(Trajectory):
     """Error over time: linear motion plus deviation, integrated once on a fixed grid.
 
-    Its coordinates are those of the linear state (e, v) for unit duration.
+    Its coordinates describe the linear part of the state (e, v) at unit duration.
     """
 
     def _derivative(self, order: int) -> Float[Tensor, "*batch T 3"]:
@@ -167,7 +167,7 @@ class UdeMotion(Trajectory):
 
     def integrate(self) -> Float[Tensor, "*batch T 2 3"]:
         """State (e, v) at the requested times, by one step from the knot before each time."""
-        # At most half a piece of the response, on which the forcing is smooth.
+        # Steps are at most half a piece of the response, on which the forcing is smooth.
         size = min(MAXIMUM_STEP, self._response.forced.interval / 2)
         s = self.s.expand(*self._batch, -1) if self.s.ndim > 1 else self.s
         knot = (s.detach() / size).floor()
@@ -248,7 +248,7 @@ def deviation(
         z: Deviation before the step.
         h: Step in normalised time.
         spring: Spring that determines A.
-        linear: Linear (e, v) at the beginning, the middle and the end of the step.
+        linear: Linear part of (e, v) at the beginning, the middle and the end of the step.
     """
     begin, middle, end = linear
     E = spring.propagator(h.double() / 2).to(z)

@@ -48,7 +48,7 @@ motions overshoot."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViaPoints:
-    """Positions and rates that a linear primitive has to pass; NaN leaves a value free."""
+    """Positions and rates that a linear primitive has to reach; NaN leaves a value free."""
 
     s: Float[Tensor, "*batch n"]
     """Normalised times (float64)."""
@@ -202,11 +202,11 @@ class _CurveFollower:
     """
 
     chosen: Int[Tensor, "K"]
-    """Basis functions inside the window."""
+    """Indices of the basis functions inside the window."""
     s: Float[Tensor, "G"]
     """Times at which a curve is compared."""
     units: Float[Tensor, "3"]
-    """Units of the curve and its derivatives."""
+    """Factors on the curve and its derivatives."""
     Q: Float[Tensor, "G3 K"]
     to_weights: Float[Tensor, "K K"]
     end: Float[Tensor, "2 K"]

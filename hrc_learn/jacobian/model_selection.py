@@ -50,7 +50,7 @@ class EvidenceConfig:
     rounds: int = 15
     """Largest number of rounds of L-BFGS."""
     iterations: int = 5
-    """Iterations of L-BFGS in a round."""
+    """Number of iterations of L-BFGS in a round."""
     patience: int = 3
     """Number of rounds without a better held-out error after which the learning stops."""
     min_improvement: float = 1e-3
@@ -171,9 +171,9 @@ class NegativeLogEvidence(nn.Module):
         self.log_weight = logarithm(config.weight_std)
 
     def forward(self, motion: MotionSamples) -> Float[Tensor, ""]:
-        """Value over the pairs of all processes; each process passes its own pairs."""
+        """Value for the pairs of all processes together; each process passes its own pairs."""
         total = self.statistics(motion)
-        # Variance of a difference of two measurements, each with this deviation.
+        # Variance of a difference of two measurements, each with the same standard deviation.
         noise = 2 * (2 * self.log_noise).exp()
         # Whitened weights, independent with unit variance under the prior, are well scaled.
         prior = weight_covariance(self.centers, self.log_bias.exp(), self.log_weight.exp())
@@ -193,7 +193,7 @@ class NegativeLogEvidence(nn.Module):
         return RegressionStatistics.of(phi, motion.dx).over_processes()
 
     def neurons(self, *, attached: bool = False) -> RBFCenters:
-        """The present neurons; `attached` keeps them in the graph, so that gradients flow."""
+        """The present neurons; `attached` keeps them in the graph of gradients."""
         centers, width = self.centers, self.log_width.exp()
         if not attached:
             centers, width = centers.detach().clone(), float(width.detach())
@@ -311,7 +311,7 @@ def cross_validate(
     Args:
         demonstrations: Demonstrations to which the network was fitted.
         network: Network as returned by `RBFImageJacobian.fit`, not loaded from a file.
-        config: Settings of that fit.
+        config: Settings with which the network was fitted.
         image_size: Width and height of the image [px]; needed for a network with a camera.
 
     Raises:
