@@ -116,7 +116,7 @@ def check(args: Check) -> int:
         FileNotFoundError: There is no dataset.
         ValueError: An option names something that does not exist, no columns could be read for
             the contract (the meaning of the columns), or there is no marker for `--camera`. The
-            findings are written first.
+            findings are printed before an error of the contract or the camera is raised.
     """
     if not args.dataset.is_dir() or not any(args.dataset.iterdir()):  # not an error in the data
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")

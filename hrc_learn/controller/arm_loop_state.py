@@ -42,11 +42,12 @@ class ArmLoopConfig(YieldingConfig):
     end effector by a few centimetres."""
     speed: float = 1.0
     """Speed of the task relative to its planned speed, in (0, 1]. Use a low value for the first
-    run on a real arm. Null-space motion off a path is not slowed down."""
+    run on a real arm. Null-space motion is not slowed down
+    while the joints are off their path."""
     longest_wait: float = 300.0
     """Longest time for which people may block or displace the arm before the task fails [s]."""
     back_after: float = 2.0
-    """Time without progress towards a path after which the path is retraced [s]."""
+    """Time after which the path runs backwards if the joints come no nearer to it [s]."""
     direct_return_after: float = 20.0
     """Time without progress after which the joints return to their path directly [s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)

@@ -40,7 +40,7 @@ _TRUTH, _INDEX = ir.IntType(1), ir.IntType(32)
 _INTRINSICS = {"abs": "fabs", "round": "roundeven"}
 
 type Unit = tuple[int, ...]
-"""Consecutive value numbers (see `scalar_program`) that one instruction computes."""
+"""Consecutive value numbers (see `scalar_program`) whose values one instruction computes."""
 
 ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.
@@ -150,7 +150,7 @@ class NativeCode:
         return builder
 
     def _row(self, builder: ir.IRBuilder, vector: str, row: int) -> ir.Value:
-        """Address of the numbers of the arms being computed, in a row of a vector."""
+        """Address of the part of a vector's row that belongs to the arms being computed."""
         first, offset = builder.function.args[self._vectors.index(vector)], ir.IntType(64)(row)
         if self.lanes > 1:
             offset = builder.mul(builder.function.args[-1], offset)

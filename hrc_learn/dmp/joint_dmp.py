@@ -33,7 +33,7 @@ LIMIT_SAMPLES = 2001
 """Number of times at which limits are checked: 40 for each of 50 basis functions. A peak
 between two of these times exceeds the checked values by less than 0.1 %."""
 TOLERANCE = 1.05
-"""Held-out errors up to this multiple of the smallest error count as equal to the smallest."""
+"""Held-out errors of at most this factor times the smallest one are treated as equal to it."""
 DEFAULT_COUNT = 50
 """Default number of basis functions. 50 functions reproduce recordings of arms to 5e-5 of the
 range. If the samples have no noise, fewer functions would not give a smoother motion."""
@@ -255,7 +255,8 @@ class BasisSelection:
     """Smallest number of basis functions whose error is within 5 % of the smallest error."""
     candidates: tuple[int, ...]
     error: Float[Tensor, "candidates"]
-    """RMSE on held-out samples, relative to the largest range, over all demonstrations."""
+    """RMSE on the held-out samples of all demonstrations, relative to the largest range of a
+    coordinate in any of them."""
 
 
 def select_basis_count(

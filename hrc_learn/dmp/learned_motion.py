@@ -1,8 +1,9 @@
 """Learning of a motion with the model that best predicts each demonstration from the others.
 
-A primitive is fitted to each demonstration; x_j are the coordinates of primitive j of n. All
-models except the one with frames compute the coordinates for a context c (known before the
-motion) as x(c) = sum_j w_j(c) x_j with sum_j w_j = 1. These models are the mean, the nearest
+A primitive is fitted to each of n demonstrations. The coordinates x_j of primitive j are its
+weights, start velocity, start and goal. All models except the one with frames compute the
+coordinates for a context c (known before the motion) as x(c) = sum_j w_j(c) x_j with
+sum_j w_j = 1. These models are the mean, the nearest
 demonstration, means weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge
 regression on contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a
 trajectory database"). If demonstration i is held out, the weights of the other demonstrations
@@ -41,12 +42,12 @@ from hrc_learn.model_files import SavedModel, write_model
 BASIS_COUNTS = (10, 20, 30, 50, 100)
 """Numbers of basis functions compared."""
 APPROACHES = (1.0, 0.6)
-"""Values of `FitOptions.approach` compared: the smoothest, and one for which the last 40 % of
-the path only shifts with the goal."""
+"""Values of `FitOptions.approach` to compare. With 1, the motion adapts most smoothly. With
+0.6, a new goal only shifts the last 40 % of the path."""
 WIDTHS = (2.0, 1.0, 0.5, 0.25)
 """Widths of kernels, relative to the spread of the contexts."""
 PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
-"""Ridges relative to the data; a ridge of 1 halves the effect of a single context."""
+"""Ridges relative to the data. If the context is one number, a ridge of 1 halves its effect."""
 FEWEST = 4
 """Smallest number of demonstrations for which a regression is tried besides the mean."""
 CLEARLY, DEVIATIONS = 0.02, 0.8
@@ -120,9 +121,9 @@ def learn(
 
     Args:
         demonstrations: Demonstrations as from `load_demos`, with `time` and `joint_position`,
-            or with `time`, `position` and perhaps `orientation`. Alternatively, pairs of times
-            (T,) [s] and values, which are joints or other coordinates (T, D), or a `Pose` of
-            (T).
+            or with `time`, `position` and perhaps `orientation`. Alternatively, pairs (times,
+            values): times (T,) [s]; values are joints or other coordinates (T, D), or a `Pose`
+            with batch shape (T,).
         context: Values (n, C) that are known before each motion. None: start and goal.
         frames: Frames of each demonstration, (n, F), for positions in space.
         n_basis: Number of basis functions. None: the smallest of `BASIS_COUNTS` whose error on
@@ -275,7 +276,10 @@ class LearnedMotion:
     def _primitives(
         self, x: Float[Tensor, "q D M"], w: Float[Tensor, "q n"]
     ) -> MotionPrimitive:
-        """Primitives from coordinates `x`, shrunk, with weighted geometric mean durations."""
+        """Primitives with the coordinates `x` after shrinkage.
+
+        Durations are geometric means of the demonstrated durations with weights `w`.
+        """
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x, self.chosen.shrinkage)
         middle, reference = mean_primitive(self.each).motion, common_reference(self.each)
@@ -422,8 +426,8 @@ def _candidates(
 def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor, "n D 1"]:
     """Unit of the error of each column: the largest range among columns of its kind.
 
-    Positions, orientation errors and bodies are different kinds. The unit of a kind that does
-    not move is 1.
+    Positions, orientation errors and body coordinates (see `PoseDMP`) are different kinds.
+    The unit of a kind that does not move is 1.
     """
     span = shown.amax(-1) - shown.amin(-1)
     errors = each.error_columns

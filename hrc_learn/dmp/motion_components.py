@@ -17,8 +17,8 @@ from hrc_learn.dmp.samples import Samples
 MARGIN = 0.1
 """Distance by which motions may exceed the demonstrated range, relative to the range."""
 SHRINKAGE = 0.1
-"""Weight of a separable covariance, which a few motions are enough to determine: the product of
-a covariance over time and a covariance over columns."""
+"""Weight of a separable covariance, the product of a covariance over time and a covariance
+over columns. A few motions are enough to determine it."""
 RIDGE = 1e-3
 """Ridge of the prediction from the start: values from 1e-4 to 1e-2 are equally good."""
 POINTS = (6, 8, 10, 13, 16, 20, 26, 32, 40, 50, 64)

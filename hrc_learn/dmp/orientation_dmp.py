@@ -1,4 +1,6 @@
-"""Movement primitives of an orientation; the columns are its error e to a reference.
+"""Movement primitives of an orientation, described by its error e to a reference.
+
+The components of e are columns of a linear primitive (see `linear_primitive`).
 
 The equation of motion, e'' = alpha (beta (0 - e) - e') + f with the forcing term f, contains no
 approximation for small angles (Koutras and Doulgeri 2019). The reference is the goal by
@@ -123,7 +125,9 @@ torch.export.register_dataclass(
 class OrientedPrimitive[Value, Path, State: OrientationState](
     WrappedPrimitive[Value, Path, State]
 ):
-    """Primitive whose columns are a position, the error of an orientation, and a body.
+    """Primitive whose columns are a position, an orientation error, and body coordinates.
+
+    Body coordinates are, for example, an arm angle or a redundant joint.
 
     Position and body may have no columns. In the methods, `frame` is the reference.
     """
@@ -139,9 +143,9 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            motion: Motion of the columns. With the error e at its goal, the reference is
-                exp(e) * goal. An error other than zero allows primitives with different goals
-                to have one common reference.
+            motion: Motion of the columns. If e is the orientation error in `motion.goal`, the
+                reference is exp(e) * goal_orientation. An error other than zero allows
+                primitives with different goals to have one common reference.
             goal_orientation: Unit quaternion (w, x, y, z) at the end.
         """
         super().__init__()

@@ -3,8 +3,9 @@
 The error of an orientation q to the goal g is e = log(g * conj(q)), a rotation vector [rad] in
 the base frame. Hence q = exp(-e) * g. This definition follows Koutras and Doulgeri 2019, "A
 correct formulation for the orientation dynamic movement primitives for robot control in the
-Cartesian space", whose logarithm is half of ours. At the goal, e = 0. A rotation of the tool
-frame that applies to start and goal leaves e unchanged.
+Cartesian space", whose logarithm is half of ours. At the goal, e = 0. If the same rotation
+of the tool frame is applied to all orientations, including the goal (q * r and g * r), e stays
+the same.
 """
 
 import math
@@ -26,7 +27,7 @@ MEAN_ITERATIONS = 10
 factor. If all orientations are close together, the new distance is proportional to the cube of
 the previous one."""
 NORM_TOLERANCE = 1e-2
-"""Deviation from 1 up to which the norm of a recorded quaternion is corrected."""
+"""A recorded quaternion is normalised if its norm differs from 1 by at most this value."""
 
 
 def to_error(
@@ -93,7 +94,7 @@ def nearest_turn(
 ) -> Float[Tensor, "*batch 3"]:
     """The same rotation as `error`, with the whole turns that bring it closest to `reference`.
 
-    With these turns, motions to a new start or goal rotate in the direction of the
+    With these turns, a motion with a new start or goal rotates in the same direction as the
     demonstration.
     """
     error, reference = torch.broadcast_tensors(error, reference)

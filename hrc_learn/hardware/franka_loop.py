@@ -369,8 +369,8 @@ def answer_was_lost(
     acceleration.
 
     The next answer must then start from the state of the box. If the box reports the same
-    velocity twice despite an acceleration, the answer is not lost: the box sent that report
-    before it received the answer, and starting from it would be a jump back.
+    velocity twice despite an acceleration, the answer is not lost: the box sent the second
+    report before it received the answer, and a start from this report would be a jump back.
 
     Args:
         reported: Commanded velocity that the box reports [rad/s].

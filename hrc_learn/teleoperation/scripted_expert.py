@@ -146,7 +146,7 @@ class GuidedPath:
         from scipy.interpolate import PchipInterpolator  # takes a quarter of a second
 
         length = np.concatenate([[0.0], np.cumsum(chords)])
-        # The curve is monotone between way points: an overshoot would hit the boards.
+        # The curve is monotone between way points: an overshoot would hit the shelves' boards.
         self._curve = PchipInterpolator(length / length[-1], waypoints)
         self._slope = self._curve.derivative()
         self._start, self.duration = start, duration

@@ -40,7 +40,7 @@ def rgba(colour: str) -> tuple[int, int, int, int]:
 
 
 def followed_colour(fraction: float) -> str:
-    """Colour for the followed fraction of a push, 0 to 1: vermilion for 0, green for 1.
+    """Colour for the fraction of a push that the arm follows: vermilion for 0, green for 1.
 
     The colour changes in five distinguishable steps.
     """

@@ -32,8 +32,8 @@ _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_ve
 _POSES = ("position", *ORIENTATION_ROLES)
 _ORIENTATIONS = (*ORIENTATION_ROLES, "quaternion", "rotation")
 _ASSUMED = naming.WORDS["assumed"]
-# Number of components of a pose feature without component names -> encoding of the orientation
-# that follows x, y, z, and the assumed content, which is reported.
+# Pose features without component names: number of components -> encoding of the orientation
+# that follows x, y, z; and a description of the assumed content, which is reported in a note.
 _CARTESIAN = {
     6: ("euler_xyz", "x, y, z, roll, pitch, yaw"),
     7: ("quaternion_xyzw", "x, y, z, qx, qy, qz, qw"),
@@ -126,7 +126,7 @@ def _with_units(selection: ColumnSelection, features: Mapping[str, Feature]) -> 
 
 
 def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str:
-    """Note that a quantity has other joints than the other quantities, with the remedy."""
+    """Message that a quantity has other joints than the other quantities, with the remedy."""
     if set(joints) < set(names):
         advice = ""
     elif len(joints) == len(names):
@@ -416,7 +416,7 @@ class _Conventions:
             )
 
     def _encoding(self, feature: Feature, role: str, slots: Mapping[str | int, int]) -> str:
-        """Encoding of a rotation by its components, with a note where it is assumed."""
+        """Encoding of a rotation, from its components; an assumed encoding is noted."""
         if role not in ("quaternion", "rotation", "rotation_6d"):
             return role
         known = {3: "rotation_vector", 6: "rotation_6d", 9: "rotation_matrix"}
