@@ -45,22 +45,21 @@ def to_tensor(
     device: torch.device | None = None,
 ) -> Tensor:
     """Convert like `torch.as_tensor`; arrays may be read-only or have negative strides or any
-    byte order.
+    byte order. Series and tables of pandas are arrays too.
 
     Raises:
         ValueError: Values that are not real numbers, or booleans where `dtype` is floating.
     """
     if isinstance(values, Tensor) and values.dtype == dtype and values.device == device:
         return values  # the common case; `as_tensor` would return the same, but more slowly
-    if isinstance(values, np.ndarray):
+    if hasattr(values, "__array__") and not isinstance(values, Tensor):
+        values = np.asarray(values)
         if values.dtype.kind not in "biuf":
             raise ValueError(f"expected real numbers, got an array of {values.dtype}")
         values = np.require(values, values.dtype.newbyteorder("="), ["C", "W"])
     tensor = torch.as_tensor(values)
     if tensor.is_complex() or (tensor.dtype == torch.bool and dtype in FLOATING):
         raise ValueError(f"expected real numbers, got {tensor.dtype}")
-    if isinstance(values, Tensor):
-        return tensor.to(device, dtype)
     # Convert the original values again, because `tensor` holds Python's floats as float32.
     return torch.as_tensor(values, dtype=dtype, device=device)
 

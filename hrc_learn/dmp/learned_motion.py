@@ -342,21 +342,20 @@ class LearnedMotion:
 
 def _samples(demonstration: Any) -> tuple[Tensor, Any]:
     """Times and values of one demonstration."""
-    if not hasattr(demonstration, "time"):
+    if isinstance(demonstration, tuple | list) and len(demonstration) == 2:
         time, values = demonstration
         if isinstance(values, Pose):
             return to_tensor(time), values
         values = to_tensor(values)
         return to_tensor(time), values[:, None] if values.ndim == 1 else values
-    time = to_tensor(demonstration.time)
     for name in ("joint_position", "position"):
         values = getattr(demonstration, name, None)
         turned = getattr(demonstration, "orientation", None)
         if values is not None and name == "position" and turned is not None:
-            return time, Pose(to_tensor(values), to_tensor(turned))
+            return to_tensor(demonstration.time), Pose(to_tensor(values), to_tensor(turned))
         if values is not None:
-            return time, to_tensor(values)
-    raise ValueError("a demonstration has neither joint positions nor positions")
+            return to_tensor(demonstration.time), to_tensor(values)
+    raise ValueError("found neither joint positions nor positions, nor a pair (times, values)")
 
 
 def _fit_of(

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -32,12 +31,13 @@ class Pose:
     """Unit quaternion (w, x, y, z); either sign."""
 
     def __post_init__(self):
-        # NumPy arrays, lists and whole numbers become tensors of floats. Placeholders of
+        # Arrays, tables, lists and whole numbers become tensors of floats. Placeholders of
         # tracers and masks of a pytree pass unchanged.
         for name in ("position", "orientation"):
             value = getattr(self, name)
             whole = isinstance(value, Tensor) and value.dtype in _WHOLE
-            if whole or isinstance(value, (np.ndarray, list, tuple)):  # torch 2.15 traces this
+            array = not isinstance(value, Tensor) and hasattr(value, "__array__")
+            if whole or array or isinstance(value, (list, tuple)):  # torch 2.15 traces this
                 object.__setattr__(self, name, as_tensor(value))
 
     @staticmethod

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from torch import nn
@@ -100,6 +101,9 @@ def test_numbers_are_converted_without_a_copy_where_none_is_needed():
     assert arguments.to_tensor(backwards, torch.float32).tolist() == [5, 3, 1]
     foreign = np.array([1.5, 2.0], dtype=">f8")  # as instruments on a network write them
     assert arguments.to_tensor(foreign).tolist() == [1.5, 2.0]
+    assert arguments.to_tensor(pd.Series([1, 2], index=[5, 6])).tolist() == [1, 2]
+    table = arguments.to_tensor(pd.DataFrame({"a": [1.5], "b": [2.0]}), torch.float32)
+    assert table.tolist() == [[1.5, 2.0]]
     assert arguments.to_tensor(np.array([True, False])).tolist() == [True, False]
     assert arguments.to_tensor([True], torch.int64).tolist() == [1]
     for wrong in ([True, False], np.zeros(2, bool)):

@@ -195,6 +195,9 @@ def test_demonstrations_of_a_dataset_are_read_by_their_fields():
         assert hasattr(read, "orientation") == isinstance(expected, Pose)
     with pytest.raises(ValueError, match="neither joint positions nor positions"):
         learn([SimpleNamespace(time=time)])
+    for no_pairs in (way, [(time, way, way)], "way"):
+        with pytest.raises(ValueError, match=r"nor a pair \(times, values\)"):
+            learn(no_pairs)
 
 
 def test_few_samples_have_few_functions():

@@ -1,4 +1,5 @@
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from sampling import generator, quaternions, rotation_vectors
@@ -73,6 +74,14 @@ def test_whole_numbers_become_floats():
     assert pose.position.dtype == pose.orientation.dtype == torch.float64
     assert pose.apply([0.0, 0.0, 1.0]).tolist() == [1.0, 2.0, 4.0]
     assert masks.position.dtype == torch.bool
+
+
+def test_tables_become_tensors():
+    table = pd.DataFrame({"x": [0.1, 0.2], "y": [0.0, 0.0], "z": [0.5, 0.6]})
+    with shapes_unchecked():
+        pose = Pose(table, table.assign(w=1.0)[["w", "x", "x", "x"]])
+    assert pose.position.tolist() == table.to_numpy().tolist()
+    assert pose.orientation[:, 0].tolist() == [1.0, 1.0]
 
 
 def test_goes_through_vmap_as_a_value():
