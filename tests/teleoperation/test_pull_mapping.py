@@ -37,7 +37,7 @@ def test_the_docs_tell_that_default():
     )
     assert {row[1], DEFAULT_MAPPING} == {"transpose", "pinv"}
     page = (DOCS / "teleoperation.md").read_text(encoding="utf-8")
-    assert f'`mapping="{DEFAULT_MAPPING}"` by default' in page
+    assert f'`mapping="{DEFAULT_MAPPING}"` is the default' in page
 
 
 @pytest.mark.parametrize("mapping", ["transpose", "pinv"])
