@@ -612,7 +612,8 @@ def main(args: Args) -> None:
     only_one_thread()
     done = {row["seed"] for row in rows_in(args.json)}
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=spawn) as workers:
+    # The memory of freed images is not returned: each job has a process of its own.
+    with ProcessPoolExecutor(1, mp_context=spawn, max_tasks_per_child=1) as workers:
         for seed in range(args.first_seed, args.first_seed + args.jobs):
             if seed in done:
                 continue
