@@ -342,8 +342,10 @@ class LearnedMotion:
 
 def _samples(demonstration: Any) -> tuple[Tensor, Any]:
     """Times and values of one demonstration."""
-    if isinstance(demonstration, tuple | list) and len(demonstration) == 2:
-        time, values = demonstration
+    is_sequence = isinstance(demonstration, Sequence)
+    parts = tuple(demonstration) if is_sequence else ()
+    if len(parts) == 2:
+        time, values = parts
         if isinstance(values, Pose):
             return to_tensor(time), values
         values = to_tensor(values)
