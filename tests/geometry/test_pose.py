@@ -76,12 +76,14 @@ def test_whole_numbers_become_floats():
     assert masks.position.dtype == torch.bool
 
 
-def test_tables_become_tensors():
+def test_tables_and_lists_become_tensors():
     table = pd.DataFrame({"x": [0.1, 0.2], "y": [0.0, 0.0], "z": [0.5, 0.6]})
     with shapes_unchecked():
         pose = Pose(table, table.assign(w=1.0)[["w", "x", "x", "x"]])
     assert pose.position.tolist() == table.to_numpy().tolist()
     assert pose.orientation[:, 0].tolist() == [1.0, 1.0]
+    with shapes_unchecked():
+        assert Pose([1, 2, 3], (1, 0, 0, 0)).vector().tolist() == [1.0, 2.0, 3.0, 0, 0, 0]
 
 
 def test_goes_through_vmap_as_a_value():
