@@ -228,27 +228,34 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     )
 
 
-def tab_view(tab: Tab, span: tuple[float, float] | None = None) -> rrb.Grid:
-    """Layout of one tab, with the time span of its plots [s]; None: the newest data."""
-    columns = max(1, min(tab.columns, len(tab.plots)))
+def tab_view(tab: Tab, time: Float[np.ndarray, " time"] | None = None) -> rrb.Grid:
+    """Layout of one tab.
+
+    Args:
+        tab: The tab.
+        time: Times of its values [s]; the plots show the time from the first to the last finite
+            value of the tab. None: the newest data.
+    """
+    span = None
+    if time is not None:
+        values = [curves.values for plot in tab.plots for curves in plot.curves]
+        known = time[np.isfinite(np.concatenate(values, axis=1)).any(axis=1)]
+        span = known[[0, -1]].tolist() if len(known) > 1 else None
     return rrb.Grid(
         contents=[plot_view(plot, span) for plot in tab.plots],
-        grid_columns=columns,
+        grid_columns=max(1, min(tab.columns, len(tab.plots))),
         name=tab.title,
     )
 
 
-def plot_view(plot: Plot, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
-    """Layout of one plot; `span` as in `tab_view`."""
-    shown = None
-    if span is not None:
-        first, last = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in span)
-        shown = rrb.TimeAxis(view_range=rrb.TimeRange(first, last))
+def plot_view(plot: Plot, span: Sequence[float] | None = None) -> rrb.TimeSeriesView:
+    """Layout of one plot, with the first and last time that it shows [s]; None: newest data."""
+    ends = [rrb.TimeRangeBoundary.absolute(seconds=t) for t in span or ()]
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"/{curves.path}" for curves in plot.curves],
         name=plot.title,
-        axis_x=shown,
+        axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*ends)) if ends else None,
         axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
         # Most curves that need a legend begin low or at zero.
         plot_legend=rrb.PlotLegend("LeftTop", visible=plot.legend),

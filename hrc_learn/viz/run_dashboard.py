@@ -44,17 +44,17 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
 
     Args:
         run: The run.
-        finished: Plots show the whole run, not only the newest data.
+        finished: Plots show all data of their tab, not only the newest data.
     """
-    span = (float(run.time[0]), float(run.time[-1])) if finished and len(run.time) > 1 else None
-    scene = rrb.Spatial3DView(
-        origin="/world",
-        contents=["+ /world/**", "- /world/camera/image/**"],
-        name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
-        # Show only the path: if a distant camera were in view, the robot would be small.
-        eye_controls=frame_view(run.position),
-    )
-    left: list[rrb.View] = [scene]
+    left: list[rrb.View] = [
+        rrb.Spatial3DView(
+            origin="/world",
+            contents=["+ /world/**", "- /world/camera/image/**"],
+            name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
+            # Show only the path: if a distant camera were in view, the robot would be small.
+            eye_controls=frame_view(run.position),
+        )
+    ]
     if run.camera is not None:
         left.append(
             rrb.Spatial2DView(
@@ -66,7 +66,7 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
     tabs = run_tabs(run)
     if finished:
         tabs = [tab for tab in map(without_empty_plots, tabs) if tab.plots]
-    views = [tab_view(tab, span) for tab in tabs]
+    views = [tab_view(tab, run.time if finished else None) for tab in tabs]
     right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=views, active_tab=0)]
     if run.phases:
         # The text contains the time: a column of times would only make the text narrower.
@@ -216,10 +216,8 @@ class RunStream:
             when = seconds(np.array([phase.time for phase in new], dtype=float))
             # The viewer's own column of times is too narrow for decimals.
             texts = [f"{phase.time:.1f} s: {phase.text}" for phase in new]
-            levels = ["INFO"] * len(texts)
-            self._stream.send_columns(
-                "phases", when, rr.TextLog.columns(text=texts, level=levels)
-            )
+            columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))
+            self._stream.send_columns("phases", when, columns)
 
 
 def record_run(path: str | os.PathLike[str], run: RunRecording) -> None:

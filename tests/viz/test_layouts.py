@@ -67,6 +67,23 @@ def test_a_plot_has_its_range_its_legend_and_the_time_of_a_finished_run(span, ra
         assert ends == [round(1e9 * t) for t in span]
 
 
+def test_a_tab_shows_the_time_in_which_it_has_values():
+    time, values = np.arange(6.0), np.full((2, 6), np.nan)
+    values[0, 1:3], values[1, 2:5] = 1.0, np.inf
+    values[1, 3] = 2.0
+    plots = [Plot(title="t", curves=(single("a/b", "b", row, palette.RUN),)) for row in values]
+
+    def shown(plots, time):
+        for view in tab_view(Tab(title="tab", plots=tuple(plots)), time).contents:
+            axis = view.properties.get("TimeAxis")
+            (range_,) = [None] if axis is None else axis.view_range.as_arrow_array().to_pylist()
+            yield range_ and [range_[end] for end in ("start", "end")]
+
+    assert list(shown(plots, time)) == [[10**9, 3 * 10**9]] * 2
+    assert list(shown(plots, None)) == [None] * 2
+    assert list(shown(plots[1:], time)) == [None]  # one value spans no time
+
+
 @pytest.mark.parametrize(
     ("plots", "columns", "grid"), [(1, 3, 1), (3, 3, 3), (5, 2, 2), (0, 2, 1)]
 )
