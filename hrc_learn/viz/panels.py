@@ -61,7 +61,8 @@ def without_empty_plots(tab: Tab) -> Tab:
 _EFFORT = "Null-space effort d of the person, by joint [N m]"
 _ERROR = "Distance from feature to target [px]"
 _DEVIATION = "Deviation of the end effector, position [mm]"
-_WORKER = "Distance of the worker from the robot and its load [mm]"
+_WORKER = "Worker's distance from robot and load [mm]"
+_NEAR = "Worker's distance, enlarged [mm]"
 _STORY = (_ERROR, _EFFORT, _DEVIATION, _WORKER)
 """Plots of the overview, one for each topic."""
 
@@ -156,7 +157,7 @@ def person_plots(run: RunRecording) -> list[Plot]:
         title = "Followed fraction of the push [-]"
         plots.append(Plot(title=title, curves=(share,), range=(-0.05, 1.05)))
     if run.hindered:
-        title = "Reasons why the arm does not follow, or only in part"
+        title = "Reasons why the arm does not fully follow"
         plots.append(_rows("person/hindered", title, run.hindered))
     moved, turned = run.position_deviation, run.rotation_deviation
     turning = "Deviation of the end effector, rotation [deg]"
@@ -181,7 +182,7 @@ def worker_plots(run: RunRecording) -> list[Plot]:
     near = several("worker/near", run.worker_distance, np.where(values < 300, values, np.nan))
     return [
         Plot(title=_WORKER, curves=(distance,), legend=True),
-        Plot(title=f"{_WORKER}, below 300", curves=(near,), range=(-50.0, 300.0), legend=True),
+        Plot(title=_NEAR, curves=(near,), range=(-50.0, 300.0), legend=True),
     ]
 
 

@@ -61,7 +61,7 @@ def test_the_story_shows_one_plot_of_each_topic():
         np.testing.assert_array_equal(shown.values, details[path].values)
     bare = sample_run(camera=None, nullspace_input=None, position_deviation=None)
     (plot,) = run_tabs(bare)[0].plots
-    assert plot.title == "Distance of the worker from the robot and its load [mm]"
+    assert plot.title == "Worker's distance from robot and load [mm]"
 
 
 def test_each_curve_has_a_name_a_colour_and_a_path():
