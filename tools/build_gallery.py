@@ -121,8 +121,13 @@ PROGRAMS = (
     Program(
         heading="Placing",
         command="python tools/docs/experiments.py --pictures-only --placing outputs/placing",
-        pictures=_files("placing_{}.png", "paths", "null_space_posture"),
+        pictures=("placing_paths.png",),
         needs=("outputs/demo", "outputs/placing"),
+    ),
+    Program(
+        heading="Null-space posture",
+        command="python tools/docs/null_space_posture.py",
+        pictures=("null_space_posture.png",),
     ),
     Program(
         heading="Grasping",

@@ -1,5 +1,6 @@
 """The gallery: every picture of docs/images is made by one of its commands."""
 
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -8,12 +9,21 @@ sys.path.append(str(Path(__file__).parents[2] / "tools"))
 import build_gallery  # pyright: ignore[reportMissingImports]
 
 ROOT = Path(__file__).parents[2]
+NAMED = re.compile(r"\]\([^)\s]*images/([\w.-]+)\)")
+"""Picture that a page shows or links to."""
 PICTURES = [file for program in build_gallery.PROGRAMS for file in program.pictures]
 
 
 def test_every_picture_is_made_by_one_command():
     there = [path.name for path in (ROOT / "docs" / "images").iterdir()]
     assert sorted(PICTURES) == sorted(there)
+
+
+def test_every_picture_that_a_page_shows_is_made():
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    shown = {name: page for page in pages for name in NAMED.findall(page.read_text("utf-8"))}
+    assert shown
+    assert {name: page.name for name, page in shown.items() if name not in PICTURES} == {}
 
 
 def test_commands_are_programs_of_the_checkout():

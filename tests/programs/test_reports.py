@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import sys
 from io import BytesIO
 from pathlib import Path
@@ -12,6 +13,8 @@ from commands import done
 from PIL import Image
 from sample_runs import sample_run
 
+from hrc_learn.experiments import run_report
+from hrc_learn.viz import palette
 from hrc_learn.viz.film import film_mp4
 from hrc_learn.viz.report import (
     Measurement,
@@ -131,10 +134,39 @@ def test_pictures_alone_leave_the_table(runs, tmp_path, experiments):
     assert (tmp_path / "images" / "placing_paths.png").is_file()
 
 
-def test_pictures_are_those_of_all_pages_of_the_site(runs, tmp_path, experiments):
-    """The page of concepts shows those that the page of results does not."""
-    with pytest.raises(ValueError, match="'null_space_posture' of placing, but the report"):
-        experiments.main(experiments.Args(placing=runs[1], images=tmp_path))
+def test_pictures_are_those_of_all_pages_of_the_site(runs, tmp_path, experiments, monkeypatch):
+    """The page of concepts shows pictures that the page of results does not show."""
+    page, concepts = tmp_path / "benchmarks.md", tmp_path / "concepts.md"
+    page.write_text("no picture")
+    concepts.write_text("![posture](images/placing_posture.png)")
+    monkeypatch.setattr(experiments, "DOCS", tmp_path)
+    monkeypatch.setattr(experiments, "PAGE", page)
+    with pytest.raises(ValueError, match="'posture' of placing, but the report has paths"):
+        experiments.main(experiments.Args(placing=runs[1], page=page, images=tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["placing", "grasping", "collaboration"])
+def test_the_site_shows_only_pictures_that_reports_have(kind):
+    """Else `experiments.py` stops before it has made the others."""
+    pages = "\n".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
+    shown = {*re.findall(rf"images/{kind}_([\w-]+)\.png", pages)}
+    captions = {
+        name for section in run_report._TEXTS.section.values() for name in section.captions
+    }
+    assert shown
+    assert shown <= captions
+
+
+@pytest.mark.egl
+def test_the_picture_of_the_posture_shows_the_contact_with_the_door(tmp_path):
+    posture = load(ROOT / "tools" / "docs" / "null_space_posture.py")
+    posture.main(posture.Args(out=tmp_path / "posture.png"))
+    picture = np.asarray(Image.open(tmp_path / "posture.png").convert("RGB")).astype(int)
+    red = np.abs(picture - palette.rgba(palette.LIMIT)[:3]).max(axis=-1) < 12
+    height, width = red.shape
+    assert (height, width) == (posture.SIZE[1], 2 * posture.SIZE[0] + posture.GAP)
+    assert red[:, : posture.SIZE[0]].sum() > 100  # a circle around the contact
+    assert not red[:, posture.SIZE[0] :].any()
 
 
 def test_lines_keep_their_colours_beside_a_photograph(experiments):
