@@ -208,14 +208,5 @@ def _summary(shown: ShownDataset, rows: Iterable[Sequence[object]]) -> str:
     heads = ("episode", "task", "duration [s]", "frames", "path [m]")
     choose = "Choose the timeline of an episode in the time panel, at the bottom."
     notes = [f"- {note}" for note in shown.notes]
-    return "\n".join(
-        [
-            f"# {shown.title}",
-            "",
-            choose,
-            "",
-            *rerun_stream.markdown_table(heads, rows),
-            "",
-            *notes,
-        ]
-    )
+    table = rerun_stream.markdown_table(heads, rows)
+    return "\n".join([f"# {shown.title}", "", choose, "", *table, "", *notes])

@@ -25,7 +25,7 @@ from hrc_learn.log import JointRanges
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import DEMO_LOOK, JointCurves, joint_grid_figure
-from hrc_learn.viz.panels import Plot, Tab, joint_plot, joints_title, several, single, slug
+from hrc_learn.viz.panels import Plot, Tab, joint_plot, several, single, slug
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
 from hrc_learn.viz.rerun_stream import (
     dashboard,
@@ -131,7 +131,8 @@ def record_fit(path: str | os.PathLike[str], fit: ShownFit) -> None:
         name = "Paths: demonstrations (grey), reproductions (blue, dots: current position)"
         eye = frame_view(np.concatenate(every), base=False)
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
-    right = rrb.Tabs(contents=[tab_view(tab) for tab in tabs], active_tab=0)
+    views = [tab_view(tab, time) for tab, time in zip(tabs, fit.time, strict=False)]
+    right = rrb.Tabs(contents=views, active_tab=0)
     layout = dashboard(left, [right], row_shares=(1, 1), column_shares=(2, 3))
     with rrd_file(path, fit.title, layout) as stream:
         send_strips(stream, "world/demonstrations", fit.paths, palette.DEMO, 0.004)
@@ -166,7 +167,10 @@ def _fit_summary(fit: ShownFit) -> str:
         )
     ]
     heads = ("demonstration", "duration [s]", f"largest error [{_THOUSANDTHS[fit.unit]}]")
-    colours = joints_title(True, fit.limits is not None, position="reproduction")
+    # The plots are too small for legends.
+    colours = "Joints: reproduction blue, demonstration grey" + ", limits red" * bool(
+        fit.limits
+    )
     lines = [f"# {fit.title}", "", colours, "", *markdown_table(heads, rows)]
     if fit.residual:
         counts = [

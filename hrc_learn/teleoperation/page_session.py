@@ -259,7 +259,7 @@ class PageSession:
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)
         counts = self.arm.safety.counts.tolist()
         return PageStatus(
-            title=f"{'Simulated ' if self._jumps else ''}{self._workplace.robot.name}",
+            title=self._workplace.robot.name.capitalize() + " (simulated)" * self._jumps,
             **{**vars(status), "note": "; ".join(filter(None, notes))},
             interventions=dict(zip(INTERVENTIONS, counts, strict=True)),
             contacts=sum(len(monitor.touches) for monitor in monitors),

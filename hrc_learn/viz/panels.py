@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Shaped
@@ -52,13 +53,23 @@ class Tab:
     columns: int = 1
 
 
-def without_empty_plots(tab: Tab) -> Tab:
-    """Tab without its empty plots."""
-    seen = [p for p in tab.plots if any(np.isfinite(c.values).any() for c in p.curves)]
-    return replace(tab, plots=tuple(seen))
+def _with_values(tab: Tab) -> Tab:
+    """Tab without curves that have no value, and without plots that have no curve."""
+    plots = [
+        replace(p, curves=tuple(c for c in map(_filled, p.curves) if c.names))
+        for p in tab.plots
+    ]
+    return replace(tab, plots=tuple(plot for plot in plots if plot.curves))
 
 
-_EFFORT = "Null-space effort d of the person, by joint [N m]"
+def _filled(curves: Curves) -> Curves:
+    """Those of the curves that have a value."""
+    seen = np.asarray(np.isfinite(curves.values).any(axis=0))
+    names, colours = (tuple(compress(of, seen)) for of in (curves.names, curves.colours))
+    return replace(curves, names=names, colours=colours, values=curves.values[:, seen])
+
+
+_EFFORT = "Null-space effort d of the person, norm [N m]"
 _ERROR = "Distance from feature to target [px]"
 _DEVIATION = "Deviation of the end effector, position [mm]"
 _WORKER = "Worker's distance from robot and load [mm]"
@@ -67,17 +78,29 @@ _STORY = (_ERROR, _EFFORT, _DEVIATION, _WORKER)
 """Plots of the overview, one for each topic."""
 
 
-def run_tabs(run: RunRecording) -> list[Tab]:
-    """All tabs that the run has data for, an overview first."""
+def run_tabs(run: RunRecording, finished: bool = False) -> list[Tab]:
+    """All tabs that the run has data for, an overview first.
+
+    Args:
+        run: The run.
+        finished: Leave out curves without a value: none will come.
+    """
     tabs = [
         _servoing(run),
-        _person_and_worker(run),
+        Tab(title="Person", plots=tuple(person_plots(run)), columns=2),
+        Tab(title="Worker", plots=tuple(worker_plots(run))),
         _primitive(run),
         _safety(run),
         _lyapunov(run),
     ]
-    story = tuple(plot for tab in tabs for plot in tab.plots if plot.title in _STORY)
-    return [tab for tab in (Tab(title="Story", plots=story), *tabs) if tab.plots]
+    plots = {plot.title: plot for tab in tabs for plot in tab.plots}
+    if run.nullspace_input is not None:
+        norm = np.linalg.norm(run.nullspace_input, axis=1)
+        curve = single("person/effort_norm", "norm", norm, palette.PERSON)
+        plots[_EFFORT] = Plot(title=_EFFORT, curves=(curve,))
+    story = Tab(title="Story", plots=tuple(plots[t] for t in _STORY if t in plots))
+    tabs = [_with_values(tab) if finished else tab for tab in (story, *tabs)]
+    return [tab for tab in tabs if tab.plots]
 
 
 def _servoing(run: RunRecording) -> Tab:
@@ -88,6 +111,7 @@ def _servoing(run: RunRecording) -> Tab:
     parts = several("camera/error_uv", ("u (right)", "v (down)"), delta)
     plots = [
         Plot(title=_ERROR, curves=(error,)),
+        Plot(title="Distance to target, last 5 px [px]", curves=(error,), range=(0.0, 5.0)),
         Plot(title="Feature minus target [px]", curves=(parts,), legend=True),
         *image_jacobian_plots(run),
     ]
@@ -140,18 +164,13 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
     return Plot(title=title, curves=tuple(curves), legend=True)
 
 
-def _person_and_worker(run: RunRecording) -> Tab:
-    plots = (*person_plots(run), *worker_plots(run))
-    # In two columns: eight plots above one another are too low to be read.
-    return Tab(title="Person and worker", plots=plots, columns=2)
-
-
 def person_plots(run: RunRecording) -> list[Plot]:
     """Plots of what a person does, how far the arm follows, and how elbow and tool move."""
     plots = []
     if run.nullspace_input is not None:
         effort = several("person/effort", run.joint_names, run.nullspace_input)
-        plots.append(Plot(title=_EFFORT, curves=(effort,), legend=True))
+        title = "Null-space effort d of the person, by joint [N m]"
+        plots.append(Plot(title=title, curves=(effort,), legend=True))
     if run.followed is not None:
         share = single("person/followed", "fraction", run.followed, palette.TARGET)
         title = "Followed fraction of the push [-]"
@@ -197,11 +216,6 @@ def _primitive(run: RunRecording) -> Tab:
     plots[0] = replace(plots[0], legend=True)
     title = "Joints" if demo is None else "Primitive"
     return Tab(title=title, plots=tuple(plots), columns=2)
-
-
-def joints_title(demo: bool, limits: bool, position: str = "position") -> str:
-    """Title that explains the colours of `joint_plot`: its plots are too small for legends."""
-    return f"Joints: {position} blue" + ", demonstration grey" * demo + ", limits red" * limits
 
 
 def joint_plot(
@@ -260,7 +274,8 @@ def _rows(path: str, title: str, active: Mapping[str, np.ndarray], marks: bool =
     """Plot with a row for each name, which has a line or marks where its value is positive."""
     acted = [np.nan_to_num(np.asarray(on, dtype=float)) > 0 for on in active.values()]
     rows = np.column_stack([np.where(on, k, np.nan) for k, on in enumerate(acted, start=1)])
-    names = [name.replace("_", " ") for name in active]
+    # The number of a row in its name: the viewer writes no names along the axis.
+    names = [f"{k} {name.replace('_', ' ')}" for k, name in enumerate(active, start=1)]
     curves = replace(several(path, names, rows, width=4.0), marks=marks)
     span = 0.0, len(acted) + 1.0
     return Plot(title=title, curves=(curves,), range=span, legend=True, rows=True)

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
-from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -267,20 +266,16 @@ def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = 
     tables = [{m.name: m for m in report.table} for report in reports]
     common = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
     compared = [i for i, table in enumerate(tables) if table.keys() & set(common)]
-    return (
-        page_templates()
-        .get_template("report.html")
-        .render(
-            title=title,
-            reports=reports,
-            linked=linked if len(reports) == 1 else (),
-            common={name: [tables[i].get(name) for i in compared] for name in common},
-            compared=[i + 1 for i in compared],
-            style=files(__package__).joinpath("report.css").read_text(encoding="utf-8"),
-            base64=lambda content: base64.b64encode(content).decode("ascii"),
-            leading=leading,
-            flatten=flatten,
-        )
+    template = page_templates().get_template("report.html")
+    return template.render(
+        title=title,
+        reports=reports,
+        linked=linked if len(reports) == 1 else (),
+        common={name: [tables[i].get(name) for i in compared] for name in common},
+        compared=[i + 1 for i in compared],
+        base64=lambda content: base64.b64encode(content).decode("ascii"),
+        leading=leading,
+        flatten=flatten,
     )
 
 

@@ -1,8 +1,10 @@
 """Send data to Rerun: complete .rrd files, columns instead of single values, and layouts."""
 
+import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -101,15 +103,10 @@ def send_curves(
 
 def style(curves: Curves) -> rr.SeriesLines | rr.SeriesPoints:
     """Names, colours and widths of curves."""
+    names, colours, sizes = curves.names, curves.colours, [curves.width] * len(curves.names)
     if curves.marks:
-        return rr.SeriesPoints(
-            names=curves.names,
-            colors=curves.colours,
-            marker_sizes=[curves.width] * len(curves.names),
-        )
-    return rr.SeriesLines(
-        names=curves.names, colors=curves.colours, widths=[curves.width] * len(curves.names)
-    )
+        return rr.SeriesPoints(names=names, colors=colours, marker_sizes=sizes)
+    return rr.SeriesLines(names=names, colors=colours, widths=sizes)
 
 
 def send_rows(stream: rr.RecordingStream, index: list[rr.TimeColumn], curves: Curves) -> None:
@@ -157,14 +154,9 @@ def send_poses(
     timelines: Sequence[str] = (TIMELINE,),
 ) -> None:
     """Send the pose of a body at the chosen samples."""
-    stream.send_columns(
-        body_path(body),
-        seconds(time[at], timelines),
-        rr.Transform3D.columns(
-            translation=body.position[at],
-            quaternion=np.roll(body.orientation[at], -1, axis=-1),  # rerun: x, y, z, w
-        ),
-    )
+    orientation = np.roll(body.orientation[at], -1, axis=-1)  # rerun: x, y, z, w
+    poses = rr.Transform3D.columns(translation=body.position[at], quaternion=orientation)
+    stream.send_columns(body_path(body), seconds(time[at], timelines), poses)
 
 
 def send_strips(
@@ -228,24 +220,50 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     )
 
 
+_LEGEND = 0.22, 0.4
+"""Width of a legend relative to the curves, in tabs with one and with two columns."""
+_TICKS = 7
+"""Steps of an axis from which on the viewer labels every tenth step only."""
+
+
 def tab_view(tab: Tab, time: Float[np.ndarray, " time"] | None = None) -> rrb.Grid:
     """Layout of one tab.
 
     Args:
         tab: The tab.
-        time: Times of its values [s]; the plots show the time from the first to the last finite
-            value of the tab. None: the newest data.
+        time: Times of all its values [s]; the plots show the time from the first to the last
+            value that is finite and not 0, with legends to its right, and no plot has 0 as its
+            only labelled tick. None: values will be added, and the plots show the newest.
     """
-    span = None
+    span, plots = None, tab.plots
     if time is not None:
-        values = [curves.values for plot in tab.plots for curves in plot.curves]
-        known = time[np.isfinite(np.concatenate(values, axis=1)).any(axis=1)]
-        span = known[[0, -1]].tolist() if len(known) > 1 else None
+        values = np.hstack([curves.values for plot in plots for curves in plot.curves])
+        known = time[(np.isfinite(values) & (values != 0.0)).any(axis=1)]
+        if len(known) > 1:
+            legend = any(plot.legend for plot in plots) * _LEGEND[min(tab.columns, 2) - 1]
+            span = known[0], known[-1] + legend * (known[-1] - known[0])
+        plots = [_with_range(plot) for plot in plots]
     return rrb.Grid(
-        contents=[plot_view(plot, span) for plot in tab.plots],
+        contents=[plot_view(plot, span) for plot in plots],
         grid_columns=max(1, min(tab.columns, len(tab.plots))),
         name=tab.title,
     )
+
+
+def _with_range(plot: Plot) -> Plot:
+    """Plot with a range in which another tick than 0 has a label.
+
+    The viewer labels powers of ten and, if there is space, their tenths.
+    """
+    values = np.concatenate([curves.values.ravel() for curves in plot.curves])
+    values = values[np.isfinite(values)]
+    if plot.range is not None or len(values) == 0 or (extent := np.ptp(values)) == 0.0:
+        return plot
+    step = 1.05 * 10.0 ** math.ceil(math.log10(extent / _TICKS))
+    low, high = values.min(), values.max()
+    if max(-low, high) >= step:
+        return plot
+    return replace(plot, range=(-step if low < 0 else 0.0, step if high > 0 else 0.0))
 
 
 def plot_view(plot: Plot, span: Sequence[float] | None = None) -> rrb.TimeSeriesView:
@@ -257,8 +275,8 @@ def plot_view(plot: Plot, span: Sequence[float] | None = None) -> rrb.TimeSeries
         name=plot.title,
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*ends)) if ends else None,
         axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
-        # Most curves that need a legend begin low or at zero.
-        plot_legend=rrb.PlotLegend("LeftTop", visible=plot.legend),
+        # The newest data are at the right.
+        plot_legend=rrb.PlotLegend("RightTop" if ends else "LeftTop", visible=plot.legend),
     )
 
 
@@ -371,13 +389,9 @@ class CameraStream:
         self._still.send("world/camera", place, pinhole, key=key)
         new = camera.images[self._images :]
         if new:
-            self._stream.send_columns(
-                _ROOT,
-                seconds(camera.image_time[self._images :]),
-                rr.EncodedImage.columns(
-                    blob=[_jpeg(image) for image in new], media_type=["image/jpeg"] * len(new)
-                ),
-            )
+            index, kinds = seconds(camera.image_time[self._images :]), ["image/jpeg"] * len(new)
+            images = rr.EncodedImage.columns(blob=[*map(_jpeg, new)], media_type=kinds)
+            self._stream.send_columns(_ROOT, index, images)
         self._images += len(new)
 
     def send_overlays(
@@ -430,10 +444,8 @@ def _cross(pixel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2 2"]]:
     """Two strokes across a pixel; no strokes if there is no target."""
     if not np.isfinite(pixel).all():
         return []
-    return [
-        pixel + _CROSS * np.array([[-1, 0], [1, 0]]),
-        pixel + _CROSS * np.array([[0, -1], [0, 1]]),
-    ]
+    strokes = np.array([[[-1, 0], [1, 0]], [[0, -1], [0, 1]]])
+    return [*(pixel + _CROSS * strokes)]
 
 
 def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:

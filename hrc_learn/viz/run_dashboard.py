@@ -14,12 +14,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from jaxtyping import Bool, Float, Int, Shaped
+from rerun.blueprint.datatypes import TimelineColumn
 
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Plot, run_tabs, several, without_empty_plots
+from hrc_learn.viz.panels import Plot, run_tabs, several
 from hrc_learn.viz.rerun_stream import (
     POSE_RATE,
+    TIMELINE,
     CameraStream,
     StaticShapes,
     begin,
@@ -50,7 +52,8 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
         rrb.Spatial3DView(
             origin="/world",
             contents=["+ /world/**", "- /world/camera/image/**"],
-            name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
+            name="Robot: path of the run (blue), demonstration (grey), plan (orange), "
+            "region, gap to the worker (red)",
             # Show only the path: if a distant camera were in view, the robot would be small.
             eye_controls=frame_view(run.position),
         )
@@ -63,14 +66,12 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
                 contents=["$origin/**"],
             )
         )
-    tabs = run_tabs(run)
-    if finished:
-        tabs = [tab for tab in map(without_empty_plots, tabs) if tab.plots]
-    views = [tab_view(tab, run.time if finished else None) for tab in tabs]
+    views = [tab_view(tab, run.time if finished else None) for tab in run_tabs(run, finished)]
     right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=views, active_tab=0)]
     if run.phases:
         # The text contains the time: a column of times would only make the text narrower.
-        text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+        hidden = TimelineColumn(TIMELINE, visible=False)
+        text = rrb.TextLogColumns(timeline_columns=hidden, text_log_columns=["Body"])
         right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
     tabs_and_text = rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)])
     return dashboard(left, [tabs_and_text], row_shares=(3, 2))
@@ -167,7 +168,7 @@ class RunStream:
         if run.camera is not None:
             self._camera.send_overlays(time, run.camera, at, ends)
         # The overview shows curves of other tabs: each curve is sent once.
-        plots = [plot for tab in run_tabs(run) for plot in tab.plots]
+        plots = [plot for tab in run_tabs(run, self._finished) for plot in tab.plots]
         for curves in {c.path: c for plot in plots for c in plot.curves}.values():
             self._still.send(curves.path, style(curves), key=curves.names)
             new = replace(curves, values=curves.values[first:])

@@ -228,7 +228,7 @@ def test_the_simulated_arm_jumps_home_with_its_object_and_stops_recording(
 def test_the_status_guides_to_the_shelf_while_a_demonstration_is_open(session, screen, world):
     step = session.step()
     ready = session._status(step)
-    assert ready.title == "Simulated panda"
+    assert ready.title == "Panda (simulated)"
     assert ready.state == "ready"
     assert ready.note == ""
     assert list(ready.interventions) == list(INTERVENTIONS)

@@ -13,6 +13,11 @@ from hrc_learn.viz.report import Measurement, Report, flatten
 ROOT = Path(__file__).parents[2]
 
 
+def test_the_style_is_not_escaped():
+    """An escaped quote in a style ends it."""
+    assert '"Segoe UI"' in evidence_page([run()])
+
+
 def run(**changes):
     values = {
         "title": "A worker & an arm",

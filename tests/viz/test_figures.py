@@ -139,4 +139,5 @@ def test_reasons_stand_beside_their_rows_in_place_of_numbers():
     assert axes.get_legend() is None
     for line in axes.get_lines():
         heights = line.get_ydata()
-        assert set(heights[np.isfinite(heights)]) <= {named[line.get_label()]}
+        name = line.get_label().split(" ", 1)[1]  # without its number
+        assert set(heights[np.isfinite(heights)]) <= {named[name]}

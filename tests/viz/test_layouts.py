@@ -80,8 +80,50 @@ def test_a_tab_shows_the_time_in_which_it_has_values():
             yield range_ and [range_[end] for end in ("start", "end")]
 
     assert list(shown(plots, time)) == [[10**9, 3 * 10**9]] * 2
+    absent = Plot(title="t", curves=(single("a/b", "b", 0.0 * time, palette.RUN),))
+    assert list(shown([*plots, absent], time)) == [[10**9, 3 * 10**9]] * 3  # 0 is no action
     assert list(shown(plots, None)) == [None] * 2
     assert list(shown(plots[1:], time)) == [None]  # one value spans no time
+
+
+@pytest.mark.parametrize(("columns", "end"), [(1, 122), (2, 140)])
+def test_legends_stand_to_the_right_of_finished_curves(columns, end):
+    values = np.ones((101, 2))
+    plot = Plot(title="t", curves=(several("a", "bc", values),), legend=True)
+    tab = Tab(title="tab", plots=(plot, plot), columns=columns)
+    for view in tab_view(tab, np.arange(101.0)).contents:
+        (time,) = view.properties["TimeAxis"].view_range.as_arrow_array().to_pylist()
+        assert [round(1e-9 * time[side]) for side in ("start", "end")] == [0, end]
+        assert view.properties["PlotLegend"].corner.as_arrow_array().to_pylist() == [2]
+    for view in tab_view(tab).contents:  # the newest data are at the right
+        assert view.properties["PlotLegend"].corner.as_arrow_array().to_pylist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "range_"),
+    [
+        (0.0, 0.09, (0.0, 0.105)),  # tenths would be too dense to be labelled
+        (0.0, 0.9, (0.0, 1.05)),
+        (-6.5, 6.5, (-10.5, 10.5)),
+        (-0.9, 0.0, (-1.05, 0.0)),
+        (0.0, 3.0, None),  # labels at 1, 2, 3
+        (40.0, 1330.0, None),  # a label at 1000
+        (-2.9, 2.9, None),
+        (2.0, 2.0, None),
+    ],
+)
+def test_a_finished_plot_has_another_label_than_zero(low, high, range_):
+    values = np.array([low, np.nan, high])
+    plot = Plot(title="t", curves=(single("a", "b", values, palette.RUN),))
+    tab = Tab(title="tab", plots=(plot,))
+    (view,) = tab_view(tab, np.arange(3.0)).contents
+    shown = view.properties.get("ScalarAxis")
+    if range_ is None:
+        assert shown is None
+    else:
+        np.testing.assert_allclose(shown.range.as_arrow_array().to_pylist()[0], range_)
+    (view,) = tab_view(tab).contents
+    assert "ScalarAxis" not in view.properties
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def rrd(run, tmp_path_factory) -> Rrd:
 
 
 def test_every_curve_is_recorded_at_every_step(run, rrd):
-    every = [c for tab in run_tabs(run) for plot in tab.plots for c in plot.curves]
+    every = [c for tab in run_tabs(run, True) for plot in tab.plots for c in plot.curves]
     assert len(every) > 30
     for curves in every:
         np.testing.assert_array_equal(rrd.scalars(curves.path), curves.values)
@@ -68,7 +68,7 @@ def test_empty_plots_are_left_out_of_finished_runs():
     over, going_on = (names_of(run_layout(run, f).root_container) for f in (True, False))
     assert {elbow, lyapunov} <= going_on  # it may come
     assert not {elbow, lyapunov} & over
-    assert "Person and worker" in over
+    assert "Person" in over
     assert elbow in names_of(run_layout(sample_run()).root_container)
 
 

@@ -30,7 +30,7 @@ SIZE = (1600, 1000)
 """Of the window [px]."""
 WIDTH = 1200
 """Of the pictures, at which the viewer's text can still be read [px]."""
-TABS = ("Story", "Servoing", "Person and worker", "Primitive", "Safety", "Lyapunov")
+TABS = ("Story", "Servoing", "Person", "Worker", "Primitive", "Safety", "Lyapunov")
 """Of a run, as `run_tabs` names them."""
 LEFT, DOWN, LETTER, MARGIN = 800, 40, 6.5, 33
 """Where the viewer draws the row of a run's tabs, and how wide they are: a letter, and what is
@@ -39,7 +39,7 @@ PAUSES = 20
 """Most pauses of a viewer that still draws."""
 
 
-type Tab = Literal["story", "servoing", "person", "primitive", "safety", "lyapunov"]
+type Tab = Literal["story", "servoing", "person", "worker", "primitive", "safety", "lyapunov"]
 
 
 @dataclass(frozen=True, kw_only=True)
