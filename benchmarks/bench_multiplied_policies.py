@@ -1,10 +1,10 @@
-"""Policies learned from demonstrations that `hrc multiply` made of five, in MetaWorld.
+"""Policies learned from demonstrations that `hrc multiply` made of five, in public tasks.
 
 A policy learns from five demonstrations of the scripted expert (few), from these five
-multiplied without physics (multiplied), from these five multiplied and judged by MetaWorld
+multiplied without physics (multiplied), from these five multiplied and judged by the task
 (judged), or from a hundred demonstrations (many), for the same CPU time. It starts where no
-demonstration does, and MetaWorld decides. The user of `hrc multiply` states where objects and
-goals may be: where MetaWorld puts them. Every finished run is a line of `--runs`; runs that are
+demonstration does, and the task decides. The user of `hrc multiply` states where objects and
+goals may be: where the task puts them. Every finished run is a line of `--runs`; runs that are
 there already are not repeated. Needs tools/make_environments.sh.
 
     .venv-environments/bin/python benchmarks/bench_multiplied_policies.py
@@ -24,13 +24,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import bench_multiply_public as public
 import pyarrow.parquet as pq
 import torch
 from bench_environments import environments, successes
 from bench_policies import ACTION, ENVIRONMENT, STATE, Episode, learn
 from public_tasks.known import TASKS
-from public_tasks.metaworld import MetaWorld
+from public_tasks.multiplied import STAGES, judge_of
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
@@ -43,15 +42,12 @@ SETS = ("few", "multiplied", "judged", "many")
 SIZES = {"few": "few", "multiplied": "episodes", "judged": "episodes", "many": "many"}
 TOGETHER = 10
 """Environments that run side by side."""
-LONGEST = 500
-"""Actions after which an episode has failed, in MetaWorld and in LeRobot: multiplied motions
-keep the limits of the arm, which the expert does not, and take three times as long."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    tasks: tuple[str, ...] = ("metaworld-pick-place", "metaworld-push", "metaworld-coffee-push")
-    """Tasks of MetaWorld in public_tasks/known.py, with one object and a goal."""
+    tasks: tuple[str, ...] = tuple(STAGES)
+    """Tasks in public_tasks/multiplied.py."""
     policies: tuple[str, ...] = ("act", "motion_chunk")
     """LeRobot's own and ours."""
     sets: tuple[str, ...] = SETS
@@ -109,12 +105,12 @@ def main(args: Args) -> None:
 def measured(run: dict[str, Any], args: Args) -> dict[str, Any]:
     """Steps and time of the training, and the number of successful rollouts."""
     name = run["task"]
-    shown = episodes(name, run["set"], args)
+    shown, stage = episodes(name, run["set"], args), STAGES[name]()
     setting = TASKS[name]
     learned = learn(
         run["policy"],
         shown,
-        MetaWorld.fps,
+        stage.task.fps,
         minutes=args.minutes,
         chunk=setting.chunk,
         executed=setting.executed,
@@ -122,7 +118,7 @@ def measured(run: dict[str, Any], args: Args) -> dict[str, Any]:
     )
     begun = time.process_time()
     with environments(name, TOGETHER, moved=False) as vector:
-        vector.set_attr("_max_episode_steps", LONGEST)  # pyright: ignore[reportAttributeAccessIssue]
+        vector.set_attr("_max_episode_steps", stage.longest)  # pyright: ignore[reportAttributeAccessIssue]
         done = successes(vector, learned, args.rollouts)
     return {
         "frames": sum(len(e[ACTION]) for e in shown),
@@ -134,38 +130,31 @@ def measured(run: dict[str, Any], args: Args) -> dict[str, Any]:
 
 
 def episodes(name: str, chosen: str, args: Args) -> list[Episode]:
-    """Episodes of a set, in the columns that the policy sees in MetaWorld."""
-    folder = args.out / name
-    task = "".join(f"{word}-" for word in name.split("-")[1:]) + "v3"
+    """Episodes of a set, in the columns that the policy sees in the task."""
+    folder, stage = args.out / name, STAGES[name]()
     shown = folder / f"demonstrations_{args.many}"
     if not shown.exists():
-        public.record(MetaWorld(task), task, shown, args.many)
+        stage.record(shown, args.many, name)
     if SIZES[chosen] != "episodes":
-        return read(shown)[: args.few if chosen == "few" else args.many]
-    options = [f"multiply.demonstrations={[*range(args.few)]}", *ranges(task), *args.config]
-    judge = ""
-    if chosen == "judged":
-        judge = f"{public.__file__}:{task.removesuffix('-v3').replace('-', '_')}"
+        return [*map(stage.seen, read(shown)[: args.few if chosen == "few" else args.many])]
+    few = f"multiply.demonstrations={[*range(args.few)]}"
+    judge = judge_of(name) if chosen == "judged" else ""
     label = "_".join([chosen, *args.config]).replace("/", "")
     made = folder / f"{label}_{args.few}_{args.episodes}"
     command = Multiply(
-        dataset=shown, episodes=args.episodes, out=made, judge=judge, config=tuple(options)
+        dataset=shown,
+        episodes=args.episodes,
+        out=made,
+        judge=judge,
+        config=(few, *stage.ranges(), *args.config),
     )
     if not made.exists() and multiply(command):
         raise SystemExit(1)
-    return read(made)
-
-
-def ranges(task: str) -> Iterator[str]:
-    """Settings of where MetaWorld puts the object and the goal."""
-    space = MetaWorld(task)._env._random_reset_space
-    for k, name in enumerate(("object", "object", "goal", "goal", "goal")):
-        axis, number = ("x", "y", "x", "y", "z")[k], (0, 1, 3, 4, 5)[k]
-        yield f"objects.{name}.{axis}=[{space.low[number]},{space.high[number]}]"
+    return [*map(stage.seen, read(made))]
 
 
 def read(folder: Path) -> list[Episode]:
-    """Episodes of a dataset of `bench_multiply_public`, as MetaWorld shows them."""
+    """Observations and actions of a dataset, by episode."""
     rows = pq.read_table(sorted(folder.glob("data/*/*.parquet")))
     columns = {
         k: torch.tensor(rows.column(k).to_pylist()) for k in (STATE, ENVIRONMENT, ACTION)
@@ -173,12 +162,6 @@ def read(folder: Path) -> list[Episode]:
     lengths = torch.unique_consecutive(
         torch.tensor(rows.column("episode_index").to_pylist()), return_counts=True
     )[1]
-    things = columns[ENVIRONMENT]
-    absent = torch.zeros(len(things), 7)
-    columns[STATE] = columns[STATE][:, -4:]
-    columns[ENVIRONMENT] = torch.cat(
-        [things[:, :3], things[:, 3:7].roll(-1, -1), absent, things[:, 7:]], -1
-    )
     parts = {k: x.split(lengths.tolist()) for k, x in columns.items()}
     return [{k: x[n] for k, x in parts.items()} for n in range(len(lengths))]
 

@@ -62,6 +62,9 @@ TASKS = {
     "metaworld-coffee-push": Setting(
         make=partial(_metaworld, "coffee-push-v3"), chunk=24, executed=3
     ),
+    "metaworld-box-close": Setting(
+        make=partial(_metaworld, "box-close-v3"), chunk=24, executed=3
+    ),
     "so101-pick-place": Setting(make=_so101, chunk=16, executed=4),
     "grasping": Setting(make=_grasping, chunk=24, executed=12),
 }

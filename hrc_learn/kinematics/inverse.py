@@ -50,7 +50,9 @@ _TOLERANCE = 1e-9
 # Largest rotation between a wanted pose and its "nearest pose" [rad]: beyond it, the arm would
 # do another task.
 _MISSED_TURN = 0.6
-_CORRECTIONS = 2  # iterations of `_step` at each pose of a path
+# Iterations of `_step` at each pose of a path: for most arms, and for arms with fewer than six
+# joints, whose nearest orientation takes more.
+_CORRECTIONS, _FEW_JOINTS = 2, 4
 
 
 @dataclass(frozen=True)
@@ -234,12 +236,10 @@ def solve_inverse(
         if round_ == 0:
             start[:, 0] = best[missing]
         q = solutions_from(chain, goal[missing], start, task=task)
-        q = unwound(chain, q, wish[missing].unsqueeze(-2))
-        apart = torch.linalg.vector_norm(q - wish[missing].unsqueeze(-2), dim=-1)
-        apart = torch.where(apart.isnan(), torch.inf, apart)
+        q = unwound(chain, q, wish[missing, None])
+        apart = torch.linalg.vector_norm(q - wish[missing, None], dim=-1).nan_to_num(torch.inf)
         least = apart.min(-1)
-        each = torch.arange(len(missing), device=q.device)
-        chosen = q[each, least.indices]
+        chosen = q.take_along_dim(least.indices[:, None, None], dim=-2)[:, 0]
         good = least.values.isfinite()
         best[missing[good]], distance[missing[good]] = chosen[good], least.values[good]
     found = distance.isfinite()
@@ -305,11 +305,11 @@ def follow_poses(
     for k in range(len(path.position)):
         goal = _in_rows(path[k], rows)
         near = None if wish is None else wish[k].reshape(q.shape)
-        for _ in range(_CORRECTIONS):
+        for _ in range(_CORRECTIONS if start.shape[-1] >= 6 else _FEW_JOINTS):
             q, _ = _step(chain, goal, q, task, near)
-        left, _ = task_error_and_jacobian(chain, q, goal)
+        left = chain.forward(q).twist_to(goal).unflatten(-1, (2, 3))
         positions.append(q.reshape(start.shape))
-        errors.append(left.unflatten(-1, (2, 3)).norm(dim=-1).amax(-1).reshape(rows))
+        errors.append(left.norm(dim=-1).amax(-1).reshape(rows))
     return torch.stack(positions), torch.stack(errors)
 
 
@@ -326,24 +326,35 @@ def _step(
 ) -> tuple[Tensor, Tensor]:
     """Joint positions after one iteration, and the error before it [m, rad]."""
     error, J = task_error_and_jacobian(chain, q, goal, task)
-    missed = error[..., 3:]
-    if task == "nearest pose" and J.shape[-1] < 6:
+    missed, few = error[..., 3:], task == "nearest pose" and J.shape[-1] < 6
+    if few:
         basis = position_first(J)
         error, J = (basis @ error[..., None])[..., 0], basis @ J
     far = torch.linalg.vector_norm(missed, dim=-1, keepdim=True) > _MISSED_TURN
     weight = torch.ones_like(error[:1])
     weight[:, 3:] = _LEVER
     e, A = error * weight, J * weight[..., None]
-    damping = e.square().sum(-1)[:, None, None] + _BIAS
-    eye = torch.eye(A.shape[-2], dtype=q.dtype, device=q.device)
-    gram = A @ A.mT + damping * eye
-    dq = (A.mT @ torch.linalg.solve(gram, e[..., None]))[..., 0]
-    if wish is not None:
+    dq = _damped(A, e, e)
+    if wish is not None and not few:  # few joints have no null space
         away = wish - q
-        dq = dq + away - (A.mT @ torch.linalg.solve(gram, A @ away[..., None]))[..., 0]
+        dq = dq + away - _damped(A, (A @ away[..., None])[..., 0], e)
     if task == "nearest pose":
         error = torch.where(far, torch.inf, error)
-    return (q + dq).clamp(*_limits(chain, q)), error
+    after = (q + dq).clamp(*_limits(chain, q))
+    if few:
+        # Where joints stop at their limits, the other joints bring the tool to its position.
+        lever, free = A[..., :3, :], after == q + dq
+        rest = e[..., :3] - (lever @ (after - q)[..., None])[..., 0]
+        more = _damped(lever * free[..., None, :], rest, rest)
+        after = (after + more).clamp(*_limits(chain, q))
+    return after, error
+
+
+def _damped(A: Tensor, e: Tensor, error: Tensor) -> Tensor:
+    """Joint motion dq that solves A dq = e by least squares, damped by the squared error."""
+    damping = error.square().sum(-1)[:, None, None] + _BIAS
+    gram = A @ A.mT + damping * torch.eye(A.shape[-2], dtype=A.dtype, device=A.device)
+    return (A.mT @ torch.linalg.solve(gram, e[..., None]))[..., 0]
 
 
 def _limits(chain: SerialChain, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -395,9 +406,7 @@ def _drawn_nearer(
     for _ in range(15):  # each step removes most of the distance that null-space motion can
         moved, _ = _step(chain, goal, moved, task, wish)
     moved, reached = _descend(chain, goal, moved, task)
-    nearer = torch.linalg.vector_norm(moved - wish, dim=-1) < torch.linalg.vector_norm(
-        q - wish, dim=-1
-    )
+    nearer = (moved - wish).norm(dim=-1) < (q - wish).norm(dim=-1)
     return torch.where((reached & nearer)[:, None], moved, q)
 
 

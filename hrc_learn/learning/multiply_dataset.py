@@ -164,8 +164,7 @@ class MultipliedColumns:
         demos: Any = [*self._source]
         q = np.concatenate([self._taught.positions(demo.joint_position) for demo in demos])
         tool = self._taught.arm.forward(torch.from_numpy(q))
-        away = torch.from_numpy(np.concatenate([d.position for d in demos])) - tool.position
-        away = quaternion.rotate(quaternion.conjugate(tool.orientation), away)
+        away = tool.inverse().apply(np.concatenate([demo.position for demo in demos]))
         found = away.median(0).values
         if (apart := float((away - found).norm(dim=-1).median())) > _APART:
             arm, root = self._taught.arm.name, self._source.folder.root
@@ -349,8 +348,7 @@ class MultipliedColumns:
             objects: Pose of each object over time: position [m] and quaternion (w, x, y, z).
         """
         tool = self._robot.forward(torch.from_numpy(joints))
-        place = tool.position + quaternion.rotate(tool.orientation, self._tool)
-        tool = Pose(place, tool.orientation)
+        tool = Pose(tool.apply(self._tool), tool.orientation)
         made = {key: self._along(main, key, phase) for key in self._old}
         for key, i in self._gripper_commands:
             made[key][:, i] = self._along(main, key, self._gripper_phase(phase))[:, i]

@@ -379,9 +379,7 @@ class MotionSource:
                 scene = {name: pose[i] for name, pose in objects.items()}
                 local.append(frame_of(scene, frame, whole[0]).inverse() @ whole[part])
             times = [torch.from_numpy(d.time[p]) for d, p in zip(demos, parts, strict=True)]
-            body = None
-            if not fixed:
-                body = [q[part] for q, part in zip(near, parts, strict=True)]
+            body = None if fixed else [q[p] for q, p in zip(near, parts, strict=True)]
             shown = times, [p.position for p in local], [p.orientation for p in local]
             count = min(last - first for first, last in spans) // _PER_FUNCTION
             options: Any = {"n_basis": min(max(count, _FEWEST), _MOST), "smooth": True}

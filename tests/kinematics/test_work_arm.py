@@ -309,6 +309,25 @@ def test_joints_led_along_a_path_stay_on_it_and_move_steadily():
     torch.testing.assert_close(q[-1, 0], slow, atol=2e-3, rtol=0)
 
 
+@pytest.mark.skipif(find_spec("cmeel") is None, reason="example-robot-data is not installed")
+def test_five_joints_stay_on_a_path_where_one_of_them_stops_at_its_limit():
+    chain = registered("so101")
+    # The tool points down and moves outwards, until the wrist cannot bend any further.
+    start = torch.tensor([0.35, -0.15, 0.05, 1.6, 1.9], dtype=torch.float64)
+    begin = chain.forward(start)
+    share = torch.linspace(0, 1, 12, dtype=torch.float64)[:, None]
+    aside = torch.tensor([0.075, 0.0, 0.01], dtype=torch.float64)
+    path = Pose(begin.position + share * aside, begin.orientation.expand(12, 4))
+    q, _ = follow_poses(chain, path, start)
+    assert q[-1, 3] == pytest.approx(float(chain.limits.upper[3]))
+    missed = chain.forward(q).twist_to(path)
+    assert missed[:, :3].norm(dim=-1).max() < 1e-3  # 18 mm without a correction
+    assert 0.02 < missed[:, 3:].norm(dim=-1).max() < 0.3
+    # Without a null space, a wanted posture changes nothing.
+    wished, _ = follow_poses(chain, path, start, (q + 0.3).clone())
+    torch.testing.assert_close(wished, q, atol=0, rtol=0)
+
+
 def test_a_path_out_of_reach_is_not_followed():
     chain = bare(()).chain
     begin = chain.forward(chain.ready)
