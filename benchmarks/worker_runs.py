@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from torch.utils import _pytree
 from worker_job import JobCycle
 from worker_tables import Workers, WorkerTables
+from working_worker import WorkingWorkers
 
 from hrc_learn.controller import Distances, WayMakingConfig
 from hrc_learn.controller.arm_loop import ArmLoop
@@ -60,6 +62,47 @@ _STEP = 1e-4  # step of a difference quotient along a motion [s]
 _PARTS = 3  # number of spheres that cover a capsule in bounds of distances
 
 
+class Experts(Protocol):
+    """Experts who pull a joint of each arm."""
+
+    joint: int
+    """Number of this joint, counted from 1."""
+
+    def forces(
+        self, time: float, runs: Int[Tensor, " some"], at: Float[Tensor, "some 3"]
+    ) -> Float[Tensor, "some 3"]:
+        """Pulls at some of the arms [N], called at each control step.
+
+        Args:
+            time: Time [s].
+            runs: Numbers of the arms.
+            at: Positions of their joints [m].
+        """
+        ...
+
+
+class ScriptedExperts:
+    """Experts whose pulls are known beforehand, one for each arm."""
+
+    def __init__(self, pulls: Sequence[ScriptedForce]):
+        """Begin.
+
+        Args:
+            pulls: Pull at each arm, all at the same joint.
+        """
+        self._pulls, self.joint = pulls, pulls[0].joint
+
+    def forces(
+        self, time: float, runs: Int[Tensor, " some"], at: Float[Tensor, "some 3"]
+    ) -> Float[Tensor, "some 3"]:
+        """Pulls at some of the arms [N]; see `Experts`."""
+        force = torch.zeros_like(at)
+        for k, run in enumerate(runs.tolist()):
+            if self._pulls[run].strength(time):
+                force[k] = torch.from_numpy(self._pulls[run].force(time, at[k].numpy()))
+        return force
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Job:
     """Task of the arms, and the workers near them; the same for all reactions."""
@@ -71,11 +114,12 @@ class Job:
     """Different cycles of the job."""
     cycle: Int[Tensor, " runs"]
     """Index of the cycle of each arm."""
-    workers: WorkerTables
+    workers: WorkerTables | WorkingWorkers
+    """Workers who follow a script, or who react to their arm."""
     bodies: Sequence[WorkerConfig]
     """Sizes of the workers."""
-    pulls: Sequence[ScriptedForce]
-    """Pull of the expert at the elbow of each arm."""
+    experts: Experts
+    """Experts who pull the elbows."""
     encoder_offset: Float[Tensor, "runs joints"]
     """Offset of the encoders: measured minus true [rad]."""
     encoder_noise: Float[Tensor, "runs steps joints"]
@@ -270,6 +314,8 @@ class _Batch:
             self.found.unsolved[self.live] += ~report.safety.constraints.solved
         self.found.waited[self.live] += (1 - self._state.pace.people_scale) * self._config.dt
         self._move(step, command)
+        if isinstance(self._job.workers, WorkingWorkers):
+            self._job.workers.act(step, self._q)
         ended = self._state.path.finished
         if bool(ended.any()):
             self.found.cycle_time[self.live[ended]] = step * self._config.dt
@@ -420,20 +466,13 @@ class _Batch:
 
     def _pulled(self, step: int, measured: Tensor) -> Float[Tensor, "live joints"]:
         """Null-space input of the experts' pulls at the elbow [N m]."""
-        time, pulls = step * self._config.dt, self._job.pulls
-        d = torch.zeros_like(measured)
-        active = [k for k, run in enumerate(self.live.tolist()) if pulls[run].strength(time)]
-        if active:
-            joint = pulls[0].joint
-            origin = panda.joint_origins(measured[active])[:, joint - 1].numpy()
-            force = np.stack(
-                [
-                    pulls[int(self.live[k])].force(time, at)
-                    for k, at in zip(active, origin, strict=True)
-                ]
-            )
-            J = panda.joint_jacobian(measured[active], joint)[:, :3]
-            d[active] = (J.mT @ torch.from_numpy(force).unsqueeze(-1)).squeeze(-1)
+        experts = self._job.experts
+        origin = panda.joint_origins(measured)[:, experts.joint - 1]
+        force = experts.forces(step * self._config.dt, self.live, origin)
+        d, active = torch.zeros_like(measured), (force != 0).any(-1)
+        if bool(active.any()):
+            J = panda.joint_jacobian(measured[active], experts.joint)[:, :3]
+            d[active] = (J.mT @ force[active].unsqueeze(-1)).squeeze(-1)
         return d
 
     def _measure(self, step: int) -> None:
@@ -441,8 +480,7 @@ class _Batch:
         live, found, dt = self.live, self.found, self._config.dt
         q, v, tables = self._q[live], self._v[live], self._job.workers
         workers = tables.truth(step, live)
-        there = (step >= tables.first[live]) & (step < tables.first[live] + tables.rows[live])
-        found.present[live] += there * dt
+        found.present[live] += tables.present(step, live) * dt
         cycle, progress = self._progress()
         holding = self._holding[cycle, progress.long()]
         self._holds[live] = holding

@@ -32,7 +32,7 @@ from rich.progress import Progress
 from rich.table import Table
 from torch import Tensor
 from worker_job import JobCycle, random_cycles
-from worker_runs import Job, Reaction, WorkerRuns, run_near_workers
+from worker_runs import Job, Reaction, ScriptedExperts, WorkerRuns, run_near_workers
 from worker_tables import WorkerTables
 
 from hrc_learn import cli
@@ -264,7 +264,7 @@ def draw_job(
         cycle=torch.tensor([run % len(cycles) for run in runs]),
         workers=WorkerTables.of(visits, sizes, chances, dt),
         bodies=[visit.worker.config for visit in visits],
-        pulls=[expert_pull(visit) for visit in visits],
+        experts=ScriptedExperts([expert_pull(visit) for visit in visits]),
         encoder_offset=torch.from_numpy(np.stack(offset)),
         encoder_noise=torch.from_numpy(np.stack(noise)),
         sizes=sizes,
@@ -350,7 +350,8 @@ def measure_contacts(
     """Force and pressure of the contacts of each run, from an independent evaluation."""
     scene = job.workplace.scene
     for run, body in enumerate(job.bodies):
-        steps = min(len(trace), round(float(runs.cycle_time[run]) / dt)) if len(trace) else 0
+        # A cycle that has not ended lasts for ever.
+        steps = int((runs.cycle_time[run] / dt).round().clamp(max=len(trace)))
         number = torch.tensor([run])
         motion = Motion(
             dt=dt,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.protocols import PersonObservation
@@ -116,6 +116,11 @@ class WorkerTables:
             newest=torch.zeros(runs, round(_REPEATED / dt), dtype=torch.int64),
             observed=zero + round(_REPEATED / dt),
         )
+
+    def present(self, step: int, runs: Int[Tensor, " some"]) -> Bool[Tensor, " some"]:
+        """True during the visits."""
+        begin = self.first[runs]
+        return (step >= begin) & (step < begin + self.rows[runs])
 
     def truth(self, step: int, runs: Int[Tensor, " some"]) -> Workers:
         """Workers near some of the arms at a control step."""
