@@ -35,7 +35,7 @@ from hrc_learn.store import EXPORT, Claim, cache_home, replacing, write_json, wr
 
 
 def export_step(
-    controller: Steppable, observation: StepObservation, folder: Path | None = None
+    controller: Steppable, observation: StepObservation, folder: str | Path | None = None
 ) -> Path:
     """Compile the step of a controller, unless an equal one has been compiled before.
 
@@ -63,7 +63,7 @@ def export_step(
         UnknownOperationError: The step uses an operation of PyTorch for which there is no code.
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
-    folder = folder or cache_home() / "hrc_learn"
+    folder = Path(folder or cache_home() / "hrc_learn")
     step = PackedStep(controller, observation)
     try:
         key = content_hash(machine(), controller, _structure(observation))

@@ -118,7 +118,7 @@ class StepRunner:
 class PackageRunner(StepRunner):
     """A control step compiled ahead of time, which allocates no memory."""
 
-    def __init__(self, package: Path):
+    def __init__(self, package: str | Path):
         """Load machine code written by `export_step`, in milliseconds.
 
         Raises:
@@ -126,7 +126,7 @@ class PackageRunner(StepRunner):
             ValueError: The file was not written by this library, has changed since, or was
                 written for another machine.
         """
-        super().__init__(*load(package))
+        super().__init__(*load(Path(package)))
 
 
 @final
@@ -157,7 +157,7 @@ class EagerRunner(StepRunner):
 
 
 def open_step(
-    controller: Steppable, observation: StepObservation, folder: Path | None = None
+    controller: Steppable, observation: StepObservation, folder: str | Path | None = None
 ) -> StepRunner:
     """The fastest available runner: compiled, or uncompiled with a warning.
 

@@ -133,7 +133,7 @@ class MeshPart:
 
 
 @cache
-def read_mesh(path: Path) -> tuple[MeshPart, ...]:
+def read_mesh(path: str | Path) -> tuple[MeshPart, ...]:
     """Read the shape in a file; results are cached, so each file is read once.
 
     Args:
@@ -168,7 +168,7 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
     return tuple(parts)
 
 
-def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
+def mesh_points(path: str | Path) -> Float[np.ndarray, "points 3"]:
     """Corners of the triangles in a file that `read_mesh` reads [m].
 
     Raises:
@@ -178,7 +178,7 @@ def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
     return np.concatenate([mesh.vertices[np.unique(mesh.faces)] for mesh, _ in _meshes(path)])
 
 
-def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
+def _meshes(path: str | Path) -> list[tuple[Any, Colour | None]]:
     """Meshes in a file [m], each placed in the scene of the file, and with its colour."""
     try:
         import collada  # noqa: F401  # needed by trimesh for COLLADA

@@ -10,7 +10,6 @@ the demonstrated motion near the object.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -18,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.store import Radians, read_json, write_json
+from hrc_learn.store import JsonFile, Radians
 
 NEAR = 0.05
 """Length of the last part of a path [m]; the direction of this part is the tangent."""
@@ -77,7 +76,7 @@ def turn_about_vertical(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Approach:
+class Approach(JsonFile):
     """Orientation of the end effector in front of an object, from demonstrated approaches.
 
     Objects lie at any yaw, so the rotation about the vertical is removed: the orientation is
@@ -135,20 +134,6 @@ class Approach:
         turn = quaternion.exp(turned * axis / axis.norm().clamp(min=_SHORTEST))
         w, x, y, z = quaternion.multiply(turn, demonstrated).tolist()
         return cls(orientation_wxyz=(w, x, y, z), spread_rad=spread, turned_rad=turned)
-
-    def save(self, path: Path) -> None:
-        """Write the approach to a JSON file, completely or not at all."""
-        write_json(path, self)
-
-    @classmethod
-    def load(cls, path: Path) -> "Approach":
-        """Read what `save` wrote.
-
-        Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If the file holds no approach.
-        """
-        return read_json(path, cls, "fit it again")
 
 
 def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:

@@ -73,7 +73,7 @@ def keep_best(
     fitted: FittedPrimitives,
     demos: DemonstrationSet,
     columns: tuple[str, ...],
-    folder: Path,
+    folder: str | Path,
     *,
     regression_only: bool = False,
 ) -> dict[str, float]:
@@ -101,7 +101,7 @@ def keep_best(
             continue
         context = contexts(demos, columns, fitted.motions, channel) if columns else None
         best = choose([fitted.each[channel]], context, regression_only=regression_only)
-        best.save(folder / LEARNED / channel)
+        best.save(Path(folder, LEARNED, channel))
         chosen[channel] = best.chosen.kind
         for candidate in (*best.candidates, best.chosen):
             name = f"held_out_{channel}_{candidate.kind}_nrmse_median"
@@ -111,11 +111,11 @@ def keep_best(
     if regression_only and not chosen:
         raise ValueError("a regression on a context needs joint positions or tool positions.")
     if chosen:
-        write_json(folder / CHOICE, {"models": chosen, "context": columns})
+        write_json(Path(folder, CHOICE), {"models": chosen, "context": columns})
     return metrics
 
 
-def best_models(folder: Path) -> dict[str, str]:
+def best_models(folder: str | Path) -> dict[str, str]:
     """Kind of the best model by channel, without channels for which the mean primitive is best.
 
     Raises:
@@ -124,14 +124,14 @@ def best_models(folder: Path) -> dict[str, str]:
     return {k: v for k, v in _choice(folder).models.items() if v != "mean"}
 
 
-def _choice(folder: Path) -> _Choice:
-    path = folder / CHOICE
+def _choice(folder: str | Path) -> _Choice:
+    path = Path(folder, CHOICE)
     if not path.is_file():
         return _Choice(models={}, context=())
     return read_json(path, _Choice, "fit again")
 
 
-def predict(folder: Path, channel: str, motions: Motions, demos: DemonstrationSet) -> Any:
+def predict(folder: str | Path, channel: str, motions: Motions, demos: DemonstrationSet) -> Any:
     """Motions that the best model predicts from context, start, goal and duration.
 
     Args:
@@ -146,14 +146,14 @@ def predict(folder: Path, channel: str, motions: Motions, demos: DemonstrationSe
     """
     choice = _choice(folder)
     if channel not in choice.models:
-        return motions.adapted(channel, load_primitive(folder / channel, channel))
+        return motions.adapted(channel, load_primitive(Path(folder, channel), channel))
     context = contexts(demos, choice.context, motions, channel)
-    model = LearnedMotion.load(folder / LEARNED / channel)
+    model = LearnedMotion.load(Path(folder, LEARNED, channel))
     return motions.adapted(channel, cast(JointDMP, model.at_contexts(context)))
 
 
 def predicted_primitive(
-    folder: Path, channel: str, start: Float[Tensor, " D"], goal: Float[Tensor, " D"]
+    folder: str | Path, channel: str, start: Float[Tensor, " D"], goal: Float[Tensor, " D"]
 ) -> JointDMP:
     """Primitive that the best model predicts for one start and goal.
 
@@ -166,5 +166,5 @@ def predicted_primitive(
     """
     choice = _choice(folder)
     if channel not in choice.models or choice.context:
-        return cast(JointDMP, load_primitive(folder / channel, channel))
-    return LearnedMotion.load(folder / LEARNED / channel).at(start, goal)
+        return cast(JointDMP, load_primitive(Path(folder, channel), channel))
+    return LearnedMotion.load(Path(folder, LEARNED, channel)).at(start, goal)

@@ -198,7 +198,7 @@ def _naming(channel: str, joint_names: tuple[str, ...], joint_unit: str) -> dict
     return {"joint_names": ("x", "y", "z"), "units": "m"}
 
 
-def load_primitive(folder: Path, channel: str) -> Primitive:
+def load_primitive(folder: str | Path, channel: str) -> Primitive:
     """Load the primitive of a channel.
 
     Raises:
@@ -243,7 +243,7 @@ class FittedPrimitives:
     selection: BasisSelection | None = None
     """Selection of the number of basis functions; None if the number was given."""
 
-    def save(self, folder: Path, each: bool = False) -> None:
+    def save(self, folder: str | Path, each: bool = False) -> None:
         """Write the mean primitives to `folder/CHANNEL`.
 
         Args:
@@ -252,9 +252,9 @@ class FittedPrimitives:
                 `ProbabilisticDMP` is fitted, to `folder/each/CHANNEL`.
         """
         for channel, primitive in self.common.items():
-            primitive.save(folder / channel)
+            primitive.save(Path(folder, channel))
         for channel, primitives in self.each.items() if each else ():
-            primitives.save(folder / EACH / channel)
+            primitives.save(Path(folder, EACH, channel))
 
     def metrics(self) -> dict[str, float]:
         """Errors of the primitives, by name.

@@ -142,8 +142,8 @@ class CameraWatchStep(ProcessorStep):
 
 
 def add_camera_watch(
-    checkpoint: Path,
-    dataset: Path,
+    checkpoint: str | Path,
+    dataset: str | Path,
     image_size: tuple[int, int] = IMAGE_SIZE,
     *,
     correct: bool = False,
@@ -168,9 +168,9 @@ def add_camera_watch(
         ValueError: The dataset lacks a column, which the message names, or the object was not
             grasped where it was seen.
     """
-    path = checkpoint / PREPROCESSOR
+    path = Path(checkpoint, PREPROCESSOR)
     content = read_pipeline(path, without=(CAMERA_WATCH,))
-    info = read_info(dataset)
+    info = read_info(Path(dataset))
     names = flatten_names(info["features"].get(OBS_STATE, {}).get("names")) or ()
     index = {f"{name.removesuffix('.pos')}.pos": i for i, name in enumerate(names)}
     if missing := [name for name in (*HAND, *MARKER) if name not in index]:

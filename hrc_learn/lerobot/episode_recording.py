@@ -37,7 +37,7 @@ def observation_features(robot: ArmRobot) -> dict[str, dict]:
 
 
 @contextmanager
-def new_dataset(folder: Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
+def new_dataset(folder: str | Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
     """New dataset of a robot's observations and actions; the folder appears when complete.
 
     Args:
@@ -47,7 +47,7 @@ def new_dataset(folder: Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
     features = hw_to_dataset_features(robot.action_features, ACTION)
     with replacing(folder, DATASET) as new:
         dataset = LeRobotDataset.create(
-            f"local/{folder.name}",
+            f"local/{Path(folder).name}",
             round(1 / robot.dt),
             root=new,
             robot_type=robot.name,
@@ -78,7 +78,7 @@ def add_frame(
 
 
 def record_expert(
-    folder: Path, config: MujocoArmRobotConfig, episodes: int
+    folder: str | Path, config: MujocoArmRobotConfig, episodes: int
 ) -> Iterator[tuple[int, bool]]:
     """Record demonstrations of the scripted expert, as lerobot-record would.
 
@@ -134,7 +134,7 @@ wait for a person."""
 class CheckpointPolicy:
     """Any policy of LeRobot, from its checkpoint."""
 
-    def __init__(self, folder: Path, robot: ArmRobot):
+    def __init__(self, folder: str | Path, robot: ArmRobot):
         """Load a checkpoint.
 
         Args:
@@ -144,9 +144,10 @@ class CheckpointPolicy:
         Raises:
             FileNotFoundError: There is no checkpoint.
         """
-        if not (folder / "config.json").is_file():
+        file = Path(folder, "config.json")
+        if not file.is_file():
             raise FileNotFoundError(
-                f"there is no {folder / 'config.json'}: give the folder `pretrained_model` of "
+                f"there is no {file}: give the folder `pretrained_model` of "
                 "a LeRobot checkpoint."
             )
         config = PreTrainedConfig.from_pretrained(folder)
@@ -197,7 +198,7 @@ def roll_out(
 
 
 def record_rollouts(
-    folder: Path, policy: Path, config: MujocoArmRobotConfig, episodes: int
+    folder: str | Path, policy: str | Path, config: MujocoArmRobotConfig, episodes: int
 ) -> Iterator[bool]:
     """Roll a policy out and record it, successful or not.
 

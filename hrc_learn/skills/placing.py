@@ -226,7 +226,7 @@ class PlacingSkill:
     """Arm of the primitives."""
 
     @classmethod
-    def load(cls, folder: Path, robot: Arm) -> "PlacingSkill":
+    def load(cls, folder: str | Path, robot: Arm) -> "PlacingSkill":
         """Read the primitives written by `hrc fit`.
 
         Args:
@@ -237,6 +237,7 @@ class PlacingSkill:
             FileNotFoundError: The folder holds no primitives.
             ValueError: The primitives are for another arm, or lack a pose primitive.
         """
+        folder = Path(folder)
         joint = JointDMP.load(folder / "joint").double()
         names = robot.chain.joint_names
         if joint.joint_names != names:

@@ -17,7 +17,7 @@ from hrc_learn.jacobian.perspective import FOCAL
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.model_files import SavedModel, write_model
 from hrc_learn.skills.visual_target import VisualTarget, object_heading
-from hrc_learn.store import Radians, read_json, write_json
+from hrc_learn.store import JsonFile, Radians
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OBJECT_FEATURE = "observation.object_feature"
@@ -32,10 +32,12 @@ HALF_TURN = math.pi
 # A chosen turn is kept until it lies further than this outside the range of turns [rad]. This
 # is the error of an estimated turn while the camera is uncertain.
 _KEPT = 0.15
+# Files of target, approach and angle.
+_FILES = ("visual_target.json", "approach.json", "angle.json")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerAngle:
+class MarkerAngle(JsonFile):
     """Demonstrated turn of the end effector relative to the object's marker.
 
     The JSON file that `save` writes has the same fields.
@@ -106,20 +108,6 @@ class MarkerAngle:
         nearest = min(candidates, key=lambda c: (max(low - c, c - high, 0.0), abs(c - now)))
         return min(max(nearest, low), high)
 
-    def save(self, path: Path) -> None:
-        """Write a JSON file, atomically."""
-        write_json(path, self)
-
-    @classmethod
-    def load(cls, path: Path) -> "MarkerAngle":
-        """Read a saved turn.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: The file is damaged, or has an unknown version.
-        """
-        return read_json(path, cls, "fit it again")
-
 
 def _heading(orientation: Float[Tensor, "4"]) -> float:
     """Heading of a tool's x axis in the horizontal plane [rad]."""
@@ -147,30 +135,29 @@ class VisualServoSkill:
     cells: CellErrors | None = None
     """Held-out errors in each cell of a horizontal grid; None for a loaded skill."""
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: str | Path) -> None:
         """Write the image Jacobian and all other learned parts that are not None."""
+        folder = Path(folder)
         self.jacobian.save(folder / "jacobian")
-        if self.target is not None:
-            self.target.save(folder / "visual_target.json")
-        if self.approach is not None:
-            self.approach.save(folder / "approach.json")
-        if self.angle is not None:
-            self.angle.save(folder / "angle.json")
+        parts = self.target, self.approach, self.angle
+        for name, part in zip(_FILES, parts, strict=True):
+            if part is not None:
+                part.save(folder / name)
         if self.landmarks is not None:
             _write_landmarks(self.landmarks, folder / "landmarks")
 
     @classmethod
-    def load(cls, folder: Path) -> "VisualServoSkill":
+    def load(cls, folder: str | Path) -> "VisualServoSkill":
         """Read a saved skill.
 
         Raises:
             FileNotFoundError: There is no such folder or file.
             ValueError: A file has an unknown version or kind.
         """
-        target, approach = folder / "visual_target.json", folder / "approach.json"
-        angle, landmarks = folder / "angle.json", folder / "landmarks"
+        target, approach, angle = (Path(folder, name) for name in _FILES)
+        landmarks = Path(folder, "landmarks")
         return cls(
-            jacobian=RBFImageJacobian.load(folder / "jacobian"),
+            jacobian=RBFImageJacobian.load(Path(folder, "jacobian")),
             target=VisualTarget.load(target) if target.exists() else None,
             approach=Approach.load(approach) if approach.exists() else None,
             angle=MarkerAngle.load(angle) if angle.exists() else None,

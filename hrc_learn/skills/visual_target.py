@@ -141,13 +141,13 @@ class VisualTarget:
         metres = np.linalg.lstsq(image_jacobian[:, :2], apart.T, rcond=None)[0]
         return float(np.sqrt(cameras.weights.numpy() @ (metres**2).sum(0)))
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a JSON file, atomically."""
         x, y, z = self.offset.tolist()
         write_json(path, _TargetFile(offset_m=(x, y, z), error_px=self.error))
 
     @classmethod
-    def load(cls, path: Path) -> "VisualTarget":
+    def load(cls, path: str | Path) -> "VisualTarget":
         """Read a saved target.
 
         Raises:

@@ -49,6 +49,7 @@ from hrc_learn.store._reading import read_toml as read_toml
 from hrc_learn.store._writing import BusyError as BusyError
 from hrc_learn.store._writing import Claim as Claim
 from hrc_learn.store._writing import InTheWayError as InTheWayError
+from hrc_learn.store._writing import JsonFile as JsonFile
 from hrc_learn.store._writing import new_file as new_file
 from hrc_learn.store._writing import new_folder as new_folder
 from hrc_learn.store._writing import read_made_by as read_made_by

@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, ClassVar, TextIO
 
 from hrc_learn.store import _folder as disk
 from hrc_learn.store._folder import MADE_BY, MANIFEST, RESULTS, SUFFIX, Kind
@@ -434,6 +434,27 @@ def write_json(path: str | Path, content: object) -> None:
             become null, other objects become text.
     """
     write_text(path, json_text(content))
+
+
+class JsonFile:
+    """Base of a dataclass that is saved as one JSON file with the same fields."""
+
+    ADVICE: ClassVar[str] = "fit it again"
+    """Remedy for a damaged file, the end of the error message."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, completely or not at all."""
+        write_json(path, self)
+
+    @classmethod
+    def load[S: "JsonFile"](cls: type[S], path: str | Path) -> S:
+        """Read a file that `save` wrote.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: An entry is missing, of the wrong type, not finite or out of its range.
+        """
+        return read_json(path, cls, cls.ADVICE)
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +19,7 @@ from hrc_learn.demos.read.unit_evidence import STEP_IN_DEGREES, read_calibration
 from hrc_learn.kinematics.description import MOVING
 from hrc_learn.kinematics.urdf import read_urdf
 from hrc_learn.lerobot.policy.action_encoding import matched_columns
-from hrc_learn.store import Positive, read_json, write_json
+from hrc_learn.store import JsonFile, Positive
 
 _UNUSUAL = 0.999
 """Quantile of the differences used as a limit; single glitches do not count."""
@@ -31,7 +32,7 @@ type Range = tuple[float | None, float | None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActionLimits:
+class ActionLimits(JsonFile):
     """Limits of every value of an action, and the state column that measures the value.
 
     Limits are in the unit of the value.
@@ -39,6 +40,8 @@ class ActionLimits:
     Raises:
         ValueError: The lists differ in length, or a range is empty. `load` checks the rest.
     """
+
+    ADVICE: ClassVar[str] = "write the limits of actions again by hrc smooth --limits"
 
     names: list[str]
     fps: Positive
@@ -105,27 +108,13 @@ class ActionLimits:
             self, lower=[p[0] for p in pairs], upper=[p[1] for p in pairs], velocity=velocity
         )
 
-    def save(self, path: Path) -> None:
-        """Write a JSON file, atomically."""
-        write_json(path, self)
-
-    @classmethod
-    def load(cls, path: Path) -> ActionLimits:
-        """Read a file that `save` wrote.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: An entry is missing, of the wrong type, not finite or out of its range.
-        """
-        return read_json(path, cls, "write the limits of actions again by hrc smooth --limits")
-
 
 def gathered_limits(
-    dataset: Path,
+    dataset: str | Path,
     *,
     scale: float = 1.0,
-    urdf: Path | None = None,
-    calibration: Path | None = None,
+    urdf: str | Path | None = None,
+    calibration: str | Path | None = None,
     degrees: bool = False,
 ) -> ActionLimits:
     """Limits of the demonstrations, with limits of position and velocity from other sources.
@@ -163,7 +152,7 @@ def gathered_limits(
     return limits
 
 
-def _require_names(limits: ActionLimits, found: set[str], file: Path) -> None:
+def _require_names(limits: ActionLimits, found: set[str], file: str | Path) -> None:
     if found.isdisjoint(limits.names):
         raise ValueError(
             f"{file} names {', '.join(sorted(found))}, but the actions of the dataset are "
@@ -171,7 +160,7 @@ def _require_names(limits: ActionLimits, found: set[str], file: Path) -> None:
         )
 
 
-def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
+def demonstrated_limits(dataset: str | Path, scale: float = 1.0) -> ActionLimits:
     """Limits within which a policy moves at most as abruptly as its demonstrators did.
 
     Limits are the 99.9th percentiles of differences of the actions within episodes. Positions
@@ -220,7 +209,7 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
 
 
 def urdf_limits(
-    urdf: Path, *, degrees: bool = False
+    urdf: str | Path, *, degrees: bool = False
 ) -> tuple[dict[str, Range], dict[str, float]]:
     """Ranges and velocities of the joints of a URDF, named as LeRobot names their actions.
 
@@ -240,7 +229,7 @@ def urdf_limits(
     """
     ranges: dict[str, Range] = {}
     velocities: dict[str, float] = {}
-    for joint in read_urdf(urdf).joints:
+    for joint in read_urdf(Path(urdf)).joints:
         if joint.kind not in MOVING:
             continue
         unit = math.degrees(1) if degrees and joint.kind != "prismatic" else 1.0
@@ -254,7 +243,7 @@ def urdf_limits(
     return ranges, velocities
 
 
-def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, Range]:
+def calibrated_ranges(calibration: str | Path, *, degrees: bool = False) -> dict[str, Range]:
     """Ranges through which a robot's motors were moved when LeRobot calibrated the robot.
 
     Commands of the motor `gripper` are always 0 to 100, even with `degrees`.
@@ -272,7 +261,7 @@ def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, 
         ValueError: The file is no calibration.
     """
     ranges: dict[str, Range] = {}
-    for name, (span, _) in read_calibration(calibration).items():
+    for name, (span, _) in read_calibration(Path(calibration)).items():
         end = span / 2 * STEP_IN_DEGREES if degrees else 100.0
         ranges[f"{name}.pos"] = (0.0, 100.0) if name == "gripper" else (-end, end)
     return ranges

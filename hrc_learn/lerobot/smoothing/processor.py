@@ -277,7 +277,7 @@ ProcessorStepRegistry.register(WATCH)(WatchStateStep)
 ProcessorStepRegistry.register(SMOOTH)(SmoothActionsStep)
 
 
-def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
+def add_smoothing(checkpoint: str | Path, limits: ActionLimits) -> None:
     """Add smoothing of the actions to a trained policy's checkpoint.
 
     Steps from an earlier call are replaced. Weights and all other steps stay as they are.
@@ -290,6 +290,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
         FileNotFoundError: The folder holds no processors.
         ValueError: A processor cannot be read, or the limits do not fit the policy's actions.
     """
+    checkpoint = Path(checkpoint)
     _require_width(checkpoint, limits)
     before, after = (read_pipeline(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
     watch = {"registry_name": WATCH, "config": {}}
@@ -313,20 +314,20 @@ def _require_width(checkpoint: Path, limits: ActionLimits) -> None:
         )
 
 
-def remove_smoothing(checkpoint: Path) -> None:
+def remove_smoothing(checkpoint: str | Path) -> None:
     """Remove the steps of `add_smoothing`; raises the errors of `read_pipeline`."""
     for name in (PREPROCESSOR, POSTPROCESSOR):
-        write_json(checkpoint / name, read_pipeline(checkpoint / name))
+        write_json(Path(checkpoint, name), read_pipeline(Path(checkpoint, name)))
 
 
-def read_pipeline(path: Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[str, Any]:
+def read_pipeline(path: str | Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[str, Any]:
     """Settings of a processor pipeline without the steps of these names.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file cannot be read.
     """
-    if not path.is_file():
+    if not Path(path).is_file():
         raise FileNotFoundError(
             f"there is no {path}: give the folder `pretrained_model` of a LeRobot checkpoint."
         )
