@@ -7,7 +7,7 @@ limiting), each with an arm that does not use its null space, with an expert who
 away, with automatic way-making, and with both. The time of the team ends when both have done
 their work.
 
-    python benchmarks/complementarity_map.py --placing outputs/demo/placing \\
+    python benchmarks/complementarity_map.py --placing outputs/demo/placing \
         --aiming outputs/demo/aiming --results outputs/complementarity.jsonl
 """
 
@@ -18,8 +18,9 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -27,8 +28,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 from rich.table import Table
+from torch import Tensor
 from worker_job import JobCycle, random_cycles
 from worker_runs import Job, Reaction, run_near_workers
 from worker_study import MODES, Mode, WorkerStudyConfig, key, measure_contacts
@@ -85,7 +87,9 @@ class Args:
 def main(args: Args) -> None:
     """Run every reaction that is missing, and print the map."""
     torch.set_num_threads(1)
-    cells = [(place, pause) for place in args.places for pause in args.pauses]
+    cells: list[tuple[Where, float]] = [
+        (place, pause) for place in args.places for pause in args.pauses
+    ]
     reactions = {
         key(mode, person): Reaction(way_making=WayMakingConfig(mode=mode), mode=person)
         for person, mode in product(args.people, args.modes)
@@ -103,23 +107,37 @@ def main(args: Args) -> None:
             rng = np.random.default_rng([args.seed, 0, 1])
             drawn = random_cycles(workplace, placing, args.cycles, _REACH, rng, config.cell.dt)
             cycles = list(progress.track(drawn, args.cycles, description="planning"))
-            works = [
-                _work(workplace, *cell, [args.seed, run, number])
-                for number, cell in enumerate(cells)
-                for run in range(args.runs)
-            ]
+            works = draw_works(workplace, cells, args.runs, args.seed)
             for name in missing:
-                task = progress.add_task(name, total=1.0)
+                report = partial(_report, progress, progress.add_task(name, total=1.0))
                 job = make_job(workplace, cycles, works, config)
-                found = run_job(job, reactions[name], config, lambda f: progress.update(task, completed=f))
+                found = run_job(job, reactions[name], config, report)
                 line = {"reaction": name, "cells": cells, "runs": args.runs} | found
                 args.results.parent.mkdir(parents=True, exist_ok=True)
-                with args.results.open("a") as file:
+                with args.results.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(line) + "\n")
         done = _read(args.results)
     figures = show({name: done[name] for name in reactions}, cells, args.runs)
     if args.json is not None:
         cli.write_json(args.json, figures)
+
+
+def draw_works(
+    workplace: Workplace, cells: Sequence[tuple[Where, float]], runs: int, seed: int
+) -> list[Work]:
+    """Works of the runs of each cell, one cell after another.
+
+    Args:
+        workplace: Table, shelves and arm.
+        cells: Place of the parts, and time between two parts [s].
+        runs: Runs of each cell.
+        seed: Seed of all works.
+    """
+    return [
+        _work(workplace, *cell, [seed, run, number])
+        for number, cell in enumerate(cells)
+        for run in range(runs)
+    ]
 
 
 def _work(workplace: Workplace, place: Where, pause: float, seed: list[int]) -> Work:
@@ -161,10 +179,23 @@ def make_job(
     )
 
 
-def run_job(job: Job, reaction: Reaction, config: WorkerStudyConfig, report) -> dict:
-    """Let arms and workers work; lists with a number for each run."""
+def _report(progress: Progress, task: TaskID, fraction: float) -> None:
+    progress.update(task, completed=fraction)
+
+
+def run_job(
+    job: Job, reaction: Reaction, config: WorkerStudyConfig, report: Callable[[float], None]
+) -> dict[str, list[float]]:
+    """Let arms and workers work; lists with a number for each run.
+
+    Args:
+        job: Arms and workers at the beginning of the work.
+        reaction: Reaction of the arms to the workers.
+        config: Settings of the runs.
+        report: Called now and then with the fraction of the runs that have ended.
+    """
     assert isinstance(job.workers, WorkingWorkers)
-    trace = []
+    trace: list[tuple[Tensor, Tensor]] = []
     found = run_near_workers(job, reaction, config.cell, _LIMIT, report, trace)
     measure_contacts(job, trace, found, config.cell.dt)
     arm = found.cycle_time.clamp(max=_LIMIT)
@@ -187,7 +218,7 @@ def run_job(job: Job, reaction: Reaction, config: WorkerStudyConfig, report) -> 
 def _read(path: Path) -> dict[str, dict]:
     if not path.exists():
         return {}
-    lines = (json.loads(line) for line in path.read_text().splitlines())
+    lines = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
     return {line.pop("reaction"): line for line in lines}
 
 
@@ -213,12 +244,20 @@ def show(
         plain = {n: t for n, t in team.items() if n.startswith(("none", "stop"))}
         best = min(plain, key=lambda name: plain[name].mean())
         table = Table(
-            title=f"parts at the {place}, {pause:g} s between two, n = {runs}; best without null space: {best}"
+            title=f"parts at the {place}, {pause:g} s between two, n = {runs}; plain: {best}"
         )
         for title in (
-            "reaction", "team [s]", "shorter than best [%]", "arm [s]", "worker [s]",
-            "arm waited [s]", "worker waited [s]", "off path p95 [mm]", "least [mm]",
-            "violations", "over limit",
+            "reaction",
+            "team [s]",
+            "shorter than best [%]",
+            "arm [s]",
+            "worker [s]",
+            "arm waited [s]",
+            "worker waited [s]",
+            "off path p95 [mm]",
+            "least [mm]",
+            "violations",
+            "over limit",
         ):
             table.add_column(title)
         for name, found in results.items():
@@ -241,10 +280,17 @@ def show(
             }
             figures |= {f"{place}_{pause:g}_{name}_{k}": float(v) for k, v in row.items()}
             table.add_row(
-                name, f"{row['team_s']:.1f}", f"{100 * gain.mean():.1f} ({100 * low:.1f} to {100 * high:.1f})",
-                f"{row['arm_s']:.1f}", f"{row['worker_s']:.1f}", f"{row['arm_waited_s']:.1f}",
-                f"{row['worker_waited_s']:.1f}", f"{row['off_path_p95_mm']:.1f}",
-                f"{row['least_mm']:.0f}", str(row["violations"]), str(row["exceedances"]),
+                name,
+                f"{row['team_s']:.1f}",
+                f"{100 * gain.mean():.1f} ({100 * low:.1f} to {100 * high:.1f})",
+                f"{row['arm_s']:.1f}",
+                f"{row['worker_s']:.1f}",
+                f"{row['arm_waited_s']:.1f}",
+                f"{row['worker_waited_s']:.1f}",
+                f"{row['off_path_p95_mm']:.1f}",
+                f"{row['least_mm']:.0f}",
+                str(row["violations"]),
+                str(row["exceedances"]),
             )
         console.print(table)
     return figures

@@ -38,8 +38,9 @@ Where = Literal["hand", "forearm", "elbow", "beside"]
 elbow, or away from the arm."""
 PLACES: tuple[Where, ...] = ("hand", "forearm", "elbow", "beside")
 
-# Areas of the parts on the bench: least and greatest x and y [m]. At the bench, the elbow of
-# the Panda is above (-0.1 to 0.1, 0.1 to 0.3) m, the gripper above (0.24 +- 0.10, 0.54 +- 0.08).
+# Areas of the parts on the bench: least and greatest x and y [m]. While the Panda works at the
+# bench, its elbow is above (-0.1 to 0.1, 0.1 to 0.3) m, its gripper above (0.24 +- 0.10,
+# 0.54 +- 0.08) m.
 _AREAS: dict[Where, tuple[tuple[float, float], tuple[float, float]]] = {
     "hand": ((0.04, 0.44), (0.46, 0.62)),
     "forearm": ((0.00, 0.20), (0.30, 0.44)),
@@ -48,8 +49,8 @@ _AREAS: dict[Where, tuple[tuple[float, float], tuple[float, float]]] = {
 }
 # Half the width of the gripper with its load, within which no hand can work [m].
 _GRIPPER = 0.11
-# Step back from the end of the bench that is near the elbow [m]: closer workers block an arm that
-# keeps its distance for good.
+# Step back from the end of the bench that is near the elbow [m]: closer workers block an arm
+# that keeps its distance for good.
 _STEP_BACK = 0.25
 # Postures on the way of a hand that a worker looks at before reaching.
 _LOOKED_AT = (0.3, 0.5, 0.7, 0.85, 1.0)
@@ -59,8 +60,8 @@ _TRIES = 200
 # Interval at which a worker looks at the arm [s], and time of starting, stopping or reversing a
 # motion of the hand [s].
 _LOOKS, _TURNS = 0.1, 0.15
-# Clearance of the arm from the way to a part below which an expert acts [m]; delay [s], strength
-# [N] and rise [s] of the pull: as in worker_study.py and the paper's Experiment 3.
+# Clearance of the arm from the way to a part below which an expert acts [m]; delay [s],
+# strength [N] and rise [s] of the pull: as in worker_study.py and the paper's Experiment 3.
 _NOTICED, _EXPERT_DELAY, _PULL, _RAMP = 0.25, 0.4, 60.0, 0.4
 # Number of images over which the tracker averages velocities, as `WorkerSensor` does (0.1 s).
 _AVERAGED = 3
@@ -190,7 +191,9 @@ def _part(
         target = in_worker_frame(worker, stand, facing, point)
         if worker.lean_to(target, int(target[1] < 0)) is not None:
             return point
-    raise ValueError(f"a worker of {worker.config.stature:.2f} m cannot reach under the {where}.")
+    raise ValueError(
+        f"a worker of {worker.config.stature:.2f} m cannot reach under the {where}."
+    )
 
 
 class WorkingWorkers:
@@ -270,7 +273,9 @@ class WorkingWorkers:
         """Tabulate the postures on the way to each part that a worker looks at."""
         runs, most = self._spans.shape[:2]
         self._way_rows = torch.lerp(
-            self._spans[..., :1], self._spans[..., 1:2], torch.tensor(_LOOKED_AT, dtype=torch.float64)
+            self._spans[..., :1],
+            self._spans[..., 1:2],
+            torch.tensor(_LOOKED_AT, dtype=torch.float64),
         )
         rows = self._way_rows.round().long()
         every = torch.arange(runs)[:, None, None]
