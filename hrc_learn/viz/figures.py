@@ -68,6 +68,8 @@ def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
         axis.set_major_locator(MaxNLocator(5))
         axis.set_pane_color((1, 1, 1, 0))  # pyright: ignore[reportAttributeAccessIssue]
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axes.zaxis.set_rotate_label(False)  # it would be read from above
+    axes.zaxis.label.set_rotation(90)
     return axes
 
 

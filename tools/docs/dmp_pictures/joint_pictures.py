@@ -76,8 +76,8 @@ def approach(figure: Figure) -> None:
         where.plot(motion.time, motion.position[:, 0], color=colour, label=label)
         how.plot(motion.time, motion.acceleration[:, 0], color=colour, label=label)
     where.plot(2.0, goal[0], "s", color=palette.TARGET, ms=5)
-    where.set(xlabel="time [s]", ylabel="joint 1 [rad]", title="Way to a goal 0.8 rad on")
-    how.set(xlabel="time [s]", ylabel="acceleration [rad/s²]", title="What it takes")
+    where.set(xlabel="time [s]", ylabel="joint 1 [rad]", title="Joint, sent 0.8 rad farther")
+    how.set(xlabel="time [s]", ylabel="acceleration [rad/s²]", title="Its acceleration")
     how.legend(loc="upper right")
 
 

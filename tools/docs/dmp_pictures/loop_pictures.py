@@ -53,7 +53,7 @@ def goal_filter(figure: Figure) -> None:
         how.plot(t[1:-1], np.diff(path, 2) / DT**2, color=colour, label=label)
     where.plot(2.6, goal[0], "s", color=palette.TARGET, ms=5, clip_on=False)
     where.set(xlabel="time [s]", ylabel="joint [rad]", title="The goal jumps by 0.5 rad at 1 s")
-    how.set(xlabel="time [s]", ylabel="acceleration [rad/s²]", title="What the arm feels")
+    how.set(xlabel="time [s]", ylabel="acceleration [rad/s²]", title="Its acceleration")
     where.legend(loc="upper left")
 
 

@@ -80,9 +80,9 @@ def pose(figure: Figure) -> None:
     space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
     space.view_init(elev=22, azim=-62)
     space.locator_params(nbins=4)
-    space.set_title("Path of the hand with its frames", loc="left")
+    space.set_title("Path of the tool with its frames", loc="left")
     space.legend(loc="upper left")
-    over_time.set(xlabel="time [s]", ylabel="arm angle [rad]", title="The body keeps its shape")
+    over_time.set(xlabel="time [s]", ylabel="arm angle [rad]", title="Arm angle, the same for both")
 
 
 def _draw_frame(axes: Axes3D, position: torch.Tensor, rotation: torch.Tensor) -> None:
