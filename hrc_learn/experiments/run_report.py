@@ -34,7 +34,7 @@ from hrc_learn.viz.figures import (
     plots_figure,
     space,
 )
-from hrc_learn.viz.panels import image_jacobian_plots, person_plots, worker_plots
+from hrc_learn.viz.panels import image_jacobian_plots, person_plots, with_values, worker_plots
 from hrc_learn.viz.report import Picture, Section
 
 Spans = Mapping[str, tuple[float, float]]
@@ -114,7 +114,7 @@ def person_figure(run: RunRecording) -> Figure:
     present = acting
     if run.position_deviation is not None:  # known while a person is present
         present = acting | np.isfinite(run.position_deviation)
-    return plots_figure(run.time, person_plots(run), shown=present, shaded=acting)
+    return plots_figure(run.time, with_values(person_plots(run)), shown=present, shaded=acting)
 
 
 def image_jacobian_figure(run: RunRecording) -> Figure:

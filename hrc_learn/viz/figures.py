@@ -232,8 +232,8 @@ def plots_figure(
             axes.margins(x=0)
             handles, names = axes.get_legend_handles_labels()
             if plot.rows:
-                names = [name.split(" ", 1)[1] for name in names]  # without their numbers
-                axes.set_yticks(range(1, len(names) + 1), names, fontsize=7)
+                rows, names = zip(*(name.split(" ", 1) for name in names), strict=True)
+                axes.set_yticks([*map(int, rows)], names, fontsize=7)
             elif plot.legend:
                 once = dict(zip(names, handles, strict=True))  # names may be repeated
                 beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}

@@ -53,13 +53,13 @@ class Tab:
     columns: int = 1
 
 
-def _with_values(tab: Tab) -> Tab:
-    """Tab without curves that have no value, and without plots that have no curve."""
-    plots = [
-        replace(p, curves=tuple(c for c in map(_filled, p.curves) if c.names))
-        for p in tab.plots
+def with_values(plots: Iterable[Plot]) -> tuple[Plot, ...]:
+    """Plots without curves that have no value, and without plots that have no curve."""
+    filled = [
+        replace(plot, curves=tuple(c for c in map(_filled, plot.curves) if c.names))
+        for plot in plots
     ]
-    return replace(tab, plots=tuple(plot for plot in plots if plot.curves))
+    return tuple(plot for plot in filled if plot.curves)
 
 
 def _filled(curves: Curves) -> Curves:
@@ -98,8 +98,9 @@ def run_tabs(run: RunRecording, finished: bool = False) -> list[Tab]:
         norm = np.linalg.norm(run.nullspace_input, axis=1)
         curve = single("person/effort_norm", "norm", norm, palette.PERSON)
         plots[_EFFORT] = Plot(title=_EFFORT, curves=(curve,))
-    story = Tab(title="Story", plots=tuple(plots[t] for t in _STORY if t in plots))
-    tabs = [_with_values(tab) if finished else tab for tab in (story, *tabs)]
+    tabs.insert(0, Tab(title="Story", plots=tuple(plots[t] for t in _STORY if t in plots)))
+    if finished:
+        tabs = [replace(tab, plots=with_values(tab.plots)) for tab in tabs]
     return [tab for tab in tabs if tab.plots]
 
 

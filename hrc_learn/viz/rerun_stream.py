@@ -420,9 +420,8 @@ class CameraStream:
         self._still.send(f"{_ROOT}/feature", dot)
         # A sample without points removes the mark while the feature is not seen.
         columns = rr.Points2D.columns(positions=camera.feature[at][seen[at]])
-        self._stream.send_columns(
-            f"{_ROOT}/feature", seconds(time[at]), columns.partition(seen[at].astype(int))
-        )
+        marks = columns.partition(seen[at].astype(int))
+        self._stream.send_columns(f"{_ROOT}/feature", seconds(time[at]), marks)
 
     def _send_lines(
         self,

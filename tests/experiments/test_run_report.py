@@ -323,3 +323,24 @@ def test_joints_to_shelves_are_drawn_from_the_start_of_each_motion(placings):
         placed = run.placings["pose", shelf]
         np.testing.assert_array_equal(line.get_xdata(), placed.time)
         np.testing.assert_array_equal(line.get_ydata(), placed.joint_position[:, 0])
+
+
+def test_the_figure_of_a_person_has_no_empty_panels_and_no_empty_rows(run):
+    nothing = np.full(len(run.time), np.nan)
+    never = {"never": np.zeros(len(run.time), dtype=bool)}
+    often = {"joint_limit": ~never["never"], "person": ~never["never"]}
+    changed = replace(run, rotation_deviation=nothing, hindered=never | often)
+    titles, fewer = (
+        [axes.get_title("left") for axes in person_figure(shown).axes]
+        for shown in (run, changed)
+    )
+    assert fewer == [title for title in titles if "rotation" not in title]
+    assert len(fewer) == len(titles) - 1
+    (reasons,) = (
+        axes
+        for axes in person_figure(changed).axes
+        if axes.get_title("left").startswith("Reasons")
+    )
+    named = [text.get_text() for text in reasons.get_yticklabels()]
+    assert named == ["joint limit", "person"]
+    assert reasons.get_yticks().tolist() == [2, 3]

@@ -82,7 +82,9 @@ def pose(figure: Figure) -> None:
     space.locator_params(nbins=4)
     space.set_title("Path of the tool with its frames", loc="left")
     space.legend(loc="upper left")
-    over_time.set(xlabel="time [s]", ylabel="arm angle [rad]", title="Arm angle, the same for both")
+    over_time.set(
+        xlabel="time [s]", ylabel="arm angle [rad]", title="Arm angle, the same for both"
+    )
 
 
 def _draw_frame(axes: Axes3D, position: torch.Tensor, rotation: torch.Tensor) -> None:
