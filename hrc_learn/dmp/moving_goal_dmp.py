@@ -87,9 +87,12 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         """Wrap a joint primitive.
 
         Raises:
+            TypeError: Another kind of primitive.
             ValueError: Its scaling depends on start and goal, which the moving frame changes.
         """
         super().__init__()
+        if not isinstance(motion, JointDMP):
+            raise TypeError(f"a moving goal needs a JointDMP, got {type(motion).__name__}")
         if motion.forcing_scale.depends_on_boundary:
             raise ValueError("a moving goal needs a scaling independent of start and goal")
         self.motion = motion

@@ -163,8 +163,12 @@ class ProbabilisticDMP[P: MotionPrimitive]:
                 combination of the demonstrations.
 
         Raises:
+            TypeError: Not primitives, but a list of them or demonstrations.
             ValueError: Fewer than two primitives, or a scaling other than `"none"`.
         """
+        if not isinstance(primitives, MotionPrimitive):
+            text = "needs a batch of primitives: JointDMP.fit(times, positions, scaling='none')"
+            raise TypeError(f"ProbabilisticDMP.fit {text}, got {type(primitives).__name__}")
         batch = primitives.motion.weights.shape[:-2]
         if batch.numel() < 2:
             raise ValueError("a distribution needs a batch of at least 2 primitives")

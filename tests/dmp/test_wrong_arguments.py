@@ -12,6 +12,7 @@ from hrc_learn.dmp import (
     Frames,
     JointDMP,
     MotionHead,
+    MovingGoalDMP,
     OrientationDMP,
     PoseDMP,
     ProbabilisticDMP,
@@ -137,6 +138,17 @@ def distribution():
 
 
 REFUSED = [
+    (
+        lambda: ProbabilisticDMP.fit(TIME, POSITION),  # pyright: ignore
+        TypeError,
+        "a batch of primitives.*Tensor",
+    ),
+    (lambda: ProbabilisticDMP.fit([JointDMP.fit(TIME, POSITION)]), TypeError, "got list"),
+    (
+        lambda: MovingGoalDMP(OrientationDMP.fit(*turning_motion(), 8)),  # pyright: ignore[reportArgumentType]
+        TypeError,
+        "needs a JointDMP, got OrientationDMP",
+    ),
     (lambda: JointDMP.fit(TIME, POSITION, 8)[0], TypeError, "a single primitive cannot be ind"),
     (
         lambda: JointDMP.fit(TIME, POSITION, 8).condition(
