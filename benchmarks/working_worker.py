@@ -33,10 +33,10 @@ from hrc_learn.sim.worker_visit import (
 )
 from hrc_learn.sim.workplace import Workplace
 
-Where = Literal["hand", "forearm", "elbow", "beside"]
+Where = Literal["hand", "forearm", "elbow", "across", "beside"]
 """Place of the parts: beside the gripper that works at the bench, under the forearm, under the
-elbow, or away from the arm."""
-PLACES: tuple[Where, ...] = ("hand", "forearm", "elbow", "beside")
+elbow, across the bench seen from its end near the elbow, or away from the arm."""
+PLACES: tuple[Where, ...] = ("hand", "forearm", "elbow", "across", "beside")
 
 # Areas of the parts on the bench: least and greatest x and y [m]. While the Panda works at the
 # bench, its elbow is above (-0.1 to 0.1, 0.1 to 0.3) m, its gripper above (0.24 +- 0.10,
@@ -45,6 +45,7 @@ _AREAS: dict[Where, tuple[tuple[float, float], tuple[float, float]]] = {
     "hand": ((0.04, 0.44), (0.46, 0.62)),
     "forearm": ((0.00, 0.20), (0.30, 0.44)),
     "elbow": ((-0.08, 0.10), (0.23, 0.36)),
+    "across": ((0.02, 0.36), (0.40, 0.56)),
     "beside": ((0.45, 0.62), (0.66, 0.80)),
 }
 # Half the width of the gripper with its load, within which no hand can work [m].
@@ -124,11 +125,11 @@ def draw_work(
     """
     worker, table = Worker(WorkerConfig.draw(rng)), workplace.scene.table
     h, top = worker.config.stature, table.centre[2] + table.half_size[2]
-    from_side = where == "elbow"
+    from_side = where in ("elbow", "across")
     away = 0.1 * h + rng.uniform(0, 0.05)
     area = np.array(_AREAS[where])
     if from_side:
-        away += _STEP_BACK
+        away += _STEP_BACK if where == "elbow" else 0.0
         stand = np.array([table.centre[0] - table.half_size[0] - away, area[1].mean()])
         facing = rng.uniform(-0.15, 0.15)
     else:
