@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from posture_plans import planned_cycles
 from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
@@ -47,6 +48,8 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 # Largest distance of the object from the middle of the table, along x and y [m]: as in
 # worker_study.py.
 _REACH = (0.10, 0.08)
+# Speeds of arm and worker towards each other whose protective distance plans keep [m/s].
+_ARM, _WORKER = 0.1, 1.0
 # Readings of the encoders after which their noise repeats.
 _READINGS = 1000
 # The longest time of a run [s]: several cycles.
@@ -76,6 +79,9 @@ class Args:
     """Reactions to people."""
     modes: tuple[Mode, ...] = MODES
     """Sources of null-space motion."""
+    planned: bool = True
+    """Also plan postures that avoid the parts of each worker, as a bound: the planner knows
+    where they are."""
     stop_distances: tuple[float, ...] = (0.2,)
     """Distances within which arms without another reaction stop and wait [m]."""
     results: Path = Path("outputs/complementarity.jsonl")
@@ -95,6 +101,11 @@ def main(args: Args) -> None:
         for person, mode in product(args.people, args.modes)
     }
     still = WayMakingConfig(mode="none")
+    if args.planned:
+        reactions |= {
+            f"planned_{person}": Reaction(way_making=still, mode=person)
+            for person in args.people
+        }
     for distance in args.stop_distances:
         reactions[f"stop_{distance:g}"] = Reaction(way_making=still, stop_distance=distance)
     done = _read(args.results)
@@ -110,7 +121,7 @@ def main(args: Args) -> None:
             works = draw_works(workplace, cells, args.runs, args.seed)
             for name in missing:
                 report = partial(_report, progress, progress.add_task(name, total=1.0))
-                job = make_job(workplace, cycles, works, config)
+                job = make_job(workplace, cycles, works, config, name.startswith("planned"))
                 found = run_job(job, reactions[name], config, report)
                 line = {"reaction": name, "cells": cells, "runs": args.runs} | found
                 args.results.parent.mkdir(parents=True, exist_ok=True)
@@ -156,9 +167,22 @@ def make_job(
     cycles: Sequence[JobCycle],
     works: Sequence[Work],
     config: WorkerStudyConfig,
+    planned: bool = False,
 ) -> Job:
-    """Arms with their workers at the beginning of the work."""
+    """Arms with their workers at the beginning of the work.
+
+    Args:
+        workplace: Table, shelves and arm.
+        cycles: Cycles of the job, done in turn.
+        works: Work near each arm.
+        config: Settings of the runs.
+        planned: True to plan postures that avoid the parts of each worker.
+    """
     sizes, dt, arm = config.imperfections, config.cell.dt, whole_arm(workplace.scene.arm)
+    if planned:
+        slow, fast = torch.tensor([[_ARM], [_WORKER]], dtype=torch.float64)
+        kept = sizes.plant(config.cell.safety).separation.protective_distance(slow, fast)
+        cycles = planned_cycles(workplace, arm, cycles, works, float(kept))
     workers = WorkingWorkers(works, sizes, arm, dt, config.seed)
     offset, noise = [], []
     for run in range(len(works)):

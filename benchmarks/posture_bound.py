@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
+from posture_plans import FIRST_MOVING, TURNS, all_postures
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -31,8 +32,7 @@ from worker_job import random_cycles
 from worker_study import WorkerStudyConfig
 
 from hrc_learn import cli
-from hrc_learn.kinematics import CapsuleArm, panda, separation
-from hrc_learn.kinematics.inverse import arm_angle_and_motion
+from hrc_learn.kinematics import CapsuleArm, separation
 from hrc_learn.sim import Worker, whole_arm
 from hrc_learn.sim.worker import Posture
 from hrc_learn.sim.worker_visit import HAND_OVER_BENCH, in_worker_frame
@@ -42,16 +42,8 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_file
 from hrc_learn.viz.figures import STYLE, WIDTH
 
-# Change of the arm angle between two postures [rad], and number of such steps to either side.
-_TURN, _TURNS = 0.06, 24
-# Clearance of the arm from furniture and from itself that a posture must keep [m].
-_CLEAR = 0.01
-# Error of a tool after self-motion above which a posture does not count [m].
-_EXACT = 1e-3
 # Speed of the arm [m/s], and speeds of the worker towards it [m/s].
 _SLOW, _SPEEDS = 0.1, (0.0, 1.0)
-# First link whose distance from a worker changes noticeably: the upper arm.
-_FIRST_MOVING = 2
 # Interval between two moments of a cycle [s].
 _EVERY = 0.5
 # Spacing of the points on the bench, and their distance from its edges [m].
@@ -109,33 +101,6 @@ def main(args: Args) -> None:
             draw(grid[..., -1, :], x, y).savefig(part, dpi=150)
     if args.json is not None:
         cli.write_json(args.json, figures)
-
-
-def all_postures(
-    workplace: Workplace, q: Float[Tensor, "moments 7"]
-) -> tuple[Float[Tensor, "postures moments 7"], Bool[Tensor, "postures moments"]]:
-    """Postures with the same pose of the tool, the given one first, and which of them are
-    possible.
-    """
-    pose = panda.forward(q)
-    found = [q]
-    for sign in (1.0, -1.0):
-        now = q
-        for _ in range(_TURNS):
-            _, motion = arm_angle_and_motion(panda, now, panda.jacobian(now))
-            now = now + sign * _TURN * motion
-            for _ in range(2):  # back to the tool's pose
-                reached, J = panda.forward_and_jacobian(now)
-                twist = reached.twist_to(pose).unsqueeze(-1)
-                now = now + torch.linalg.lstsq(J, twist, driver="gelsd").solution.squeeze(-1)
-            found.append(now)
-    postures = torch.stack(found)
-    lower, upper = panda.limits.lower, panda.limits.upper
-    valid = ((postures > lower) & (postures < upper)).all(-1)
-    valid &= (panda.forward(postures).position - pose.position).norm(dim=-1) < _EXACT
-    valid &= workplace.arm_clearance(postures) > _CLEAR
-    valid[0] = True
-    return postures, valid
 
 
 def workers_on_grid(
@@ -199,9 +164,9 @@ def blocked(
     """
     if bool(body.isnan().any()):
         return body.new_full((len(kept), 2), torch.nan)
-    moving = [k for k, link in enumerate(arm.links) if link >= _FIRST_MOVING]
+    moving = [k for k, link in enumerate(arm.links) if link >= FIRST_MOVING]
     distance = separation(arm, postures, body, radius).distance[..., moving, :].amin((-2, -1))
-    least = torch.stack([distance[0], distance.masked_fill(~valid, -torch.inf).amax(0)])
+    least = torch.stack([distance[TURNS], distance.masked_fill(~valid, -torch.inf).amax(0)])
     return (least < kept[:, None, None]).double().mean(-1)
 
 

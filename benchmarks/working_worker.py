@@ -52,7 +52,7 @@ _AREAS: dict[Where, tuple[tuple[float, float], tuple[float, float]]] = {
 _GRIPPER = 0.11
 # Step back from the end of the bench that is near the elbow [m]: closer workers block an arm
 # that keeps its distance for good.
-_STEP_BACK = 0.25
+_STEP_BACK = {"elbow": 0.25, "across": 0.12}
 # Postures on the way of a hand that a worker looks at before reaching.
 _LOOKED_AT = (0.3, 0.5, 0.7, 0.85, 1.0)
 # Body parts that a worker takes care of, besides those of the reaching arm.
@@ -125,11 +125,11 @@ def draw_work(
     """
     worker, table = Worker(WorkerConfig.draw(rng)), workplace.scene.table
     h, top = worker.config.stature, table.centre[2] + table.half_size[2]
-    from_side = where in ("elbow", "across")
+    from_side = where in _STEP_BACK
     away = 0.1 * h + rng.uniform(0, 0.05)
     area = np.array(_AREAS[where])
     if from_side:
-        away += _STEP_BACK if where == "elbow" else 0.0
+        away += _STEP_BACK[where]
         stand = np.array([table.centre[0] - table.half_size[0] - away, area[1].mean()])
         facing = rng.uniform(-0.15, 0.15)
     else:
