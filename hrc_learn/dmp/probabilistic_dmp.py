@@ -167,8 +167,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             ValueError: Fewer than two primitives, or a scaling other than `"none"`.
         """
         if not isinstance(primitives, MotionPrimitive):
-            text = "needs a batch of primitives: JointDMP.fit(times, positions, scaling='none')"
-            raise TypeError(f"ProbabilisticDMP.fit {text}, got {type(primitives).__name__}")
+            raise TypeError(f"fit primitives as one batch, got {type(primitives).__name__}")
         batch = primitives.motion.weights.shape[:-2]
         if batch.numel() < 2:
             raise ValueError("a distribution needs a batch of at least 2 primitives")

@@ -141,7 +141,7 @@ REFUSED = [
     (
         lambda: ProbabilisticDMP.fit(TIME, POSITION),  # pyright: ignore
         TypeError,
-        "a batch of primitives.*Tensor",
+        "fit primitives as one batch, got Tensor",
     ),
     (lambda: ProbabilisticDMP.fit([JointDMP.fit(TIME, POSITION)]), TypeError, "got list"),
     (
