@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from page_in_browser import chromium
 
 import hrc_learn.teleoperation
+from hrc_learn.viz.evidence import evidence_page
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, reports_page
 
 CLIENT = Path(hrc_learn.teleoperation.__file__).parent / "xr_client"
@@ -28,6 +29,7 @@ def report(title: str) -> Report:
     table = [
         Measurement(name="place error", value=4.3, unit="mm", target=5, claim="in a " * 20),
         Measurement(name="place tilt", value=9.0, unit="deg", target=3),
+        Measurement(name="separation violations", value=0, target=0),
         *(Measurement(name=f"further quantity {i}", value=i, unit="s") for i in range(9)),
     ]
     sections = [
@@ -52,12 +54,20 @@ def axe():
     return AXE.read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("runs", [1, 2])
-def test_reports_are_accessible_and_fit_a_phone(axe, runs, tmp_path):
-    page = tmp_path / "report.html"
-    content = reports_page("Runs", [report(f"Run {i}") for i in range(runs)])
+def written(folder: Path, runs: int, evidence: bool) -> Path:
+    """A page about this number of runs."""
+    reports = [report(f"Run {i}") for i in range(runs)]
+    page = folder / "report.html"
+    content = evidence_page(reports) if evidence else reports_page("Runs", reports)
     page.write_text(content, encoding="utf-8")
+    return page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("evidence", [False, True])
+@pytest.mark.parametrize("runs", [1, 2])
+def test_reports_are_accessible_and_fit_a_phone(axe, runs, evidence, tmp_path):
+    page = written(tmp_path, runs, evidence)
     with chromium(tmp_path / "profile") as tab:
         for width in (390, 820, 1280):
             for scheme in ("light", "dark"):
@@ -69,6 +79,21 @@ def test_reports_are_accessible_and_fit_a_phone(axe, runs, tmp_path):
                 tab.evaluate(axe)
                 found = tab.evaluate("axe.run()")["violations"]
                 assert [(v["id"], v["nodes"][0]["html"]) for v in found] == []
+
+
+def test_names_of_rows_and_options_are_not_broken(tmp_path):
+    lines = "e => { const r = document.createRange(); r.selectNodeContents(e); return " + (
+        "new Set([...r.getClientRects()].map(b => Math.round(b.top))).size }"
+    )
+    with chromium(tmp_path / "profile") as tab:
+        for width in (390, 820):
+            tab.set_viewport_size({"width": width, "height": 844})
+            tab.goto(written(tmp_path, 1, evidence=True).as_uri())
+            for name in ("Requirement", "Parameters", "Measured"):
+                row = tab.get_by_role("rowheader", name=name, exact=True).first
+                assert row.evaluate(lines) == 1, name
+            option = tab.locator("pre span", has_text="--out").first
+            assert option.evaluate(lines) == 1
 
 
 @pytest.fixture(scope="module")
