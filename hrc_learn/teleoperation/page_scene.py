@@ -90,7 +90,7 @@ class PageScene:
             turns: True if the end effector has a gizmo with rings even if it cannot be held.
         """
         self._scene, self._held, self._guides = server.scene, held, guides
-        self._twin = self._scene.add_frame("/twin", position=_TWIN_AT, show_axes=False)
+        self._twin = self._scene.add_frame("/twin", False, position=_TWIN_AT, visible=False)
         # Carried objects have no twin, as they cannot be held.
         self._frames = [
             [self._draw(parent, body) for parent in _PARENTS if not parent or _held(body)]
@@ -264,9 +264,8 @@ class PageScene:
         self._scene.add_grid(
             "/floor", width=6.0, height=6.0, cell_size=0.25, position=(0.0, 0.5, -0.72)
         )
-        server.initial_camera.position = _CAMERA
-        server.initial_camera.look_at = _LOOK_AT
-        server.initial_camera.fov = 0.9
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.fov = _CAMERA, _LOOK_AT, 0.9
         server.on_client_connect(_step_back)
 
     async def _gizmo_dragged(self, event: Any) -> None:

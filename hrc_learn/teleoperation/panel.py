@@ -19,7 +19,7 @@ from hrc_learn.teleoperation.gate import messages
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page_operator import HeldGizmos
 from hrc_learn.teleoperation.page_scene import PageScene, ViserServer, in_loop
-from hrc_learn.teleoperation.region_editor import RegionEditor
+from hrc_learn.teleoperation.region_editor import QUIET, RegionEditor
 from hrc_learn.viz import palette
 from hrc_learn.viz.report import page_templates
 
@@ -142,14 +142,14 @@ class Panel:
         with gui.add_folder("Arm"):
             if guides:
                 self._add_end_effector(scene, grip)
-            twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
+            twin = gui.add_checkbox("Virtual twin", False, hint="Hold it instead of the arm.")
             twin.on_update(in_loop(lambda _: scene.show_twin(twin.value)))
             self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
         self.editor: RegionEditor | None = None
         if draws:
             with gui.add_folder("Region, target and turn"):
                 self.editor = RegionEditor(server, boxes)
-                clear = gui.add_button("Clear the turn", color="gray")
+                clear = gui.add_button("Clear the turn", color=QUIET)
                 clear.on_click(in_loop(lambda _: held.clear_turn()))
                 self._turn_text = gui.add_markdown("")
         self._seen: Mapping[str, int] = {}

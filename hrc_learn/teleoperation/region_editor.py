@@ -109,6 +109,8 @@ FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.1
 
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
+QUIET = 73, 80, 87
+"""Colour of buttons that undo something, dark enough for white letters (8:1)."""
 _MARK: Any = "target"
 # Largest and smallest half sizes of a region [m]: the largest is the reach of the arm, the
 # smallest leaves a margin around a point.
@@ -181,7 +183,7 @@ class RegionEditor:
         mark = gui.add_button("Mark the target", icon=_MARK)
         click = self._scene.on_click, self._scene.remove_click_callback
         mark.on_click(in_loop(lambda _: _once(mark, *click, self._mark_above)))
-        clear = gui.add_button("Clear the target", color="gray")
+        clear = gui.add_button("Clear the target", color=QUIET)
         clear.on_click(in_loop(lambda _: self.mark(None)))
 
     def _add_nodes(self) -> None:

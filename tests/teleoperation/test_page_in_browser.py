@@ -124,6 +124,7 @@ def test_every_control_has_a_name_for_screen_readers(browser):
 
 @pytest.mark.slow
 def test_the_twin_is_held_as_the_arm_is(session, browser):
+    browser.tab.get_by_role("checkbox", name="Virtual twin").check()
     with browser.dragging(session.frame(4) + np.array(_TWIN_AT), by=(-50, 0)):
         wait_until(lambda: session.asked.nullspace_input.any(), "effort")
     wait_until(lambda: still(session), "rest")
