@@ -92,16 +92,13 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
         f"quaternion_{args.quaternion_order}": turn,
     }
     given = {name: words for name, words in fields.items() if words}
-    return replace(
-        said,
-        columns=said.columns | given,
-        units=said.units | args.units,
-        time=args.time or said.time,
-        joint_names=tuple(_words(args.joint_names)) or said.joint_names,
-        duration=said.duration if args.duration is None else args.duration,
-        fps=said.fps if args.fps is None else args.fps,
-        task=said.task if args.task is None else args.task,
-    )
+    chosen = {"duration": args.duration, "fps": args.fps, "task": args.task}
+    chosen |= {
+        "time": args.time or None,
+        "joint_names": tuple(_words(args.joint_names)) or None,
+    }
+    chosen = {name: value for name, value in chosen.items() if value is not None}
+    return replace(said, columns=said.columns | given, units=said.units | args.units, **chosen)
 
 
 def _words(values: Sequence[str]) -> list[str]:

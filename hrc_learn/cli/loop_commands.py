@@ -40,7 +40,7 @@ from hrc_learn.hardware import DriverError, ending_at_rest
 from hrc_learn.hardware.ros2_topics import found_description, ros2_origin
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import Arm, ArmChoice, SerialChain
-from hrc_learn.protocols import Human, OpenedArm
+from hrc_learn.protocols import OpenedArm
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
@@ -129,24 +129,20 @@ def page(args: ServePage) -> None:
     connect, safety = _access(args, settings.site, world, guiding.safety)
     if not args.drives_real_arm():
         world.hold(workplace.scene.objects[0].name, workplace.home_joints().numpy())
-    writer = DatasetWriter(
-        args.out,
-        fps=settings.session.fps,
-        robot_type=robot.name,
-        joint_names=robot.chain.joint_names,
-        features=FEATURES,
-        frames=robot.frame_names,
-    )
+    writer = DatasetWriter.of(robot, args.out, settings.session.fps, features=FEATURES)
     recorder = DemonstrationRecorder(writer, lambda: page.task, chain=robot.chain)
-    targets = place_targets(workplace)
+    forces = replace(settings.page.forces, level_at=workplace.level_at)
+    shown = replace(settings.page, forces=forces)
     try:
         # The recorder is closed last, so that an open demonstration is kept in any case.
         with recorder, connect() as opened:
             config = replace(settings.session, guiding=replace(guiding, safety=safety))
             with (
                 _opened_device(args.device, robot.chain) as devices,
-                Page(world, settings.page, boxes=targets, task=settings.task) as page,
+                Page(world, shown, boxes=place_targets(workplace), task=settings.task) as page,
             ):
+                for device in devices:
+                    device.forces = forces
                 session = PageSession(
                     workplace,
                     page,
@@ -180,7 +176,9 @@ def _announce(console: Console, page: Page) -> None:
 
 
 @contextmanager
-def _opened_device(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...]]:
+def _opened_device(
+    device: str, chain: SerialChain
+) -> Iterator[tuple[Gamepad | HapticDevice | TerminalKeyboard, ...]]:
     """The additional input device, if any."""
     if device == "haptic":
         with HapticDevice.open(chain) as haptic:

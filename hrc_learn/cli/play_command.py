@@ -138,13 +138,7 @@ def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -
     assert motion.position is not None
     assert motion.orientation is not None
     following = np.concatenate([motion.joints[1:], motion.joints[-1:]])
-    with DatasetWriter(
-        folder,
-        fps=round(1 / DT),
-        robot_type=robot.name,
-        joint_names=robot.chain.joint_names,
-        frames=robot.frame_names,
-    ) as writer:
+    with DatasetWriter.of(robot, folder, round(1 / DT)) as writer:
         writer.start_episode(f"played {args.model.name}")
         columns = motion.joints, motion.position, motion.orientation, following
         for q, p, R, sent in zip(*columns, strict=True):

@@ -173,15 +173,7 @@ def _write(
     robot = workplace.robot
     with (
         replacing(args.out, DATASET, args.overwrite) as folder,
-        DatasetWriter(
-            folder,
-            fps=fps,
-            robot_type=robot.name,
-            joint_names=robot.chain.joint_names,
-            features=features,
-            cameras=cameras,
-            frames=robot.frame_names,
-        ) as writer,
+        DatasetWriter.of(robot, folder, fps, features=features, cameras=cameras) as writer,
     ):
         for _ in track(
             range(args.episodes), description=f"Demonstrations of {args.demonstration}"
@@ -260,14 +252,9 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
     site = replace(settings.site, driver="lerobot")
     robot = ArmChoice(args.robot).arm()
     names, lerobot = robot.chain.joint_names, site.lerobot
-    writer = DatasetWriter(
-        args.out,
-        fps=config.fps,
-        robot_type=str(site.device.get("type", robot.name)),
-        joint_names=names,
-        features={"action": (*(f"{name}.pos" for name in names), GRIPPER)},
-        frames=robot.frame_names,
-    )
+    features = {"action": (*(f"{name}.pos" for name in names), GRIPPER)}
+    kind = str(site.device.get("type", robot.name))
+    writer = DatasetWriter.of(robot, args.out, config.fps, robot_type=kind, features=features)
     with (
         writer,
         closing(

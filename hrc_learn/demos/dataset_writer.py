@@ -21,6 +21,7 @@ from hrc_learn.demos.read.dataset_folder import (
 from hrc_learn.demos.read.metadata import INDEX_FEATURES
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.videos import CameraRecorder, Image, video_features
+from hrc_learn.kinematics import Arm
 from hrc_learn.store import DATASET, Claim
 
 
@@ -46,6 +47,12 @@ class DatasetWriter:
         features: User-defined features: key -> component names.
         episodes: Number of episodes, those of an extended dataset included.
     """
+
+    @classmethod
+    def of(cls, robot: Arm, root: str | Path, fps: float | int, **more: Any) -> "DatasetWriter":
+        """Recorder of an arm's episodes; `more` are further arguments of `DatasetWriter`."""
+        known = {"robot_type": robot.name, "joint_names": robot.chain.joint_names}
+        return cls(root, fps, **{**known, "frames": robot.frame_names, **more})
 
     def __init__(
         self,

@@ -101,10 +101,13 @@ class RobotPage:
         """
         from hrc_learn.sim import World
         from hrc_learn.sim.workplace import Workplace
+        from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
         from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 
-        self._ghost = World(Workplace.of(arm).scene)
-        page = Page(self._ghost, PageConfig(host=host, port=port), guides=guides)
+        workplace = Workplace.of(arm)
+        forces = InteractionForceConfig(level_at=workplace.level_at)
+        self._ghost = World(workplace.scene)
+        page = Page(self._ghost, PageConfig(host=host, port=port, forces=forces), guides=guides)
         self.page = page.__enter__()
         self.page.show(PageStatus(title="LeRobot", note=note))
 

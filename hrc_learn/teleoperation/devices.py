@@ -28,8 +28,8 @@ from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     capped,
     guiding_twist,
-    steering_twist,
 )
+from hrc_learn.teleoperation.page_operator import gizmo_command
 
 OPEN = 0.08
 """Width of the open gripper [m]."""
@@ -99,6 +99,9 @@ class Gamepad(Human):
     The end effector turns to the orientation that `coarse_orientation` gives for its position.
     An unplugged gamepad requests nothing. The gamepad rumbles when the arm touches something,
     slows down for people, or does not follow the input.
+
+    Attributes:
+        forces: Largest speeds, and orientation of the end effector.
     """
 
     def __init__(
@@ -117,6 +120,7 @@ class Gamepad(Human):
             clock: Monotonic clock [s].
         """
         self._chain, self._controller, self._update = chain, controller, update
+        self.forces = InteractionForceConfig()
         self._clock, self._next_pulse = clock, float("-inf")
         self._held: set[int] = set()
 
@@ -178,7 +182,8 @@ class Gamepad(Human):
         )
         # A stick that points forward or up reads negative; the base's y axis points left.
         stick = np.array([-y, -x, -z])
-        return steering_twist(self._chain, state, deflection(stick))
+        q, direction = state.joint_position, deflection(stick)
+        return gizmo_command(self._chain, q, (), self.forces, direction=direction).twist
 
 
 DIRECTIONS = MappingProxyType(
@@ -246,6 +251,9 @@ class TerminalKeyboard(Human):
 
     [ opens the gripper, ] closes it; `KEYS` has the requests. The end effector turns to the
     orientation that `coarse_orientation` gives for its position.
+
+    Attributes:
+        forces: Largest speeds, and orientation of the end effector.
     """
 
     def __init__(
@@ -259,6 +267,7 @@ class TerminalKeyboard(Human):
             keys: State of the keys.
         """
         self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
+        self.forces = InteractionForceConfig()
 
     @classmethod
     def open(cls, chain: SerialChain) -> TerminalKeyboard:
@@ -282,11 +291,9 @@ class TerminalKeyboard(Human):
                 gripper = _GRIPPER[key]
             else:
                 self._keys.press(key)
-        return HumanInput(
-            twist=steering_twist(self._chain, state, self._keys.direction()),
-            gripper=gripper,
-            requests=tuple(requests),
-        )
+        q, direction = state.joint_position, self._keys.direction()
+        twist = gizmo_command(self._chain, q, (), self.forces, direction=direction).twist
+        return HumanInput(twist=twist, gripper=gripper, requests=tuple(requests))
 
 
 def _take_terminal() -> None:
@@ -348,6 +355,9 @@ class HapticDevice(Human):
             HandGuidedArm(panda, arm, device)
 
     An unplugged device requests nothing.
+
+    Attributes:
+        forces: Gains, largest speeds, and orientation of the end effector.
     """
 
     def __init__(
@@ -367,7 +377,7 @@ class HapticDevice(Human):
             clock: Monotonic clock [s].
         """
         self._chain, self._device, self._number = chain, device, number
-        self._forces, self._clock = InteractionForceConfig(), clock
+        self.forces, self._clock = InteractionForceConfig(), clock
         # Positions of hand and tool when the clutch was closed.
         self._clutched: tuple[np.ndarray, np.ndarray] | None = None
         self._tool = np.zeros(3)
@@ -423,8 +433,8 @@ class HapticDevice(Human):
             self._clutched = hand, self._tool
         began, start = self._clutched
         pointer = start + _HAPTIC_SCALE * (hand - began)
-        velocity = self._forces.rate * (pointer - self._tool)
-        return HumanInput(twist=guiding_twist(tool, velocity, self._forces))
+        velocity = self.forces.rate * (pointer - self._tool)
+        return HumanInput(twist=guiding_twist(tool, velocity, self.forces))
 
     def tell(self, feedback: Feedback) -> None:
         """Update the forces that show the arm's lag and contacts to the hand."""

@@ -58,6 +58,10 @@ class InteractionForceConfig:
     """Decay rate of the end effector's orientation error [1/s]."""
     turn_speed: float = 0.8
     """Largest angular speed of the end effector [rad/s]."""
+    level_at: float = 0.6
+    """Distance to the right of the base at which the end effector is level [m]. `hrc page` sets
+    it to that of the arm's work cell.
+    """
 
     __post_init__ = check_positive
 
@@ -169,29 +173,12 @@ def guiding_twist(
         config: Gains and largest speeds.
         turn: Rotation added to the rule's orientation (wxyz); None: no rotation.
     """
-    orientation = coarse_orientation(pose.position)
+    orientation = coarse_orientation(pose.position, config.level_at)
     if turn is not None:
         orientation = quaternion.multiply(turn, orientation)
     error = quaternion.multiply(orientation, quaternion.conjugate(pose.orientation))
     angular = capped(config.turn_rate * quaternion.log(error).numpy(), config.turn_speed)
     return np.concatenate([capped(velocity, config.speed), angular])
-
-
-def steering_twist(
-    chain: SerialChain, state: ArmState, direction: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "6"]:
-    """Twist that steers the end effector in a direction; zero if the direction is zero.
-
-    Args:
-        chain: The arm.
-        state: State of the arm.
-        direction: Direction of motion in the base frame, as a fraction of the largest speed.
-    """
-    if not direction.any():
-        return np.zeros(6)
-    config = InteractionForceConfig()
-    tool = chain.forward(torch.from_numpy(state.joint_position))
-    return guiding_twist(tool, config.speed * direction, config)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 else:
     Trimesh = Any
 
-END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
-"""Bodies that move with the end effector, including the last link. Dragging one of them guides
-the end effector."""
+END_EFFECTOR_PARTS = ("hand", "finger_left", "finger_right")
+"""Bodies that move with the end effector, like the last link. Dragging one of them guides the
+end effector."""
 
 
 PEDESTAL = Box(
@@ -53,14 +53,15 @@ BUILD = "make xr"
 """Command that builds the client."""
 
 
-def held_joint(body: Body) -> int | Literal["nothing"] | None:
+def held_joint(body: Body, joints: int) -> int | Literal["nothing"] | None:
     """Joint that moves a link, counted from 1; None for bodies of the end effector, "nothing"
     for bodies that cannot be held.
 
     Args:
         body: Body, identified by its name.
+        joints: Number of joints of the arm.
     """
-    if body.name in END_EFFECTOR_PARTS:
+    if body.name in (*END_EFFECTOR_PARTS, f"link{joints}"):
         return None
     link = re.fullmatch(r"link([1-9]\d*)", body.name)
     return int(link[1]) if link else "nothing"
@@ -81,18 +82,21 @@ def headset_contents() -> dict[str, Content]:
 
 
 def headset_data(
-    bodies: Sequence[Body], boxes: Sequence[Box], **more: Any
+    bodies: Sequence[Body], boxes: Sequence[Box], joints: int, **more: Any
 ) -> dict[str, Content]:
     """Scene for the headset client by path, for clients with the secret.
 
     Args:
         bodies: Moving bodies.
         boxes: Fixed boxes.
+        joints: Number of joints of the arm.
         more: Further entries of the description, such as the page's features.
     """
     made = {
         "scene.glb": scene_glb(bodies, [*boxes, PEDESTAL]),
-        "scene.json": json.dumps({"bodies": [*map(_held, bodies)], **more}).encode(),
+        "scene.json": json.dumps(
+            {"bodies": [_held(b, joints) for b in bodies], **more}
+        ).encode(),
     }
     return {f"/xr/{name}": Content.of(name, body) for name, body in made.items()}
 
@@ -132,14 +136,14 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
     return export_glb(scene, include_normals=True)
 
 
-def _held(body: Body) -> dict[str, Any]:
+def _held(body: Body, joints: int) -> dict[str, Any]:
     """Description of a body for the client: name, joint, and capsules for picking the body."""
     capsules = [[*c.start, *c.end, c.radius] for c in body.capsules]
     # A box is picked by its bounding sphere.
     capsules += [
         [*box.centre, *box.centre, float(np.linalg.norm(box.half_size))] for box in body.boxes
     ]
-    return {"name": body.name, "joint": held_joint(body), "capsules": capsules}
+    return {"name": body.name, "joint": held_joint(body, joints), "capsules": capsules}
 
 
 def capsule_mesh(capsule: Capsule, segments: int = 20) -> Trimesh:

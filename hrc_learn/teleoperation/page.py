@@ -136,8 +136,8 @@ class Page:
         """Serve the page; it follows the arm within the `with` block.
 
         Args:
-            world: World to show. Its bodies "link1", "link2", ... can be held; "link7", "hand",
-                "finger_left" and "finger_right" move the end effector.
+            world: World to show. Its bodies "link1", "link2", ... can be held; the last link,
+                "hand", "finger_left" and "finger_right" move the end effector.
             config: Settings of the page.
             boxes: Fixed boxes in addition to the boxes of the world.
             task: Description of the task to demonstrate.
@@ -157,20 +157,21 @@ class Page:
         bodies = self._bodies.drawn(*(poses[None] for poses in self._poses))
         if not config.meshes:
             bodies = [replace(body, meshes=()) for body in bodies]
-        boxes, self._chain = [*world.config.boxes(), *boxes], world.arm.robot.chain
+        boxes, robot = [*world.config.boxes(), *boxes], world.arm.robot
+        self._chain = robot.chain
         self.control = control = Control(config.silence, config.timeout, self._let_go)
         self.human = PageHuman(present=lambda: control.present)
         draws = guides if draws is None else draws
         headset = headset_contents()
         features = {"guides": guides, "draws": draws, "task": task, "opening": OPEN}
         features["touch_points"] = config.touch_points
-        self._data = headset_data(bodies, boxes, **features) if headset else {}
+        self._data = headset_data(bodies, boxes, robot.joints, **features) if headset else {}
         self._wake = Event()
         self._held_gizmos = held = HeldGizmos(self._wake.set, self._links)
         self._hands = HeadsetHands(held, guides=guides)
         server, secret = guarded_viser()
         self._server = server
-        self._scene = PageScene(server, bodies, boxes, held, guides=guides, turns=draws)
+        self._scene = PageScene(server, bodies, boxes, held, robot, guides=guides, turns=draws)
         self._panel = Panel(
             server,
             boxes,
@@ -178,9 +179,7 @@ class Page:
             self.human.request,
             self.human.grip,
             self._scene,
-            held,
             task,
-            guides=guides,
             draws=draws,
         )
         port, fits = server.get_port(), self._panel.fits

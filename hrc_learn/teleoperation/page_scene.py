@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.geometry.shapes import Colour
+from hrc_learn.kinematics import Arm
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.headset import PEDESTAL, body_meshes, body_shape, held_joint
 from hrc_learn.teleoperation.page_operator import HeldGizmo, HeldGizmos
@@ -46,20 +48,12 @@ def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 
     return _EDGES * np.array(half_size)
 
 
-_KNOBS = (2, 4, 6)
-"""Joints marked by a knob: shoulder, elbow, wrist. Links can be held, too."""
-
-
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
 """Colour of the virtual twin, a translucent copy of the arm that can be held instead of it."""
 _TWIN_AT = (-0.1, 1.3, 0.0)
-"""Position of the virtual twin relative to the arm [m]."""
+"""Position of the virtual twin relative to the arm, for a Panda [m]."""
 _PARENTS = ("", "/twin")
 _BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)
-
-
-def _held(body: Body) -> bool:
-    return held_joint(body) != "nothing"
 
 
 class PageScene:
@@ -67,6 +61,11 @@ class PageScene:
 
     Callbacks are coroutines, so that viser calls them in its event loop and in the order of the
     browser's messages. Handles of viser send a property only if it has changed.
+
+    Attributes:
+        robot: The arm.
+        held: Record of held gizmos.
+        guides: True if the end effector can be held.
     """
 
     def __init__(
@@ -75,6 +74,7 @@ class PageScene:
         bodies: Sequence[Body],
         boxes: Sequence[Box],
         held: HeldGizmos,
+        robot: Arm,
         *,
         guides: bool,
         turns: bool,
@@ -86,18 +86,25 @@ class PageScene:
             bodies: Moving bodies with their shapes.
             boxes: Fixed boxes.
             held: Record of held gizmos.
+            robot: The arm. If it has a null space, every second joint (shoulder, elbow, wrist)
+                is marked by a knob. Links can be held, too.
             guides: True if the end effector can be held and has a gizmo.
             turns: True if the end effector has a gizmo with rings even if it cannot be held.
         """
-        self._scene, self._held, self._guides = server.scene, held, guides
-        self._twin = self._scene.add_frame("/twin", False, position=_TWIN_AT, visible=False)
+        self._scene, self.held, self.guides = server.scene, held, guides
+        self.robot, self._joints, self._size = robot, robot.joints, robot.hand_size
+        self._twin_at = self._size * np.array(_TWIN_AT)
+        self._twin = self._scene.add_frame(
+            "/twin", False, position=self._twin_at, visible=False
+        )
         # Carried objects have no twin, as they cannot be held.
         self._frames = [
-            [self._draw(parent, body) for parent in _PARENTS if not parent or _held(body)]
+            [self._draw(parent, body) for parent in _PARENTS[: 1 + self._can_be_held(body)]]
             for body in bodies
         ]
+        knobs = range(2, self._joints, 2) if robot.null_space != "none" else ()
         self._knobs = {
-            joint: [self._draw_knob(parent, joint) for parent in _PARENTS] for joint in _KNOBS
+            joint: [self._draw_knob(parent, joint) for parent in _PARENTS] for joint in knobs
         }
         for box in (*boxes, PEDESTAL):
             self._draw_box(box)
@@ -106,9 +113,9 @@ class PageScene:
             "/pull",
             np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]]),
             rgba(PERSON)[:3],
-            shaft_radius=0.008,
-            head_radius=0.022,
-            head_length=0.05,
+            shaft_radius=0.008 * self._size,
+            head_radius=0.022 * self._size,
+            head_length=0.05 * self._size,
             visible=False,
         )
         self._region = self._scene.add_line_segments(
@@ -120,7 +127,7 @@ class PageScene:
         )
         self._gizmo = self._scene.add_transform_controls(
             "/end_effector",
-            scale=0.2,
+            scale=0.2 * self._size,
             disable_axes=not guides,
             disable_sliders=not guides,
             disable_rotations=guides,
@@ -152,7 +159,7 @@ class PageScene:
             for knob in knobs:
                 knob.position = links.position[joint - 1].numpy()
         gizmo = self._gizmo
-        if not self._held.turning and all(name != gizmo.name for _, name in self._held.held()):
+        if not self.held.turning and all(name != gizmo.name for _, name in self.held.held()):
             gizmo.position, gizmo.wxyz = links.position[-1].numpy(), _BASE_AXES
 
     def show_twin(self, visible: bool) -> None:
@@ -190,8 +197,11 @@ class PageScene:
             self._arrows.points = arrows.astype(np.float32)
             self._arrows.colors = np.array(rgba(colour)[:3], np.uint8)
 
+    def _can_be_held(self, body: Body) -> bool:
+        return held_joint(body, self._joints) != "nothing"
+
     def _draw(self, parent: str, body: Body) -> Any:
-        path, joint = f"{parent}/arm/{body.name}", held_joint(body)
+        path, joint = f"{parent}/arm/{body.name}", held_joint(body, self._joints)
         frame = self._scene.add_frame(
             path, position=body.position[0], wxyz=body.orientation[0], show_axes=False
         )
@@ -213,7 +223,7 @@ class PageScene:
     def _draw_knob(self, parent: str, joint: int) -> Any:
         knob = self._scene.add_icosphere(
             f"{parent}/knobs/joint{joint}",
-            radius=0.078,
+            radius=0.078 * self._size,
             subdivisions=2,
             color=rgba(PERSON)[:3],
             opacity=0.9,
@@ -223,9 +233,9 @@ class PageScene:
         return knob
 
     def _connect(self, node: Any, joint: int | None, parent: str) -> None:
-        if joint is None and not self._guides:
+        if joint is None and not self.guides:
             return
-        offset = np.array(_TWIN_AT if parent else (0.0, 0.0, 0.0))
+        offset = self._twin_at if parent else np.zeros(3)
 
         @node.on_drag
         async def dragged(event: Any) -> None:
@@ -233,11 +243,11 @@ class PageScene:
             pointer = np.array(event.end_position) - offset
             if event.phase == "start":
                 start = np.array(event.start_position) - offset
-                self._held.grab(key, joint, start, pointer)
+                self.held.grab(key, joint, start, pointer)
             elif event.phase == "update":
-                self._held.move(key, pointer)
+                self.held.move(key, pointer)
             else:
-                self._held.release(*key)
+                self.held.release(*key)
 
     def _draw_box(self, box: Box) -> None:
         r, g, b, opacity = box.colour
@@ -264,9 +274,10 @@ class PageScene:
         self._scene.add_grid(
             "/floor", width=6.0, height=6.0, cell_size=0.25, position=(0.0, 0.5, -0.72)
         )
+        usual = self._size * np.array([_CAMERA, _LOOK_AT])
         camera = server.initial_camera
-        camera.position, camera.look_at, camera.fov = _CAMERA, _LOOK_AT, 0.9
-        server.on_client_connect(_step_back)
+        (camera.position, camera.look_at), camera.fov = usual, 0.9
+        server.on_client_connect(partial(_step_back, usual=usual))
 
     async def _gizmo_dragged(self, event: Any) -> None:
         if event.client_id is None:
@@ -275,22 +286,21 @@ class PageScene:
         pointer, orientation = gizmo.position.copy(), gizmo.wxyz.copy()
         if event.phase == "start":
             held = HeldGizmo(joint=None, held_at=np.zeros(3), pointer=pointer)
-            self._held.take(key, held if self._guides else None, orientation)
+            self.held.take(key, held if self.guides else None, orientation)
         elif event.phase == "update":
-            self._held.move(key, pointer, orientation)
+            self.held.move(key, pointer, orientation)
         else:
-            self._held.release(*key)
+            self.held.release(*key)
 
 
-_CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)
+_CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)  # for a Panda [m]
 _ASPECT = 1.2  # smallest aspect ratio at which both cabinet and twin are in view
 
 
-async def _step_back(client: Any) -> None:
+async def _step_back(client: Any, usual: Float[np.ndarray, "2 3"]) -> None:
     """Move the camera back if its view is narrow, as on a phone, to show the same scene."""
-    aspect = client.camera.aspect
+    aspect, (camera, look_at) = client.camera.aspect, usual
     if aspect < _ASPECT:
-        look_at = np.array(_LOOK_AT)
         # Setting the position also shifts the point that it looks at.
-        client.camera.position = look_at + _ASPECT / aspect * (np.array(_CAMERA) - look_at)
-        client.camera.look_at = _LOOK_AT
+        client.camera.position = look_at + _ASPECT / aspect * (camera - look_at)
+        client.camera.look_at = look_at

@@ -17,7 +17,6 @@ from hrc_learn.teleoperation.demonstration_recorder import RecorderStatus
 from hrc_learn.teleoperation.devices import DIRECTIONS, OPEN, KeyboardState
 from hrc_learn.teleoperation.gate import messages
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
-from hrc_learn.teleoperation.page_operator import HeldGizmos
 from hrc_learn.teleoperation.page_scene import PageScene, ViserServer, in_loop
 from hrc_learn.teleoperation.region_editor import QUIET, RegionEditor
 from hrc_learn.viz import palette
@@ -101,10 +100,8 @@ class Panel:
         request: Callable[[Request], None],
         grip: Callable[[float], None],
         scene: PageScene,
-        held: HeldGizmos,
         task: str,
         *,
-        guides: bool,
         draws: bool,
     ):
         """Build the panel.
@@ -115,13 +112,13 @@ class Panel:
             forces: Initial gains of gizmos.
             request: Receives the requests of buttons.
             grip: Receives the openings of the gripper that buttons request [m].
-            scene: Scene, in which the panel shows or hides the virtual twin and the gizmo.
-            held: Held gizmos, and the rotation added by the rings of the end effector's gizmo.
+            scene: Scene, in which the panel shows or hides the virtual twin and the gizmo. If
+                the end effector can be held in it, the person records.
             task: Description of the task.
-            guides: True if the person guides the end effector and records.
             draws: True if people draw regions, mark targets and turn the end effector.
         """
-        self._gui, self._initial_forces, self._held = server.gui, forces, held
+        self._gui, self._initial_forces, self._held = server.gui, forces, scene.held
+        self._bends = scene.robot.null_space != "none"
         gui = server.gui
         gui.configure_theme(
             control_width="medium",
@@ -134,13 +131,13 @@ class Panel:
         self._next: Request = "start"
         self.keys = KeyboardState()
         self._state, self._told = gui.add_html(""), gui.add_html("")
-        if guides:
+        if scene.guides:
             with gui.add_folder("Demonstration"):
                 self._add_recording(request, task)
         with gui.add_folder("Null-space input and safety"):
             self._bars, self._safety = gui.add_html(""), gui.add_html("")
         with gui.add_folder("Arm"):
-            if guides:
+            if scene.guides:
                 self._add_end_effector(scene, grip)
             twin = gui.add_checkbox("Virtual twin", False, hint="Hold it instead of the arm.")
             twin.on_update(in_loop(lambda _: scene.show_twin(twin.value)))
@@ -148,9 +145,9 @@ class Panel:
         self.editor: RegionEditor | None = None
         if draws:
             with gui.add_folder("Region, target and turn"):
-                self.editor = RegionEditor(server, boxes)
+                self.editor = RegionEditor(server, boxes, scene.robot.hand_size)
                 clear = gui.add_button("Clear the turn", color=QUIET)
-                clear.on_click(in_loop(lambda _: held.clear_turn()))
+                clear.on_click(in_loop(lambda _: scene.held.clear_turn()))
                 self._turn_text = gui.add_markdown("")
         self._seen: Mapping[str, int] = {}
         self._latest = ""
@@ -254,8 +251,9 @@ class Panel:
             if self._keep is not None:
                 self._keep.visible = status.state == "stopped"
         largest = self._initial_forces.max_nullspace_input
-        self._state.content = str(texts.state(status, people, self.task))
-        self._bars.content = str(texts.nullspace_input(nullspace_input.tolist(), largest))
+        self._state.content = str(texts.state(status, people, self.task, self._bends))
+        bars = nullspace_input.tolist() if self._bends else ()
+        self._bars.content = str(texts.nullspace_input(bars, largest))
         if self.editor is not None:
             turn = self._held.turn_vector
             degrees = None if turn is None else tuple(np.rad2deg(turn).tolist())

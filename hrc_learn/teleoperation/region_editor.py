@@ -105,7 +105,7 @@ def _triple(vector: Sequence[float] | Float[np.ndarray, "3"]) -> tuple[float, fl
 
 
 FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.10))
-"""Initial region."""
+"""Initial region, for a Panda."""
 
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
@@ -115,7 +115,8 @@ _MARK: Any = "target"
 # Largest and smallest half sizes of a region [m]: the largest is the reach of the arm, the
 # smallest leaves a margin around a point.
 _LARGEST, _SMALLEST = 0.5, 0.02
-# Height of a target above the clicked surface: a little more than an object's height [m].
+# Height of a target above the clicked surface, for a Panda: a little more than an object's
+# height [m].
 _LIFTED = 0.08
 
 
@@ -127,15 +128,18 @@ class RegionEditor:
         target: Marked point [m]; None: no target.
     """
 
-    def __init__(self, server: ViserServer, boxes: Sequence[Box]):
+    def __init__(self, server: ViserServer, boxes: Sequence[Box], size: float = 1.0):
         """Draw the initial region, not active.
 
         Args:
             server: Server of the page; controls go into the folder that is open.
             boxes: Furniture that targets may be marked on.
+            size: Size of the hand, 1 for a Panda, by which lengths are scaled.
         """
         self._server, self._scene, self._boxes = server, server.scene, tuple(boxes)
-        self.drawn = FIRST_REGION
+        self._size, first = size, FIRST_REGION
+        centre, half_size = (size * np.array(v) for v in (first.centre, first.half_size))
+        self.drawn = DrawnRegion(centre=_triple(centre), half_size=_triple(half_size))
         self.target: tuple[float, float, float] | None = None
         self._add_controls()
         self._add_nodes()
@@ -189,7 +193,7 @@ class RegionEditor:
     def _add_nodes(self) -> None:
         scene, region = self._scene, self.drawn
         self._gizmo = scene.add_transform_controls(
-            "/region", scale=0.16, disable_rotations=True, position=region.centre
+            "/region", scale=0.16 * self._size, disable_rotations=True, position=region.centre
         )
         self._gizmo.on_update(self._moved)
         self._box = scene.add_box(
@@ -205,11 +209,14 @@ class RegionEditor:
             "/region/edges", box_edges(region.half_size), _COLOUR, thickness=0.004
         )
         self._corner = scene.add_icosphere(
-            "/region/corner", radius=0.022, color=_COLOUR, position=region.half_size
+            "/region/corner",
+            radius=0.022 * self._size,
+            color=_COLOUR,
+            position=region.half_size,
         )
         self._corner.on_drag(self._corner_dragged)
         self._mark = scene.add_icosphere(
-            "/target", radius=0.02, color=rgba(VERMILION)[:3], visible=False
+            "/target", radius=0.02 * self._size, color=rgba(VERMILION)[:3], visible=False
         )
         self._mark.on_drag(in_loop(lambda event: self.mark(np.array(event.end_position))))
 
@@ -270,7 +277,7 @@ class RegionEditor:
         else:
             point = meet_plane(origin, direction, 2, 0.0)
         if point is not None:
-            self.mark(point + np.array([0.0, 0.0, _LIFTED]))
+            self.mark(point + np.array([0.0, 0.0, self._size * _LIFTED]))
 
 
 def _once(

@@ -466,3 +466,29 @@ def test_steps_count_as_fractions_of_a_range_only_if_all_ranges_are_a_joints(ste
     labels = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
     found = evidence.guess_joints(given, np.ones(5, bool), labels, "so101_follower")
     assert (found.unit, found.confidence > 0.9) == (unit, unit == "%")
+
+
+@pytest.mark.parametrize("robot", ["mujoco_so101", "mujoco_ur5e", "franka_panda", "ros2"])
+def test_sets_of_our_own_robots_need_no_question(robot):
+    """`lerobot-record` declares no units, but these robots record rad and m."""
+    chosen = {role: selection(role, 2) for role in ("joint_position", "gripper")}
+    given = {"joint_position": sizes(1.6, 0.3), "gripper": sizes(0.032, 0.03)}
+    decided = decide_units(chosen, given, {}, robot_type=robot)
+    for role, unit in (("joint_position", "rad"), ("gripper", "m")):
+        assert (decided[role].unit, decided[role].confidence) == (unit, 0.99)
+        assert decided[role].note is None
+        assert f"{robot} records {unit}" in decided[role].evidence
+
+
+@pytest.mark.parametrize("robot", ["my_mujoco_arm", "franka", "so101_follower", ""])
+def test_other_robots_may_record_any_unit(robot):
+    chosen, given = {"joint_position": selection("joint_position", 2)}, sizes(1.6, 0.3)
+    decided = decide_units(chosen, {"joint_position": given}, {}, robot_type=robot)
+    assert decided["joint_position"].note is not None
+
+
+def test_values_that_contradict_one_of_our_own_robots_are_doubted():
+    chosen, given = {"joint_position": selection("joint_position", 2)}, sizes(90, 45.0)
+    decided = decide_units(chosen, {"joint_position": given}, {}, robot_type="mujoco_so101")
+    assert decided["joint_position"].unit == "deg"
+    assert decided["joint_position"].guessed

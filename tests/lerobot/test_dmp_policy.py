@@ -198,6 +198,17 @@ def test_reset_begins_where_the_arm_is_measured():
     torch.testing.assert_close(policy.select_action(elsewhere), torch.tensor([[-0.3, 0.2]]))
 
 
+def test_actions_that_are_changes_per_step_do_not_begin_at_the_measured_position():
+    """Their names are those of the state, which would be commanded as one huge change."""
+    changes = [e | {"action": e["action"].diff(dim=0, append=e["action"][-1:])} for e in SHOWN]
+    policy = fitted_policy(changes)
+    assert (policy.measured == -1).all()
+    largest = torch.cat([e["action"] for e in changes]).abs().max()
+    for shown in changes:
+        assert played(policy, shown, 5).abs().max() <= 1.5 * largest
+    assert fitted_policy(SHOWN).measured.tolist() == [2, 0]
+
+
 def test_columns_are_told_by_name_alone():
     permuted = [e | {STATE: e[STATE].flip(-1)} for e in SHOWN]
     one, other = (

@@ -26,7 +26,6 @@ from hrc_learn.teleoperation.hand_guiding import (
     force_to_nullspace_input,
     gizmo_nullspace_input,
     guiding_twist,
-    steering_twist,
 )
 from hrc_learn.teleoperation.page_operator import (
     HeldGizmo,
@@ -140,10 +139,19 @@ def test_the_guided_end_effector_turns_by_the_coarse_rule():
     far = quaternion.exp(torch.tensor([0.0, 0.0, 1.0]).double())
     turned = guiding_twist(Pose(pose.position, near), np.zeros(3), SPRING, far)
     assert np.linalg.norm(turned[3:]) == pytest.approx(0.8)
-    assert steering_twist(panda, reading(), np.zeros(3)).tolist() == [0] * 6
-    np.testing.assert_allclose(
-        steering_twist(panda, reading(), np.array([0.0, -0.5, 0.0]))[:3], [0, -0.125, 0]
-    )
+    steered = gizmo_command(panda, READY, (), SPRING, direction=np.array([0.0, -0.5, 0.0]))
+    np.testing.assert_allclose(steered.twist[:3], [0, -0.125, 0])
+
+
+def test_the_guided_end_effector_is_level_where_its_work_cell_wants_it():
+    """At the shelf of an SO-101, 0.3 m from its base, as the motion that is learned there."""
+    position = torch.tensor([0.0, -0.3, 0.1]).double()
+    level = Pose(position, coarse_orientation(position, 0.3))
+    still = np.zeros(3)
+    own = guiding_twist(level, still, InteractionForceConfig(level_at=0.3))
+    np.testing.assert_allclose(own[3:], 0, atol=1e-9)
+    other = guiding_twist(level, still, InteractionForceConfig())
+    assert np.linalg.norm(other[3:]) == pytest.approx(0.8)  # it would turn up by 45 degrees
 
 
 def test_a_link_is_pulled_by_a_device_with_a_fraction_of_the_largest_force():

@@ -92,7 +92,7 @@ def test_the_client_is_told_what_can_be_held(tmp_path, monkeypatch):
     (tmp_path / "built").mkdir()
     for name in ("index.html", "style.css", "built/client.js", "built/licences.txt"):
         (tmp_path / name).write_text(name, "utf-8")
-    contents = headset_contents() | headset_data([LINK, FINGER], [TABLE], task="show it")
+    contents = headset_contents() | headset_data([LINK, FINGER], [TABLE], 7, task="show it")
     told = json.loads(contents["/xr/scene.json"].body)
     assert told["task"] == "show it"
     link, finger = told["bodies"]
@@ -100,6 +100,8 @@ def test_the_client_is_told_what_can_be_held(tmp_path, monkeypatch):
     assert link["capsules"] == [[0.0, 0.0, 0.0, 0.0, 0.1, 0.3, 0.05]]
     assert finger["joint"] is None  # it leads the end effector
     assert finger["capsules"][0][:3] == [0.0, 0.0, 0.1]
+    last = headset_data([LINK, FINGER], [TABLE], 4)["/xr/scene.json"].body
+    assert [held["joint"] for held in json.loads(last)["bodies"]] == [None, None]
     assert contents["/xr"].kind == "text/html"
     assert contents["/xr/client.js"].kind == "text/javascript"
     assert contents["/xr/scene.glb"].kind == "model/gltf-binary"

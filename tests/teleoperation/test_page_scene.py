@@ -7,8 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Body, Box, Capsule, Pose
+from hrc_learn.kinematics import panda
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.headset import PEDESTAL
 from hrc_learn.teleoperation.page_operator import HeldGizmo, HeldGizmos
@@ -65,7 +67,7 @@ def made(server):
     server.scene.reset()
     held = HeldGizmos()
     bodies = [body("link3", capsules=(LINK,)), body("glass", boxes=(GLASS,))]
-    scene = PageScene(server, bodies, [BOARD, WINDOW], held, guides=True, turns=False)
+    scene = PageScene(server, bodies, [BOARD, WINDOW], held, panda, guides=True, turns=False)
     return scene, held, lambda: nodes(server)
 
 
@@ -119,7 +121,7 @@ def test_furniture_has_its_size_place_and_colour(made):
 @pytest.mark.parametrize("turns", [True, False])
 def test_the_gizmo_moves_or_turns_what_the_page_offers(server, guides, turns):
     server.scene.reset()
-    PageScene(server, [], [], HeldGizmos(), guides=guides, turns=turns)
+    PageScene(server, [], [], HeldGizmos(), panda, guides=guides, turns=turns)
     gizmo = nodes(server)["/end_effector"]
     assert gizmo["disable_axes"] == gizmo["disable_sliders"] == (not guides)
     assert gizmo["disable_rotations"] == guides
@@ -132,6 +134,41 @@ def test_the_camera_looks_at_cabinet_and_twin(server, made):
     np.testing.assert_allclose(camera.position, (2.65, 1.05, 1.15))
     np.testing.assert_allclose(camera.look_at, (0.1, 0.47, 0.12))
     assert camera.fov == 0.9
+
+
+@shapes_unchecked()  # the arm is a stand-in
+def test_a_small_arm_without_null_space_is_drawn_near_and_has_no_knobs(server):
+    """An SO-101: five joints, and 0.4 times the size of a Panda."""
+    server.scene.reset()
+    robot = SimpleNamespace(joints=5, hand_size=0.4, null_space="none")
+    bodies = [body("link4", capsules=(LINK,)), body("link5", capsules=(LINK,))]
+    held = HeldGizmos(links=lambda: LINKS)
+    PageScene(server, bodies, [], held, robot, guides=True, turns=False)
+    found, dragged = nodes(server), dragged_nodes(server)
+    assert not [name for name in dragged if "/knobs/" in name]
+    np.testing.assert_allclose(found["/twin"]["position"], [-0.04, 0.52, 0.0])
+    assert found["/end_effector"]["scale"] == pytest.approx(0.08)
+    assert found["/pull"]["shaft_radius"] == pytest.approx(0.0032)
+    np.testing.assert_allclose(server.initial_camera.position, (1.06, 0.42, 0.46))
+    np.testing.assert_allclose(server.initial_camera.look_at, (0.04, 0.188, 0.048))
+    point, grips = np.array([0.5, 0.6, 0.7]), []
+    for name in ("/arm/link4/0", "/twin/arm/link5/0"):
+        drag(dragged[name], "start", point, point)
+        ((_, gizmo),) = held.held().items()
+        grips.append(gizmo.joint)
+        held.release()
+    assert grips == [4, None]  # the last link moves the end effector
+
+
+@pytest.mark.parametrize(("joints", "marked"), [(7, [2, 4, 6]), (8, [2, 4, 6])])
+@shapes_unchecked()
+def test_knobs_are_at_joints_that_the_arm_has(server, joints, marked):
+    server.scene.reset()
+    robot = SimpleNamespace(joints=joints, hand_size=1.0, null_space="free")
+    PageScene(server, [], [], HeldGizmos(), robot, guides=True, turns=False)
+    assert [n for n in dragged_nodes(server) if n.startswith("/knobs/j")] == [
+        f"/knobs/joint{joint}" for joint in marked
+    ]
 
 
 def test_everything_moves_but_a_gizmo_that_is_held(made):
@@ -250,7 +287,7 @@ def test_arm_and_twin_are_dragged_at_the_point_that_is_held(
 def test_the_gripper_is_dragged_where_the_end_effector_is_guided(server, guides):
     server.scene.reset()
     bodies = [body("hand", capsules=(LINK,)), body("glass", boxes=(GLASS,))]
-    PageScene(server, bodies, [], HeldGizmos(), guides=guides, turns=False)
+    PageScene(server, bodies, [], HeldGizmos(), panda, guides=guides, turns=False)
     found = {name for name in dragged_nodes(server) if "/arm/" in name}
     assert found == ({"/arm/hand/0", "/twin/arm/hand/0"} if guides else set())
 
@@ -259,7 +296,7 @@ def test_the_gripper_is_dragged_where_the_end_effector_is_guided(server, guides)
 def test_the_gizmo_holds_where_it_guides_and_turns_in_any_case(server, guides):
     server.scene.reset()
     held = HeldGizmos(links=lambda: LINKS)
-    scene = PageScene(server, [], [], held, guides=guides, turns=True)
+    scene = PageScene(server, [], [], held, panda, guides=guides, turns=True)
     half = np.sqrt(0.5)
 
     def dragged(phase, place, turn, client=1):
@@ -297,7 +334,7 @@ def test_the_gizmo_holds_where_it_guides_and_turns_in_any_case(server, guides):
 def test_a_camera_whose_view_is_narrow_stands_back_until_as_much_is_seen(aspect):
     usual, look_at = np.array((2.65, 1.05, 1.15)), np.array((0.1, 0.47, 0.12))
     camera = SimpleNamespace(aspect=aspect, position=usual, look_at="unchanged")
-    asyncio.run(_step_back(SimpleNamespace(camera=camera)))
+    asyncio.run(_step_back(SimpleNamespace(camera=camera), np.stack([usual, look_at])))
     # The width in view at the place looked at is that of a view 1.2 times as wide as high.
     width = aspect * np.linalg.norm(camera.position - look_at)
     assert width >= 1.2 * np.linalg.norm(usual - look_at) - 1e-9
@@ -306,7 +343,7 @@ def test_a_camera_whose_view_is_narrow_stands_back_until_as_much_is_seen(aspect)
         np.testing.assert_allclose(
             np.cross(camera.position - look_at, usual - look_at), 0, atol=1e-12
         )
-        assert camera.look_at == tuple(look_at)
+        np.testing.assert_array_equal(camera.look_at, look_at)
     else:
         np.testing.assert_array_equal(camera.position, usual)
         assert camera.look_at == "unchanged"

@@ -24,6 +24,15 @@ def test_efforts_are_bars_from_the_middle_to_either_side():
     assert "-5.0" in html
 
 
+def test_an_arm_without_null_space_has_no_bars_and_is_dragged_by_its_gripper():
+    html = panel_texts().nullspace_input((), 20.0)
+    assert bars(html) == []
+    assert "no null space" in html
+    ready = PageStatus()
+    assert "drag its gripper." in panel_texts().state(ready, 0, "", False)
+    assert "drag its gripper, a link or a knob." in panel_texts().state(ready, 0, "")
+
+
 def test_interventions_are_counted_and_the_new_ones_stand_out():
     status = PageStatus(interventions={"velocity": 3, "tcp_speed": 7, "jerk": 0}, contacts=2)
     html = panel_texts().safety(status, "tcp_speed")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.geometry import Box
+from hrc_learn.kinematics import panda
 from hrc_learn.protocols import DrawnRegion, Feedback
 from hrc_learn.skills.grasping import OPEN
 from hrc_learn.teleoperation.devices import DIRECTIONS
@@ -34,11 +35,11 @@ def server():
 def made(server):
     """A function that makes a panel, its scene, the gizmos held, and what was requested."""
 
-    def panel(guides=True, draws=True):
+    def panel(guides=True, draws=True, robot=panda):
         server.gui.reset()
         server.scene.reset()
         asked, held = [], HeldGizmos()
-        scene = PageScene(server, [], [], held, guides=guides, turns=True)
+        scene = PageScene(server, [], [], held, robot, guides=guides, turns=True)
         with server.gui.add_folder("all"):
             found = Panel(
                 server,
@@ -47,9 +48,7 @@ def made(server):
                 asked.append,
                 asked.append,
                 scene,
-                held,
                 "show it",
-                guides=guides,
                 draws=draws,
             )
         return found, scene, held, asked

@@ -16,6 +16,8 @@ from hrc_learn.demos.read.naming import WORDS, is_hand
 from hrc_learn.demos.read.quantities import SIZES
 from hrc_learn.store import read_json
 
+STATED = 0.99
+"""Confidence of a unit that names or one of our own robots state."""
 CONFIDENT = 0.75
 """Smallest confidence at which a guessed unit is used without a question."""
 ASSUMED = 0.95
@@ -55,6 +57,8 @@ GUESSED_BY_SIZE = tuple(SIZES)
 """Quantities other than joints whose unit is guessed from the size of their values."""
 _UNIT_LENGTH = 2e-3
 """Error of a quaternion's length due to float32 or few printed digits."""
+_OURS = re.compile(r"mujoco_\w+|franka_panda|ros2")
+"""Types of our own LeRobot robots, which record rad and m (`hrc_learn.lerobot.arm_values`)."""
 # Arms of hobby servos, whose positions LeRobot stores in degrees or as -100..100.
 _HOBBY, _HOBBY_JOINTS = re.compile(WORDS["hobby"], re.IGNORECASE), {*WORDS["hobby_joints"]}
 
@@ -329,6 +333,13 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
         f"read with --mapping position KEY[0:3]"
     )
     return guess._replace(confidence=min(guess.confidence, 0.5), evidence=text)
+
+
+def confirm(guess: Guess, si_unit: str, robot_type: str) -> Guess:
+    """The guess, certain if one of our own robots recorded the values and they fit its unit."""
+    if guess.unit != si_unit or not _OURS.fullmatch(robot_type):
+        return guess
+    return Guess(si_unit, STATED, f"{robot_type} records {si_unit}, {guess.evidence}")
 
 
 def guess_by_size(role: str, sizes: Sizes) -> Guess:

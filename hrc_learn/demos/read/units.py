@@ -191,7 +191,9 @@ def decide_units(
             decisions[role] = _stated(role, stated[role])
         elif all(named):
             decisions[role] = replace(
-                _stated(role, named), confidence=0.99, evidence="the names state it"
+                _stated(role, named),
+                confidence=unit_evidence.STATED,
+                evidence="the names state it",
             )
         elif role in _FOLLOWERS and (leader := decisions.get("joint_position")):
             decisions[role] = _following(role, leader)
@@ -251,14 +253,12 @@ def _guess(
         guess, units = _guess_joint_units(own, selection, robot_type, named)
     else:
         guess = unit_evidence.guess_by_size(role, own)
+    guess = unit_evidence.confirm(guess, ROLES[role].unit, robot_type)
     return UnitDecision(
         role=role,
-        unit=guess.unit,
         units=units if {*units} - {guess.unit} else (),
-        guessed=True,
-        confidence=guess.confidence,
-        evidence=guess.evidence,
-        other=guess.other,
+        guessed=guess.confidence < unit_evidence.STATED,
+        **guess._asdict(),
     )
 
 

@@ -115,6 +115,8 @@ class DMPPolicy(MotionPolicy):
         first = [{key: d[key][0] for key in self.encoder.widths} for d in demonstrations]
         contexts = torch.stack([self.encoder.numbers(seen) for seen in first])
         coordinates = [self.encoding.to_coordinates(shown) for shown in actions]
+        if OBS_STATE in self.encoder.widths:
+            self.keep_measured([shown[OBS_STATE] for shown in demonstrations], coordinates)
         error = fit_closed_form(self.motion, coordinates, contexts, 1 / self._step)
         self.left_out_error = error
         logger.info(

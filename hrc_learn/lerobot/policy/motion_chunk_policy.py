@@ -38,9 +38,6 @@ from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfi
 
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
-MEASURED = 0.5
-"""Largest root mean square difference, in spreads of the action, at which a value of the state
-counts as the measurement of the action's value of the same name."""
 UNKNOWN = 0.3
 """Fraction of samples trained without the velocity of the state, as after a reset. This also
 keeps policies from relying on their own past motion regardless of observations.
@@ -431,7 +428,7 @@ class MotionChunkPolicy(MotionPolicy):
         ]
         if OBS_STATE in self.encoder.widths:
             states = [e[OBS_STATE].to(self.encoding.mean) for e in episodes]
-            self._keep_measured(torch.cat(states), torch.cat([e[ACTION] for e in episodes]))
+            self.keep_measured(states, [e[ACTION] for e in episodes])
             if self.turning.triples:
                 self._learn_turning(states)
         if len(self.velocity_spread):
@@ -466,12 +463,3 @@ class MotionChunkPolicy(MotionPolicy):
         std[first] = divisors(turned.std(0))
         for triple in turning.triples:
             std[triple] = std[triple].clamp_min(SMALLEST_TURN)
-
-    def _keep_measured(self, states: Tensor, coordinates: Tensor) -> None:
-        """Ignore state columns that differ too much from the actions of the same name."""
-        values = states[None, :, self.measured.clamp_min(0)].to(coordinates)
-        off = self.encoding.to_coordinates(values)[0] - coordinates
-        far = off.square().mean(0).sqrt() > MEASURED
-        for triple in self.encoding.triples:
-            far[triple] = far[triple].any()
-        self.measured[far] = -1

@@ -216,6 +216,22 @@ class MotionPolicy(PreTrainedPolicy):
             demonstrations: Columns by key, (frames, components).
         """
 
+    def keep_measured(self, states: Sequence[Tensor], actions: Sequence[Tensor]) -> None:
+        """Ignore state columns that differ too much from the actions of the same name, such as
+        positions if the actions are changes per step.
+
+        Args:
+            states: States of each demonstration, (frames, S).
+            actions: Coordinates of its actions, (frames, A).
+        """
+        coordinates = torch.cat([*actions])
+        values = torch.cat([*states])[None, :, self.measured.clamp_min(0)].to(coordinates)
+        off = self.encoding.to_coordinates(values)[0] - coordinates
+        far = off.square().mean(0).sqrt() > MEASURED
+        for triple in self.encoding.triples:
+            far[triple] = far[triple].any()
+        self.measured[far] = -1
+
     @property
     def _step(self) -> float:
         """Time between actions [s]."""
@@ -322,6 +338,9 @@ def _require_statistics(
             )
 
 
+MEASURED = 0.5
+"""Largest root mean square difference, in spreads of the action, at which a value of the state
+counts as the measurement of the action's value of the same name."""
 MOST = 256
 """Largest number of demonstrations that are read; from more, evenly spaced ones are chosen."""
 
