@@ -96,6 +96,32 @@ def test_names_of_rows_and_options_are_not_broken(tmp_path):
             assert option.evaluate(lines) == 1
 
 
+@pytest.mark.parametrize(
+    ("size", "drawer"), [((390, 844), True), ((844, 390), False), ((1280, 800), False)]
+)
+def test_the_controls_of_the_ar_page_leave_the_arm_free(tmp_path, size, drawer):
+    style = (CLIENT / "style.css").read_text("utf-8")
+    page = (
+        (CLIENT / "index.html").read_text("utf-8").replace("</head>", f"<style>{style}</style>")
+    )
+    with chromium(tmp_path / "profile", size) as tab:
+        tab.set_content(page)
+        tab.evaluate("""() => {
+          const list = document.getElementById("buttons");
+          list.before(document.createElement("input"));
+          for (let k = 0; k < 13; k++)
+            list.append(Object.assign(document.createElement("button"), {textContent: "Draw"}));
+        }""")
+        box = tab.locator("#overlay").bounding_box()
+        field = tab.locator("#overlay input").bounding_box()
+        assert field["width"] > 0.9 * (box["width"] - 20)
+        if drawer:  # the arm stands in the middle
+            assert box["y"] > size[1] / 2
+            assert box["y"] + box["height"] == pytest.approx(size[1])
+        else:
+            assert box["x"] + box["width"] < size[0] / 2
+
+
 @pytest.fixture(scope="module")
 def check_site():
     """The program that checks the site."""
