@@ -182,10 +182,9 @@ class Report:
     """Command line that repeats the run."""
 
     def __post_init__(self) -> None:
-        names = [picture.name for section in self.sections for picture in section.figures]
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise ValueError(f"report {self.title!r} has two pictures named {twice.pop()!r}.")
+        names = Counter(picture.name for picture in self.pictures)
+        if twice := [name for name, count in names.items() if count > 1]:
+            raise ValueError(f"report {self.title!r} has two pictures named {twice[0]!r}.")
 
     @property
     def targets(self) -> int:

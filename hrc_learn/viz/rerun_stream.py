@@ -220,8 +220,8 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     )
 
 
-_LEGEND = 0.22, 0.4
-"""Width of a legend relative to the curves, in tabs with one and with two columns."""
+_LETTER = 0.011, 0.03
+"""Width of a legend's letter relative to the curves, in tabs with one and with two columns."""
 _TICKS = 7
 """Steps of an axis from which on the viewer labels every tenth step only."""
 
@@ -240,7 +240,8 @@ def tab_view(tab: Tab, time: Float[np.ndarray, " time"] | None = None) -> rrb.Gr
         values = np.hstack([curves.values for plot in plots for curves in plot.curves])
         known = time[(np.isfinite(values) & (values != 0.0)).any(axis=1)]
         if len(known) > 1:
-            legend = any(plot.legend for plot in plots) * _LEGEND[min(tab.columns, 2) - 1]
+            names = [name for p in plots if p.legend for c in p.curves for name in c.names]
+            legend = max(map(len, names), default=0) * _LETTER[min(tab.columns, 2) - 1]
             span = known[0], known[-1] + legend * (known[-1] - known[0])
         plots = [_with_range(plot) for plot in plots]
     return rrb.Grid(

@@ -86,10 +86,10 @@ def test_a_tab_shows_the_time_in_which_it_has_values():
     assert list(shown(plots[1:], time)) == [None]  # one value spans no time
 
 
-@pytest.mark.parametrize(("columns", "end"), [(1, 122), (2, 140)])
+@pytest.mark.parametrize(("columns", "end"), [(1, 113), (2, 136)])
 def test_legends_stand_to_the_right_of_finished_curves(columns, end):
     values = np.ones((101, 2))
-    plot = Plot(title="t", curves=(several("a", "bc", values),), legend=True)
+    plot = Plot(title="t", curves=(several("a", ("panda_joint1", "b"), values),), legend=True)
     tab = Tab(title="tab", plots=(plot, plot), columns=columns)
     for view in tab_view(tab, np.arange(101.0)).contents:
         (time,) = view.properties["TimeAxis"].view_range.as_arrow_array().to_pylist()
