@@ -32,7 +32,7 @@ from worker_job import random_cycles
 from worker_study import WorkerStudyConfig
 
 from hrc_learn import cli
-from hrc_learn.kinematics import CapsuleArm, separation
+from hrc_learn.kinematics import CapsuleArm, panda, separation
 from hrc_learn.sim import Worker, whole_arm
 from hrc_learn.sim.worker import Posture
 from hrc_learn.sim.worker_visit import HAND_OVER_BENCH, in_worker_frame
@@ -40,10 +40,13 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_file
+from hrc_learn.viz import palette
 from hrc_learn.viz.figures import STYLE, WIDTH
 
 # Speed of the arm [m/s], and speeds of the worker towards it [m/s].
 _SLOW, _SPEEDS = 0.1, (0.0, 1.0)
+# y beyond which the tool is above the bench [m].
+_AT_BENCH = 0.25
 # Interval between two moments of a cycle [s].
 _EVERY = 0.5
 # Spacing of the points on the bench, and their distance from its edges [m].
@@ -98,7 +101,7 @@ def main(args: Args) -> None:
     figures = show(grid, kept)
     if args.figure is not None:
         with new_file(args.figure) as part:
-            draw(grid[..., -1, :], x, y).savefig(part, dpi=150)
+            draw(grid[..., -1, :], x, y, places_at_bench(q)).savefig(part, dpi=150)
     if args.json is not None:
         cli.write_json(args.json, figures)
 
@@ -201,10 +204,22 @@ def show(grid: Float[np.ndarray, "side x y speed 2"], kept: Tensor) -> dict[str,
     return figures
 
 
+def places_at_bench(q: Float[Tensor, "moments 7"]) -> dict[str, Float[np.ndarray, "2"]]:
+    """Mean places of elbow and tool while the tool is above the bench [m]."""
+    tool = panda.forward(q).position
+    elbow = panda.joint_origins(q)[:, panda.elbow - 1]
+    there = tool[:, 1] > _AT_BENCH
+    return {
+        name: points[there, :2].mean(0).numpy()
+        for name, points in (("elbow", elbow), ("tool", tool))
+    }
+
+
 def draw(
     grid: Float[np.ndarray, "side x y 2"],
     x: Float[np.ndarray, " x"],
     y: Float[np.ndarray, " y"],
+    places: dict[str, Float[np.ndarray, "2"]],
 ) -> Figure:
     """Maps of the moments that are blocked, and of those that the best posture avoids."""
     with matplotlib.rc_context(STYLE):
@@ -212,14 +227,18 @@ def draw(
         axes = figure.subplots(2, len(SIDES), sharex=True, sharey=True)
         rows = (
             ("blocked", grid[..., 0], "Greys"),
-            ("avoidable", grid[..., 0] - grid[..., 1], "Oranges"),
+            ("avoidable by posture", grid[..., 0] - grid[..., 1], "Oranges"),
         )
         for row, (name, values, colours) in zip(axes, rows, strict=True):
             for side, (axis, panel) in enumerate(zip(row, values, strict=True)):
                 image = axis.pcolormesh(x, y, 100 * panel.T, cmap=colours, vmin=0, vmax=100)
                 axis.set_aspect("equal")
-                axis.set_title(f"{name}, worker at the\n{SIDES[side]}", fontsize=8)
+                axis.set_title(f"{name}:\nworker at the {SIDES[side]}", fontsize=8)
+                for mark, (place, point) in zip("o^", places.items(), strict=True):
+                    label = f"{place}, mean at the bench"
+                    axis.plot(*point, mark, color=palette.SERIES[0], ms=5, label=label)
             figure.colorbar(image, ax=list(row), label="moments of the cycle [%]")
+        axes[0, 0].legend(loc="lower left", fontsize=6)
         for axis in axes[-1]:
             axis.set_xlabel("x of the hand [m]")
         for axis in axes[:, 0]:

@@ -175,6 +175,13 @@ PROGRAMS = (
         pictures=("worker_study.png",),
         needs=("outputs/demo",),
     ),
+    Program(
+        heading="What another posture could gain near a worker",
+        command="python benchmarks/posture_bound.py --placing outputs/demo/placing "
+        "--aiming outputs/demo/aiming --figure docs/images/posture_bound.png",
+        pictures=("posture_bound.png",),
+        needs=("outputs/demo",),
+    ),
 )
 """Programs in the order of the gallery."""
 
