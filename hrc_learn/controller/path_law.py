@@ -252,7 +252,7 @@ class PathLaw:
             (zero, torch.zeros_like(state.aside)),
         )
         stops = ~backs & state.aside & (state.lost | path.narrow_ahead | singular)
-        ratio = torch.where(path.blocked | stops, torch.inf, ratio)
+        ratio = torch.where((path.blocked & state.aside) | stops, torch.inf, ratio)
         rate = joint_path.changed_rate(path.rate, 2.0 - ratio, dt, torch.where(backs, -1, 1))
         progress = (path.progress + rate * state.pace.scale).clamp(min=0)
         then = {"progress": progress, "rate": rate, "waited": waited, "nearest": nearest}
@@ -287,7 +287,7 @@ class PathLaw:
             goal=target.goal,
             pose=pose,
             twist=twist,
-            blocked=tracked.blocked,
+            blocked=tracked.blocked | (path.blocked & state.pushed & ~off.aside),
             narrow_ahead=target.narrow_ahead,
             direct_return=replace(direct, time=direct.time + passed),
         )
@@ -335,7 +335,8 @@ class PathLaw:
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
         # Joints on the path that lag without a push are in contact with an object: they do not
         # count as off the path.
-        stays = pushed | (aside & (error.norm(dim=-1) > _BACK))
+        away = error.norm(dim=-1) > _BACK
+        stays = (pushed & (away | ~path.blocked)) | (aside & away)
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
         lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)
