@@ -132,7 +132,8 @@ class PathState:
     twist: Float[Tensor, "*batch 6"]
     """Velocity of `pose` along the path (linear [m/s], angular [rad/s])."""
     blocked: Bool[Tensor, "*batch"]
-    """True if the arm is off its path and would collide if the path advanced."""
+    """True if the arm is off its path and would collide if the path advanced. It stays true for
+    joints on the path until a push ends: the path was planned past the obstacle."""
     narrow_ahead: Bool[Tensor, "*batch"]
     """True if the path comes near a singularity within its stopping distance. Near a
     singularity, the joints cannot leave the path."""

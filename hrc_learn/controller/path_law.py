@@ -335,8 +335,7 @@ class PathLaw:
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
         # Joints on the path that lag without a push are in contact with an object: they do not
         # count as off the path.
-        away = error.norm(dim=-1) > _BACK
-        stays = (pushed & (away | ~path.blocked)) | (aside & away)
+        stays = (pushed & ~path.blocked) | ((pushed | aside) & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
         lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)
