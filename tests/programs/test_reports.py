@@ -298,6 +298,8 @@ def test_a_dashboard_is_photographed_once_it_stays_the_same():
     dashboards = load(ROOT / "tools" / "docs" / "dashboards.py")
     viewer = Viewer(b"arm", b"arm and plot", b"all", b"all", b"later")
     assert dashboards._settled(viewer, 1.0) == b"all"
+    slow = Viewer(b"story", b"story", b"story", b"person", b"person")
+    assert dashboards._settled(slow, 1.0, before=b"story") == b"person"
     restless = Viewer(*(bytes([k]) for k in range(100)))
     with pytest.raises(ValueError, match=r"draws for longer than 20 s: raise --pause"):
         dashboards._settled(restless, 1.0)
