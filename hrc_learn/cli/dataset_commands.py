@@ -83,22 +83,18 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
     if mapping is not None:
         read = read_toml if mapping.suffix == ".toml" else read_json
         said = updated(said, read(mapping), f"{mapping}: ")
-    turn = _words(args.orientation)
     fields = {
         "joint_position": _words(args.joints),
         "command_position": _words(args.command),
         "gripper": _words(args.gripper),
         "position": _words(args.position),
-        f"quaternion_{args.quaternion_order}": turn,
+        f"quaternion_{args.quaternion_order}": _words(args.orientation),
     }
     given = {name: words for name, words in fields.items() if words}
-    chosen = {"duration": args.duration, "fps": args.fps, "task": args.task}
-    chosen |= {
-        "time": args.time or None,
-        "joint_names": tuple(_words(args.joint_names)) or None,
-    }
-    chosen = {name: value for name, value in chosen.items() if value is not None}
-    return replace(said, columns=said.columns | given, units=said.units | args.units, **chosen)
+    own = {"duration": args.duration, "fps": args.fps, "task": args.task}
+    own |= {"time": args.time or None, "joint_names": tuple(_words(args.joint_names)) or None}
+    own = {name: value for name, value in own.items() if value is not None}
+    return replace(said, columns=said.columns | given, units=said.units | args.units, **own)
 
 
 def _words(values: Sequence[str]) -> list[str]:

@@ -181,8 +181,7 @@ class Gamepad(Human):
             self._controller.get_axis(axis) / _FULL for axis in (_LEFT_X, _LEFT_Y, _RIGHT_Y)
         )
         # A stick that points forward or up reads negative; the base's y axis points left.
-        stick = np.array([-y, -x, -z])
-        q, direction = state.joint_position, deflection(stick)
+        q, direction = state.joint_position, deflection(np.array([-y, -x, -z]))
         return gizmo_command(self._chain, q, (), self.forces, direction=direction).twist
 
 

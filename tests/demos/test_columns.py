@@ -44,7 +44,7 @@ def tool(kind, count):
         ("a b c", {"joint_position": [0, 1, 2]}, False, ""),
         (3, {"joint_position": [0, 1, 2]}, False, "names no components: taken for 3 joints"),
         # Where one name tells its quantity, bare ones are no joints.
-        ("a.pos b", {"joint_position": [0]}, True, ""),
+        ("a.pos b", {"joint_position": [0]}, True, "b left out"),
         ("a.vel b.vel", {"joint_velocity": [0, 1]}, False, ""),
         (
             "waist object_x",
@@ -368,3 +368,13 @@ def test_a_state_of_joints_comes_before_any_state(key):
         "joint_position",
         "joint_velocity",
     }
+
+
+@pytest.mark.parametrize("key", [STATE, "action"])
+def test_components_whose_names_are_unknown_next_to_named_joints_are_noted(key):
+    """A gripper and five joints in two alphabets, of which one ends in .pos."""
+    found = mapped({key: "схват.pos 关节1 关节2 关节3"})
+    (note,) = found.notes
+    assert note.startswith(f"{key}: 关节1, 关节2, 关节3 left out")
+    assert "--mapping joint_position" in note
+    assert not mapped({key: "joint_1.pos joint_2.pos gripper.pos"}).notes

@@ -160,8 +160,14 @@ def test_episodes_are_selected_by_index_task_and_condition(root):
         ({"episodes": []}, "no episode was asked for; None reads all"),
         ({"episodes": [0, 3]}, "there is no such episode: choose from 0 to 2"),
         ({"tasks": "cut"}, "no episode shows the task 'cut'; tasks shown: 'pour', 'stir'"),
-        ({"episodes": [0], "tasks": "stir"}, "no episode is left by the filters given"),
-        ({"where": lambda entry: False}, "no episode is left by the filters given"),
+        (
+            {"episodes": [0], "tasks": "stir"},
+            "no episode of two frames is left by the filters given",
+        ),
+        (
+            {"where": lambda entry: False},
+            "no episode of two frames is left by the filters given",
+        ),
     ):
         with pytest.raises(DatasetError, match=text):
             select_episodes(folder, **given)

@@ -144,7 +144,7 @@ def test_episodes_are_chosen_by_task_and_by_their_metadata(tmp_path, read):
     assert [demo.episode for demo in long] == [3, 4]
     with pytest.raises(DatasetError, match=r"'stir'; tasks shown: 'place', 'pour', 'reach'"):
         read(root, tasks="stir")
-    with pytest.raises(DatasetError, match="no episode is left by the filters"):
+    with pytest.raises(DatasetError, match="no episode of two frames is left by the filters"):
         read(root, tasks="pour", where=lambda entry: entry.length > 90)
 
 

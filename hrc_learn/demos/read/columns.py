@@ -338,6 +338,12 @@ class _Conventions:
                 for name, meaning in zip(names, meanings, strict=True)
             ]
         usual = None if any(map(naming.names_joint_quantity, names)) else "joint_position"
+        unknown = [name for name, known in zip(names, meanings, strict=True) if known is None]
+        if unknown and usual is None:
+            text = (
+                "left out, as the names are unknown; --mapping joint_position names all joints"
+            )
+            self._notes.append(f"{feature.key}: {', '.join(unknown)} {text}")
         return [
             self._joint(feature, name, meaning)
             if (meaning.role if meaning else usual) == "joint_position"

@@ -373,5 +373,5 @@ def select_episodes(
         chosen = [entry for entry in chosen if wanted & {*entry.tasks}]
     chosen = [entry for entry in chosen if where is None or where(entry)]
     if not chosen:
-        raise DatasetError("no episode is left by the filters given", file=root)
+        raise DatasetError("no episode of two frames is left by the filters given", file=root)
     return tuple(chosen)
