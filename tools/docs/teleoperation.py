@@ -42,6 +42,8 @@ VIEW = (720, 450)
 """Of the headset's pictures [px]."""
 STANDS, LOOKS_AT = (0.35, 1.55, 0.0), (-0.08, 1.05, -0.95)
 """Where the person stands who wears it, and looks, in the room (y up) [m]."""
+MOVED = 0.3
+"""Motion of the end effector after which a region is photographed [m]."""
 SCENES = 14
 """Pictures of each part of the film."""
 FRAME = 150
@@ -93,7 +95,9 @@ def _at_the_page(session: Session, browser: Browser) -> Iterator[tuple[str, byte
         pass
     browser.tab.get_by_role("checkbox", name="Active").check()
     wait_until(lambda: session.asked.region is not None, "a region")
-    time.sleep(8.0)
+    then = session.frame(-1)
+    wait_until(lambda: np.linalg.norm(session.frame(-1) - then) > MOVED, "motion to the region")
+    time.sleep(5.0)
     yield "page_region.jpg", browser.tab.screenshot(type="jpeg", quality=85)
 
 
