@@ -466,16 +466,17 @@ class SafetyFilter(nn.Module):
         """The velocity that keeps limits and distances and is nearest to a given one, and a
         report.
         """
-        state, command = given.state, given.command
-        assert given.jacobian is not None
-        # Fraction of the command that the arm has reached so far.
-        square = torch.linalg.vecdot(command, command)
-        along = torch.linalg.vecdot(command, v)
+        state, command, J = given.state, given.command, given.jacobian
+        assert J is not None
+        # Fraction of the commanded motion of the tool that the arm has reached so far. Motion of
+        # the null space does not count.
+        asked, reached = torch.linalg.vecdot(J, torch.stack([command, v]).unsqueeze(-2))
+        square, along = torch.linalg.vecdot(asked, asked), torch.linalg.vecdot(asked, reached)
         fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
         v, report = constrained_velocity(
             v,
             command,
-            given.jacobian,
+            J,
             *self.barrier.reachable_velocity(
                 state.velocity, state.acceleration, given.bounds, given.dt
             ),

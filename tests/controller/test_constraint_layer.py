@@ -443,6 +443,23 @@ class TestInTheFilter:
         assert float(report.constraints.slowed) == pytest.approx(0.5, abs=1e-6)
         torch.testing.assert_close(v, 0.5 * task + null, rtol=0, atol=1e-6)
 
+    def test_a_task_slows_down_while_the_null_space_turns_back(self):
+        """The tool stays on its path, whatever the null space still has to catch up."""
+        safety, q = SafetyFilter(panda.limits, self.config), panda.ready
+        J = panda.jacobian(q)
+        task = 0.02 * torch.linalg.pinv(J)[:, 0]
+        null = 1.0 * null_projection(J, torch.eye(7, dtype=DOUBLE)[2])
+        ahead = Distances(
+            distance=torch.tensor([0.03], dtype=DOUBLE) + (task @ task) / 10,
+            gradient=-task.unsqueeze(0),
+            approach_speed=torch.zeros(1, dtype=DOUBLE),
+        )
+        moving = safety.initial_state(q, task - null)
+        v, _, report = safety.step(moving, q, task + null, 0.01, jacobian=J, distances=ahead)
+        # The weights trade 1e-4 of the task for the null space.
+        assert float(report.constraints.slowed) == pytest.approx(0.5, abs=2e-4)
+        torch.testing.assert_close(J @ v, 0.5 * (J @ task), rtol=0, atol=4e-6)
+
     def test_a_stop_stays_a_stop_whoever_comes(self):
         safety, q = SafetyFilter(panda.limits, self.config), panda.ready
         near = Distances(
