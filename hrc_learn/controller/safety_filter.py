@@ -468,8 +468,8 @@ class SafetyFilter(nn.Module):
         """
         state, command, J = given.state, given.command, given.jacobian
         assert J is not None
-        # Fraction of the commanded motion of the tool that the arm has reached so far. Motion of
-        # the null space does not count.
+        # Fraction of the commanded motion of the tool that the arm has reached so far; motion
+        # of the null space does not count.
         asked, reached = torch.linalg.vecdot(J, torch.stack([command, v]).unsqueeze(-2))
         square, along = torch.linalg.vecdot(asked, asked), torch.linalg.vecdot(asked, reached)
         fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
