@@ -108,7 +108,7 @@ def test_an_arm_with_a_driver_does_not_go_home_through_a_board(tmp_path):
         steps = [session.step() for _ in range(50)]
         status = session._status(steps[-1])
     note = status.note
-    assert status.title == "panda"
+    assert status.title == "Panda"
     assert "would meet board_upper" in note
     assert "guide the arm out first" in note
     moved = steps[-1].state.joint_position - steps[0].state.joint_position
