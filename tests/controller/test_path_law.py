@@ -193,6 +193,17 @@ def test_a_lasting_push_does_not_hold_joints_on_a_path_past_an_obstacle():
     assert largest_deviation(3.0) < largest_deviation(0.0) + 1e-3
 
 
+@pytest.mark.parametrize("pushed", [True, False])
+def test_what_blocks_a_push_counts_until_the_push_ends(pushed):
+    """Joints on the path go on, and may be pushed off it again after a new push."""
+    state = state_of(1, blocked=True, rate=1.0)
+    state = replace(state, null_velocity=0.1 * float(pushed) * null_unit(Q)[None])
+    request = FollowPath(paths=PATHS, path=torch.tensor([1]))
+    _, later = law().follow(state, reading_at(Q[None].clone()), request)
+    assert later.path.blocked.tolist() == [pushed]
+    assert not later.aside.any()
+
+
 def elbow_speed(q, velocity, h=1e-6):
     """Speed of the fastest joint origin, by differences [m/s]."""
     moved = panda.joint_origins(q + h * velocity) - panda.joint_origins(q)
