@@ -290,3 +290,10 @@ def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
     for scale in (0.0, float("inf")):
         with pytest.raises(ValueError, match="scale must be positive"):
             smooth(Smooth(dataset=dataset, limits=file, scale=scale))
+
+
+def test_a_damaged_file_is_to_be_written_again(tmp_path):
+    file = tmp_path / "limits.json"
+    file.write_text("{}", encoding="utf-8")
+    with pytest.raises(ValueError, match="write the limits of actions again by hrc smooth"):
+        ActionLimits.load(file)
