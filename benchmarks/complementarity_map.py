@@ -34,7 +34,15 @@ from rich.table import Table
 from torch import Tensor
 from worker_job import JobCycle, random_cycles
 from worker_runs import Job, Reaction, run_near_workers
-from worker_study import MODES, Mode, WorkerStudyConfig, key, measure_contacts
+from worker_study import (
+    MODES,
+    REACH,
+    READINGS,
+    Mode,
+    WorkerStudyConfig,
+    key,
+    measure_contacts,
+)
 from working_worker import PLACES, WatchingExperts, Where, Work, WorkingWorkers, draw_work
 
 from hrc_learn import cli
@@ -45,13 +53,8 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 
-# Largest distance of the object from the middle of the table, along x and y [m]: as in
-# worker_study.py.
-_REACH = (0.10, 0.08)
 # Speeds of arm and worker towards each other whose protective distance plans keep [m/s].
 _ARM, _WORKER = 0.1, 1.0
-# Readings of the encoders after which their noise repeats.
-_READINGS = 1000
 # The longest time of a run [s]: several cycles.
 _LIMIT = 120.0
 # Work of a worker without an arm lasts as long as the arm's cycle without a worker [s].
@@ -116,7 +119,7 @@ def main(args: Args) -> None:
         config = WorkerStudyConfig(runs=args.runs, seed=args.seed)
         with Progress() as progress, torch.inference_mode():
             rng = np.random.default_rng([args.seed, 0, 1])
-            drawn = random_cycles(workplace, placing, args.cycles, _REACH, rng, config.cell.dt)
+            drawn = random_cycles(workplace, placing, args.cycles, REACH, rng, config.cell.dt)
             cycles = list(progress.track(drawn, args.cycles, description="planning"))
             works = draw_works(workplace, cells, args.runs, args.seed)
             for name in missing:
@@ -188,7 +191,7 @@ def make_job(
     for run in range(len(works)):
         rng = np.random.default_rng([config.seed, run])
         offset.append(sizes.draw(rng).encoder_offset)
-        noise.append(sizes.encoder_noise * rng.standard_normal((_READINGS, 7)))
+        noise.append(sizes.encoder_noise * rng.standard_normal((READINGS, 7)))
     return Job(
         workplace=workplace,
         arm=arm,

@@ -29,7 +29,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 from worker_job import random_cycles
-from worker_study import WorkerStudyConfig
+from worker_study import REACH, WorkerStudyConfig
 
 from hrc_learn import cli
 from hrc_learn.kinematics import CapsuleArm, panda, separation
@@ -53,7 +53,6 @@ _EVERY = 0.5
 _GRID, _EDGE = 0.08, 0.06
 # Distance of a worker's spine from the edge of the bench, as a fraction of the stature.
 _STAND = 0.13
-_REACH = (0.10, 0.08)
 SIDES = ("far side", "end at the elbow", "end at the tool")
 """Edges of the bench at which a worker may stand: that opposite the arm, -x and +x."""
 
@@ -85,7 +84,7 @@ def main(args: Args) -> None:
     kept = rules.protective_distance(slow, speeds)
     with torch.inference_mode():
         rng = np.random.default_rng([args.seed, 0, 1])
-        drawn = random_cycles(workplace, placing, args.cycles, _REACH, rng, config.cell.dt)
+        drawn = random_cycles(workplace, placing, args.cycles, REACH, rng, config.cell.dt)
         every = round(_EVERY / config.cell.dt)
         q = torch.cat([torch.from_numpy(cycle.path[::every]) for cycle in drawn])
         postures, valid = all_postures(workplace, q)

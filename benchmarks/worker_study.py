@@ -61,15 +61,15 @@ MODES: tuple[Mode, ...] = ("none", "expert", "automatic", "both")
 
 # Number of parallel runs: their tables of visits need about 2 GB.
 _BATCH = 250
-# Readings of the encoders after which their noise repeats.
-_READINGS = 1000
+READINGS = 1000
+"""Readings of the encoders after which their noise repeats."""
 # Reaction time of the expert after the worker begins to reach [s]: as in bench_constraints.py.
 _REACTION = 0.4
 # Force with which the expert pulls the elbow away [N], and distance of the point towards which
 # it is pulled [m]: so far that the direction stays constant (`random_pulls`).
 _FORCE, _FAR_AWAY = 60.0, 10.0
-# Largest distance of the object from the middle of the table, along x and y [m].
-_REACH = (0.10, 0.08)
+REACH = (0.10, 0.08)
+"""Largest distance of the object from the middle of the table, along x and y [m]."""
 _COLUMNS = (
     ("viol.\nruns", "violated_runs", "{:.0f}"),
     ("least\nmargin", "margin_least_mm", "{:.0f}"),
@@ -138,7 +138,7 @@ def main(args: Args) -> int:
     with Progress() as progress, torch.inference_mode():
         # A seed of another length than those of the runs.
         rng = np.random.default_rng([args.seed, 0, 1])
-        drawn = random_cycles(workplace, placing, args.cycles, _REACH, rng, config.cell.dt)
+        drawn = random_cycles(workplace, placing, args.cycles, REACH, rng, config.cell.dt)
         cycles = list(progress.track(drawn, args.cycles, description="planning"))
         tasks = {}
 
@@ -255,7 +255,7 @@ def draw_job(
         visits.append(random_visit(worker, rng, bench=table, under=centre))
         drawn = sizes.draw(rng)
         offset.append(drawn.encoder_offset)
-        noise.append(sizes.encoder_noise * rng.standard_normal((_READINGS, 7)))
+        noise.append(sizes.encoder_noise * rng.standard_normal((READINGS, 7)))
         chances.append(rng)
     return Job(
         workplace=workplace,

@@ -193,7 +193,7 @@ def _part(
         if worker.lean_to(target, int(target[1] < 0)) is not None:
             return point
     raise ValueError(
-        f"a worker of {worker.config.stature:.2f} m cannot reach under the {where}."
+        f"a worker of {worker.config.stature:.2f} m cannot reach the parts ({where})."
     )
 
 
