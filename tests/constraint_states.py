@@ -30,7 +30,7 @@ class State:
     @property
     def arguments(self) -> tuple:
         wanted = self.task + self.null
-        return (wanted, self.task, self.jacobian, self.lower, self.upper, self.distances)
+        return (wanted, self.jacobian, self.lower, self.upper, self.distances)
 
 
 def of_panda(count: int, seed: int = 0, pairs: int = 8) -> State:
@@ -134,18 +134,20 @@ class Program:
 
 def program(state: State, k: int, config: ConstraintConfig) -> Program:
     """Written down anew, with the singular value decomposition of the Jacobian."""
-    J, task = state.jacobian[k].numpy(), state.task[k].numpy()
+    J = state.jacobian[k].numpy()
     m, n = J.shape
     Q = np.linalg.svd(J)[2].T
     if np.linalg.matrix_rank(J) < m:
         # Which m directions count as those of the path is a matter of rounding then.
         Q = orthonormal_basis(state.jacobian[k]).numpy()
+    g, wanted = state.distances.gradient[k].numpy(), (state.task + state.null)[k].numpy()
+    task = Q[:, :m] @ (Q[:, :m].T @ wanted)
     directions = np.column_stack([Q[:, :m], task, Q[:, m:], np.zeros(n)])
     path = config.task_weight * config.path_weight
+    slowing = config.task_weight * float(np.linalg.norm(task))
     weights = np.array(
-        [path] * m + [config.task_weight] + [1.0] * (n - m) + [path * config.distance_weight]
+        [path] * m + [slowing] + [1.0] * (n - m) + [path * config.distance_weight]
     )
-    g, wanted = state.distances.gradient[k].numpy(), (state.task + state.null)[k].numpy()
     nearing = -g @ directions
     nearing[:, -1] = -1.0
     share = np.zeros((1, n + 2))

@@ -207,11 +207,12 @@ class ConstraintConfig:
     rate: float = 5.0
     """Fastest decay of a distance towards the clearance [1/s], as for joints towards their
     limits; at most 1/dt."""
-    task_weight: float = 100.0
-    """Cost of stopping the task, relative to 1 rad/s of null-space motion. With 100, a change
-    of the null-space velocity by 1 rad/s costs as much as a hundredth of the task's speed."""
+    task_weight: float = 300.0
+    """Cost of slowing the task down, relative to the same change of the null-space velocity:
+    with 300, a change by 1 rad/s costs as much as 0.0033 rad/s of the task."""
     path_weight: float = 1e3
-    """Cost of leaving the path of the task by 1 rad/s, relative to stopping the task."""
+    """Cost of leaving the path of the task, relative to slowing it down by the same joint
+    velocity."""
     distance_weight: float = 1e2
     """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2,
     the violation of conflicting distances exceeds the least possible violation by 1 part in
@@ -292,7 +293,7 @@ class ConstraintReport:
     """Effect of the limits on a joint velocity."""
 
     slowed: Float[Tensor, "*batch"]
-    """Fraction of the task velocity given up, 0 to 1."""
+    """Fraction of the tool's velocity given up, 0 to 1."""
     violation: Float[Tensor, "*batch"]
     """Largest excess of a closing speed over the allowed speed [m/s]; above zero where joint
     limits or other distances permit no better solution."""
@@ -302,27 +303,25 @@ class ConstraintReport:
 
 def constrained_velocity(
     wanted: Float[Tensor, "*batch n"],
-    task: Float[Tensor, "*batch n"],
     jacobian: Float[Tensor, "*batch m n"],
     lower: Float[Tensor, "*batch n"],
     upper: Float[Tensor, "*batch n"],
     distances: Distances | None = None,
     config: ConstraintConfig | None = None,
-    task_fraction: Float[Tensor, "*batch"] | None = None,
     separation: SeparationConfig | None = None,
 ) -> tuple[Float[Tensor, "*batch n"], ConstraintReport]:
     """Joint velocity that keeps all limits and is nearest to a wanted one, with priority for
     the task.
 
-    With the joint velocity t of the task and orthonormal bases N of the null space of J and P
-    of the range of J^T, every joint velocity is
+    With orthonormal bases N of the null space of J and P of the range of J^T, the task is the
+    part t = P P^T wanted, which moves the tool. Every joint velocity is
 
         u = wanted + sigma t + N z + P e,
 
     and the returned velocity solves
 
-        min  |z|^2 + W_t^2 sigma^2 + W_p^2 |e|^2 + W_d^2 delta^2
-        s.t. lower <= u <= upper,   -task_fraction <= sigma <= 0,
+        min  |z|^2 + W_t^2 |sigma t|^2 + W_p^2 |e|^2 + W_d^2 delta^2
+        s.t. lower <= u <= upper,   -1 <= sigma <= 0,
              -dd/dq u <= c + delta,
 
     with c = rate (d - clearance) - approach_speed for objects, and for people the speed that
@@ -331,25 +330,21 @@ def constrained_velocity(
     The weights are far apart (W_t `task_weight`, W_p `path_cost`, W_d `slack_cost` of
     `ConstraintConfig`), which makes them priorities. Joint limits hold exactly. Distances
     hold, or are violated by the least possible excess `delta`, equal for all pairs. The tool
-    stays on the path of the task, J u = J wanted + sigma J t, if the limits allow any motion on
-    it. The task keeps as much of its speed as possible. The null space yields first. Where no
-    limit binds, the result is the wanted velocity.
+    stays on the path of the task, J u = (1 + sigma) J wanted, if the limits allow any motion on
+    it. The null space yields first, then the task loses speed: a slow task stops before the
+    null space becomes fast. Where no limit binds, the result is the wanted velocity.
 
     On the path, the tool never moves faster than wanted, whatever the null space does. To cap
     the speed of the tool, cap the wanted velocity.
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
-        task: Joint velocity of the task [rad/s]; the task may slow down, but keeps this
-            direction. A component that does not move the tool counts as null-space motion.
         jacobian: Jacobian of the tool, with at most as many rows as joints; may be singular.
         lower: Lowest joint velocity allowed by the limits of position, velocity, acceleration
             and jerk [rad/s]. Not above `upper`.
         upper: Highest joint velocity allowed [rad/s].
         distances: Distances to keep; None: no distances.
         config: Weights and clearance; default: the recommended settings.
-        task_fraction: Fraction of `task` that `wanted` contains, 0 to 1; it is below 1 while
-            the arm accelerates. None: 1.
         separation: Protective distance from people; default: the recommended settings.
 
     Returns:
@@ -357,37 +352,36 @@ def constrained_velocity(
     """
     config = config or ConstraintConfig()
     dtype, m = wanted.dtype, jacobian.shape[-2]
-    if task_fraction is None:
-        task_fraction = wanted.new_ones(wanted.shape[:-1])
     # Weights are 1e7 apart, and float32 has seven digits.
-    wanted, task, J, lower, upper, fraction = (
-        x.double() for x in (wanted, task, jacobian, lower, upper, task_fraction)
-    )
-    # Limits of joints, task and distances, relative to the wanted velocity.
-    zero, gradient = torch.zeros_like(fraction), None
-    least = [lower - wanted, -fraction.unsqueeze(-1)]
-    most = [upper - wanted, zero.unsqueeze(-1)]
+    wanted, J, lower, upper = (x.double() for x in (wanted, jacobian, lower, upper))
+    # Limits of joints and distances, relative to the wanted velocity.
+    gradient, least, most = None, lower - wanted, upper - wanted
     if distances is not None:
         distances = distances.double()
         gradient = distances.gradient
         allowed = distances.closing_speed(config, separation or SeparationConfig())
-        least.append(torch.full_like(allowed, -torch.inf))
-        most.append(allowed + torch.linalg.vecdot(gradient, wanted.unsqueeze(-2)))
-    least, most = torch.cat(least, dim=-1), torch.cat(most, dim=-1)
+        allowed = allowed + torch.linalg.vecdot(gradient, wanted.unsqueeze(-2))
+        least = torch.cat([least, torch.full_like(allowed, -torch.inf)], dim=-1)
+        most = torch.cat([most, allowed], dim=-1)
+    zero = torch.zeros_like(wanted[..., 0])
     if may_branch(wanted) and bool((torch.maximum(least, -most) <= _TOLERANCE).all()):
         solved = torch.ones_like(zero, dtype=torch.bool)
         within = wanted.clamp(lower, upper).to(dtype)
         zero = zero.to(dtype)
         return within, ConstraintReport(slowed=zero, violation=zero, solved=solved)
 
-    basis = _unit_cost_directions(J, task, config)
+    basis, speed = _unit_cost_directions(J, wanted, config)
+    # Limits of the task: it slows down to rest at most.
+    least = torch.cat([least, -speed.unsqueeze(-1)], dim=-1)
+    most = torch.cat([most, zero.unsqueeze(-1)], dim=-1)
     change = least_change(_limit_rows(basis, gradient, m, config), least, most, config.steps)
     y, solved = change.point, change.solved
     u = wanted + matmul(y[..., None, :-1], basis).squeeze(-2)
     # Without a solution the arm brakes towards zero; the clamp also removes rounding of the
     # solver.
     u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(lower, upper)
-    slowed = torch.where(solved, -y[..., m] / config.task_weight, fraction)
+    lost = -y[..., m] / config.task_weight / torch.where(speed > 0, speed, 1.0)
+    slowed = torch.where(solved, lost, 1.0)
     violation = torch.where(solved, y[..., -1] / config.slack_cost, 0.0)
     report = ConstraintReport(
         slowed=slowed.to(dtype), violation=violation.to(dtype), solved=solved
@@ -395,31 +389,36 @@ def constrained_velocity(
     return u.to(dtype), report
 
 
-def _unit_cost_directions(jacobian: Tensor, task: Tensor, config: ConstraintConfig) -> Tensor:
+def _unit_cost_directions(
+    jacobian: Tensor, wanted: Tensor, config: ConstraintConfig
+) -> tuple[Tensor, Tensor]:
     """Joint velocities that cost one unit each (directions, n): m directions that leave the
-    path, one along the path, and the directions of the null space.
+    path, one along the path, and the directions of the null space. Second, the speed of the
+    task [rad/s].
     """
     m = jacobian.shape[-2]
     basis = orthonormal_basis(jacobian).mT
-    null, path = basis[..., m:, :], task.unsqueeze(-2)
-    path = path - matmul(matmul(path, null.mT), null)
-    return torch.cat(
-        [basis[..., :m, :] / config.path_cost, path / config.task_weight, null], dim=-2
-    )
+    leaving, null = basis[..., :m, :], basis[..., m:, :]
+    task = matmul(matmul(wanted.unsqueeze(-2), leaving.mT), leaving)
+    square = (task * task).sum((-2, -1))
+    moves = square > 0
+    speed = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)
+    along = task / torch.where(moves, config.task_weight * speed, 1.0)[..., None, None]
+    return torch.cat([leaving / config.path_cost, along, null], dim=-2), speed
 
 
 def _limit_rows(
     basis: Tensor, gradient: Tensor | None, m: int, config: ConstraintConfig
 ) -> Tensor:
     """Argument `rows` of `least_change` (unknowns, limits). The columns are the limits of the
-    joints, of the task and of the distances. The last unknown is the common excess of the
+    joints, of the distances and of the task. The last unknown is the common excess of the
     distances.
     """
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
     slower = torch.zeros_like(joints[..., :1])
     slower[..., m, :] = 1 / config.task_weight
-    rows = [joints, slower]
+    rows = [joints]
     if gradient is not None:
         excess = torch.full_like(gradient[..., 0], 1 / config.slack_cost).unsqueeze(-2)
         rows.append(-torch.cat([matmul(basis, gradient.mT), excess], dim=-2))
-    return torch.cat(rows, dim=-1)
+    return torch.cat([*rows, slower], dim=-1)

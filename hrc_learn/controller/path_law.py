@@ -36,7 +36,8 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# `_ASIDE`: when a path begins, joints farther than this from its start are off the path [rad].
+# `_ASIDE`: joints farther than this from the start of their path, or moved this far in the null
+# space without a push, are off the path [rad].
 # `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
 # by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
@@ -333,11 +334,12 @@ class PathLaw:
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        # Joints on the path that lag without a push are in contact with an object: they do not
-        # count as off the path.
-        stays = (pushed & ~path.blocked) | ((pushed | aside) & (error.norm(dim=-1) > _BACK))
-        aside = (~target.narrow | aside) & stays
         null_error = null_projection(reading.jacobian, error)
+        # Without a push, the constraint layer moves joints off their path. Joints that lag in
+        # other directions are in contact with an object: they do not count as off the path.
+        leaves = pushed | aside | (null_error.norm(dim=-1) > _ASIDE)
+        stays = (pushed & ~path.blocked) | (leaves & (error.norm(dim=-1) > _BACK))
+        aside = (~target.narrow | aside) & stays
         lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)
         # Joints return while the path waits for them and, if `after_push` is "return", also
         # after the push.

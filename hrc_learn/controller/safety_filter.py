@@ -466,23 +466,16 @@ class SafetyFilter(nn.Module):
         """The velocity that keeps limits and distances and is nearest to a given one, and a
         report.
         """
-        state, command, J = given.state, given.command, given.jacobian
+        state, J = given.state, given.jacobian
         assert J is not None
-        # Fraction of the commanded motion of the tool that the arm has reached so far; motion
-        # of the null space does not count.
-        asked, reached = torch.linalg.vecdot(J, torch.stack([command, v]).unsqueeze(-2))
-        square, along = torch.linalg.vecdot(asked, asked), torch.linalg.vecdot(asked, reached)
-        fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
         v, report = constrained_velocity(
             v,
-            command,
             J,
             *self.barrier.reachable_velocity(
                 state.velocity, state.acceleration, given.bounds, given.dt
             ),
             given.distances,
             self.config.constraints,
-            fraction.clamp(0, 1),
             self.config.separation,
         )
         # Rounding of the solver would move joints that have a velocity limit of zero.

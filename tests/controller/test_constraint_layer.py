@@ -97,7 +97,7 @@ def test_a_step_that_ends_early_equals_one_of_all_steps():
     room = 10.0 * (torch.arange(20) % 2)
     near = replace(near, distance=near.distance + room[:, None])
     wide = state.lower - room[:, None], state.upper + room[:, None]
-    arguments = (*state.arguments[:3], *wide, near)
+    arguments = (*state.arguments[:2], *wide, near)
     with shapes_unchecked():  # vmap takes all steps
         every = torch.vmap(lambda *x: constrained(*x, ENOUGH))(*arguments)
     free = 0
@@ -105,7 +105,7 @@ def test_a_step_that_ends_early_equals_one_of_all_steps():
         one = torch.utils._pytree.tree_map(lambda x: x[k], arguments)  # noqa: B023
         few = constrained(*one, ENOUGH)
         for theirs, ours in zip(every, few, strict=True):
-            torch.testing.assert_close(ours, theirs[k], atol=1e-12, rtol=0)
+            torch.testing.assert_close(ours, theirs[k], atol=1e-11, rtol=0)
         free += torch.equal(few.joint_velocity, one[0])
     assert free >= 10
 
@@ -125,13 +125,13 @@ def test_the_order_is_strict_to_the_weight_of_the_task():
             assert off > 1e-6 or found.violation[k] > 1e-6
             continue
         kept += 1
-        # W^2 sigma^2 + z^2 is the least, and so not above that of the fastest task.
+        # W^2 |sigma t|^2 + z^2 is the least, and so not above that of the fastest task.
         most = 2 * (state.upper - state.lower)[k].norm() + state.null[k].norm()
-        slack = float(most) / ENOUGH.task_weight
+        slack = float(most / state.task[k].norm()) / ENOUGH.task_weight
         assert float(found.slowed[k]) <= np.hypot(best, slack) + 1e-6
         # Off the path goes 1 / path_weight^2 of what else is given up: so much spares the task
         # a little more.
-        assert off < 2e-5
+        assert off < 5e-5
         change = found.joint_velocity[k].numpy() - program.wanted
         change = change + float(found.slowed[k]) * state.task[k].numpy()
         astray = np.abs(program.directions[:, : program.paths].T @ change).max()
@@ -184,7 +184,6 @@ def test_a_person_who_comes_faster_than_the_arm_can_recede():
     gradient = torch.tensor([[0.3, -0.2, 0.1, 0.05, 0.0, 0.0, 0.0]], dtype=DOUBLE)
     found = constrained(
         torch.zeros(7, dtype=DOUBLE),
-        torch.zeros(7, dtype=DOUBLE),
         panda.jacobian(panda.ready),
         -limit,
         limit,
@@ -210,36 +209,62 @@ def test_the_null_space_yields_first_and_then_the_task_on_its_path():
     joint = int(null.abs().argmax())
     limit = wide.clone()
     limit[joint] = 0.2 * null[joint].abs() + task[joint].abs()
-    found = constrained(task + null, task, J, -limit, limit)
+    found = constrained(task + null, J, -limit, limit)
     torch.testing.assert_close(J @ found.joint_velocity, twist, rtol=0, atol=1e-4)
     assert abs(float(found.joint_velocity[joint])) == pytest.approx(float(limit[joint]))
     # A task of which every joint may do a third: where the null space cannot help all of them.
     narrow = task.abs() / 3 + 1e-9
-    found = constrained(task, task, J, -narrow, narrow)
+    found = constrained(task, J, -narrow, narrow)
     assert found.slowed == pytest.approx(2 / 3, abs=1e-3)
     done = J @ found.joint_velocity
     torch.testing.assert_close(done, (1 - found.slowed) * twist, rtol=0, atol=1e-6)
 
 
-def test_a_task_that_is_under_way_is_given_up_by_no_more_than_its_share():
+def test_a_task_is_given_up_completely_but_never_runs_backwards():
     J = panda.jacobian(panda.ready)
-    task = torch.linalg.pinv(J)[:, 0] * 0.2
+    task = 0.25 * torch.linalg.pinv(J)[:, 0] * 0.2
     stop = torch.zeros(7, dtype=DOUBLE)
-    share = torch.tensor(0.25, dtype=DOUBLE)
-    found = constrained(0.25 * task, task, J, stop, stop, task_fraction=share)
-    assert found.slowed == pytest.approx(0.25, abs=1e-6)
+    found = constrained(task, J, stop, stop)
+    assert found.slowed == pytest.approx(1.0, abs=1e-6)
     assert not found.joint_velocity.any()
-    # Nor does it run backwards before a person who comes towards it.
+    # A person comes towards it.
     ahead = Distances(
         distance=torch.tensor([0.03], dtype=DOUBLE),
         gradient=-task.unsqueeze(0),
         approach_speed=torch.tensor([0.1], dtype=DOUBLE),
     )
     wide = torch.full((7,), 9.0, dtype=DOUBLE)
-    found = constrained(0.25 * task, task, J, -wide, wide, ahead, task_fraction=share)
-    assert found.slowed == pytest.approx(0.25, abs=1e-9)
+    found = constrained(task, J, -wide, wide, ahead)
+    assert found.slowed == pytest.approx(1.0, abs=1e-9)
     assert found.violation < 1e-3
     assert (ahead.gradient @ found.joint_velocity).item() == pytest.approx(0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("stray", [0.0, 1e-3, 0.02])
+@pytest.mark.parametrize("lever", [1e-4, 1e-3, 1e-2, 0.1])
+def test_the_null_space_does_not_become_fast_for_a_slow_tool(stray: float, lever: float):
+    """Braking leaves a velocity that approaches a person, and the null space changes the
+    distance by a small lever: with costs of absolute speeds, the least cost moves the null
+    space by W_t / 2 times the speed of the tool's part at most, whatever the lever.
+    """
+    J = panda.jacobian(panda.ready)
+    left = torch.linalg.pinv(J)[:, 1]
+    left = left / left.norm()
+    null = null_projection(J, torch.ones(7, dtype=DOUBLE))
+    gradient = -0.3 * left + lever * null / null.norm()
+    near = Distances(
+        distance=torch.tensor([0.0], dtype=DOUBLE),
+        gradient=gradient.unsqueeze(0),
+        approach_speed=torch.tensor([1.0], dtype=DOUBLE),
+        person=torch.tensor([True]),
+    )
+    wide = torch.full((7,), 9.0, dtype=DOUBLE)
+    found = constrained(stray * left, J, -wide, wide, near)
+    W = ConstraintConfig().task_weight
+    assert null_projection(J, found.joint_velocity).norm() <= W / 2 * stray * (1 + 1e-4)
+    # Minimum of z^2 + W^2 t^2 subject to  lever z + 0.3 t = 0.3 stray.
+    saved = lever**2 / (lever**2 + (0.3 / W) ** 2)
+    assert found.slowed == pytest.approx(1 - saved if stray else 0.0, abs=1e-3)
 
 
 def test_single_precision_is_computed_in_double():
@@ -258,15 +283,15 @@ def test_single_precision_is_computed_in_double():
 
 def test_the_exported_layer_is_the_eager_one():
     state = constraint_states.of_panda(1, seed=7)
-    arguments = [x[0] for x in state.arguments[:5]]
+    arguments = [x[0] for x in state.arguments[:4]]
     names = [f.name for f in dataclasses.fields(Distances)]
     near = [getattr(state.distances, name)[0] for name in names]
     config = ConstraintConfig(steps=2)
 
     class Layer(torch.nn.Module):
-        def forward(self, wanted, task, J, lower, upper, *near):
+        def forward(self, wanted, J, lower, upper, *near):
             distances = Distances(**dict(zip(names, near, strict=True)))
-            return tuple(constrained(wanted, task, J, lower, upper, distances, config))
+            return tuple(constrained(wanted, J, lower, upper, distances, config))
 
     with shapes_unchecked():
         program = torch.export.export(Layer(), (*arguments, *near), strict=False)
@@ -305,7 +330,7 @@ def test_one_step_of_the_solver_is_enough_for_one_limit():
     wide = torch.full((7,), 9.0, dtype=DOUBLE)
     upper = wide.clone()
     upper[2] = -0.1
-    found = constrained(still, still, J, -wide, upper, None, ConstraintConfig(steps=1))
+    found = constrained(still, J, -wide, upper, None, ConstraintConfig(steps=1))
     assert found.solved
     assert float(found.joint_velocity[2]) == pytest.approx(-0.1)
     torch.testing.assert_close(
@@ -402,8 +427,8 @@ class TestInTheFilter:
         assert (speeds[0] - wanted).norm() > 0.02
         torch.testing.assert_close(speeds[1], wanted, rtol=0, atol=2e-3)
 
-    def test_it_gives_up_no_more_of_a_task_than_the_arm_has_picked_up(self):
-        """In the first step a small part of it, whoever comes."""
+    def test_an_arm_that_picks_up_speed_gives_up_what_it_has(self):
+        """In the first step, with a person who comes."""
         safety, q = SafetyFilter(panda.limits, self.config), panda.ready
         J = panda.jacobian(q)
         task = 0.3 * torch.linalg.pinv(J)[:, 0]
@@ -417,9 +442,8 @@ class TestInTheFilter:
         w, after, report = safety.step(start, q, task, 0.01, jacobian=J, distances=ahead)
         assert (w - v).norm() > 1e-3
         torch.testing.assert_close(after.acceleration, w / 0.01)  # not that of the command
-        share = float((v @ task) / (task @ task))
-        assert 0 < share < 0.5
-        assert float(report.constraints.slowed) == pytest.approx(share)
+        assert 0 < float((v @ task) / (task @ task)) < 0.5
+        assert float(report.constraints.slowed) == pytest.approx(1.0)
 
     def test_a_task_that_slows_down_leaves_the_null_space_as_it_is(self):
         """Somebody ahead of the tool whom the null space cannot avoid."""
@@ -440,8 +464,9 @@ class TestInTheFilter:
             jacobian=J,
             distances=ahead,
         )
-        assert float(report.constraints.slowed) == pytest.approx(0.5, abs=1e-6)
-        torch.testing.assert_close(v, 0.5 * task + null, rtol=0, atol=1e-6)
+        # To leave the path costs W_p^2 / W_t^2 times as much: 1e-6 of the speed lost.
+        assert float(report.constraints.slowed) == pytest.approx(0.5, abs=2e-6)
+        torch.testing.assert_close(v, 0.5 * task + null, rtol=0, atol=2e-6)
 
     def test_a_task_slows_down_while_the_null_space_turns_back(self):
         """The tool stays on its path, whatever the null space still has to catch up."""

@@ -463,7 +463,9 @@ def test_joints_on_their_path_move_with_it(progress, rate, override):
 # velocity of the push.
 STAYS = {"after_push": "stay"}
 OFF_PATH = {
-    "on the path": ({"off": 0.2}, {}, (False, None, None)),
+    "on the path": ({"off": 0.09}, {}, (False, None, None)),
+    "moved by the constraint layer": ({"off": 0.2}, {}, (True, 0.4, 0.0)),
+    "moved where it is narrow": ({"off": 0.2, "narrow": True}, {}, (False, None, None)),
     "near the path again": ({"off": 0.029, "aside": True}, {}, (False, None, None)),
     "let go": ({"off": 0.05, "aside": True}, {}, (True, 0.2, 0.0)),
     "far": ({"off": 0.2, "aside": True}, {}, (True, 0.4, 0.0)),
