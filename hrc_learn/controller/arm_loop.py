@@ -184,7 +184,7 @@ class ArmLoop:
         self, state: ArmLoopState, reading: ArmReading
     ) -> tuple[Tensor, tuple[Limitation, ...]]:
         """Null-space velocity for the present push [rad/s], and limitations of the push."""
-        requested = self._requested_null_velocity(reading)
+        requested = self._requested_null_velocity(state, reading)
         acts = (requested.norm(dim=-1) > 0) | state.pushed
         if not bool(acts.any()):
             return requested, ()
@@ -211,14 +211,16 @@ class ArmLoop:
             ),
         )
 
-    def _requested_null_velocity(self, reading: ArmReading) -> Tensor:
+    def _requested_null_velocity(self, state: ArmLoopState, reading: ArmReading) -> Tensor:
         """Joint velocity requested by push and repulsion; only its null-space part acts."""
-        config = self.config
-        push = null_space_input(
-            reading.nullspace_input, _distances(reading), config.way_making, config.damping
-        )
-        if push is None:
-            push = torch.zeros_like(reading.nullspace_input)
+        config, still = self.config, torch.zeros_like(reading.nullspace_input)
+        way, path = config.way_making, state.path
+        push = reading.nullspace_input if way is None or way.expert else still
+        own = null_space_input(None, _distances(reading), way, config.damping)
+        if own is not None:
+            # Way-making may last: it must not keep a path waiting.
+            waits = path.followed & (path.rate < 1)
+            push = push + own.masked_fill(waits.unsqueeze(-1), 0.0)
         return _scaled(push, reading) / config.damping
 
     # Poses of the end effector.

@@ -8,7 +8,13 @@ import torch
 from projections import null_space_projector
 from torch.utils._pytree import tree_leaves
 
-from hrc_learn.controller import Command, ConstraintConfig, Distances, SafetyConfig
+from hrc_learn.controller import (
+    Command,
+    ConstraintConfig,
+    Distances,
+    SafetyConfig,
+    WayMakingConfig,
+)
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
@@ -256,6 +262,38 @@ def test_each_arm_of_a_batch_has_its_own_push():
     still = replace(state, null_velocity=0 * moving)
     none = replace(now, nullspace_input=0 * moving)
     assert law.observe(still, none)[1] == ()
+
+
+@pytest.mark.parametrize(
+    ("followed", "rate", "pushed", "moves"),
+    [
+        (True, 1.0, False, True),
+        (True, 0.9, False, False),
+        (True, -0.5, False, False),
+        (False, 0.0, False, True),
+        (True, 0.0, True, True),
+    ],
+)
+def test_way_making_does_not_keep_a_path_waiting(followed, rate, pushed, moves):
+    """A person may hold the arm aside while its path waits; the repulsion may not."""
+    law = loop(way_making=WayMakingConfig(mode="both"))
+    state = law.initial_state(Q)
+    state = replace(
+        state,
+        path=replace(
+            state.path,
+            followed=torch.tensor(followed),
+            rate=torch.tensor(rate, dtype=DOUBLE),
+        ),
+    )
+    near = people(distance=0.1)
+    near = replace(
+        near,
+        distances=replace(near.distances, gradient=UNIT.expand_as(near.distances.gradient)),
+    )
+    push = UNIT if pushed else 0 * UNIT
+    after, _ = law.observe(state, reading(people=near, nullspace_input=push))
+    assert bool(after.pushed) == moves
 
 
 def test_a_push_while_a_pose_is_tracked_is_not_slowed_twice():
