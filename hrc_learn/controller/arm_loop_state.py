@@ -171,13 +171,18 @@ class PathState:
             direct_return=DirectReturn.none(joint_position),
         )
 
+    def longer(self, time: Float[Tensor, "*batch"], dt: float) -> Float[Tensor, "*batch"]:
+        """A waiting time of the path, one step later [s].
+
+        Time in which the path advances is subtracted: a path that stops and starts is stuck
+        only if it rests for more than half of the time.
+        """
+        return (time + (1.0 - 2.0 * self.rate.clamp(min=0)) * dt).clamp(min=0)
+
     def waiting(
         self, off: Tensor, counts: Tensor, stuck_after: float, dt: float
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         """`waited` and `nearest`, one step later.
-
-        Time in which the path advances is subtracted: a path that stops and starts under
-        repeated pushes is stuck only if it rests for more than half of the time.
 
         Args:
             off: Distance of the joints from the path now [rad].
@@ -187,8 +192,8 @@ class PathState:
             dt: Control step [s].
         """
         nearer = counts & (off < self.nearest - _NEARER) & (self.waited <= stuck_after)
-        longer = (self.waited + (1.0 - 2.0 * self.rate.clamp(min=0)) * dt).clamp(min=0)
-        waited = torch.where(nearer, 0.0, torch.where(counts, longer, self.waited))
+        longer = torch.where(counts, self.longer(self.waited, dt), self.waited)
+        waited = torch.where(nearer, 0.0, longer)
         return waited, torch.where(nearer | ~counts, off, self.nearest)
 
     @property

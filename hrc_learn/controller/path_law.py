@@ -236,7 +236,7 @@ class PathLaw:
         off, counts = (path.goal - q).norm(dim=-1), ~pushed & state.pace.at_full_speed
         waited, nearest = path.waiting(off, counts, self.config.back_after, dt)
         waited = torch.where(state.aside, waited, 0.0)
-        held = torch.where((path.rate <= 0) & pushed, path.held + dt, 0.0)
+        held = torch.where(pushed, path.longer(path.held, dt), 0.0)
         # Joints that cannot return to this sample may be able to return to an earlier one, near
         # which they left the path.
         backs = (waited > self.config.back_after) & (path.progress > 0)

@@ -377,7 +377,11 @@ GOES_ON = {
         {"aside": True, "rate": 0.0, "lost": True, "override": 0.5, "waited": 1.0},
         {"waited": 1.0},
     ),
-    "pushed while it goes on": ({"pushed": True, "held": 1.0}, {"held": 0.0}),
+    "pushed while it goes on": ({"pushed": True, "held": 1.0}, {"held": 0.99}),
+    "pushed while it chatters": (
+        {"pushed": True, "rate": 0.05, "held": 1.0},
+        {"held": 1.009},
+    ),
     "let go": ({"rate": 0.0, "held": 1.0}, {"held": 0.0}),
 }
 
