@@ -265,18 +265,23 @@ def test_each_arm_of_a_batch_has_its_own_push():
 
 
 @pytest.mark.parametrize(
-    ("followed", "rate", "pushed", "moves"),
+    ("mode", "followed", "rate", "pushed", "moves"),
     [
-        (True, 1.0, False, True),
-        (True, 0.9, False, False),
-        (True, -0.5, False, False),
-        (False, 0.0, False, True),
-        (True, 0.0, True, True),
+        ("both", True, 1.0, False, True),
+        ("both", True, 0.9, False, False),
+        ("both", True, -0.5, False, False),
+        ("both", False, 0.0, False, True),
+        ("both", True, 0.0, True, True),
+        ("automatic", True, 0.0, True, False),
+        ("automatic", True, 1.0, False, True),
+        ("expert", True, 1.0, False, False),
+        ("expert", True, 0.0, True, True),
+        ("none", True, 1.0, True, False),
     ],
 )
-def test_way_making_does_not_keep_a_path_waiting(followed, rate, pushed, moves):
+def test_way_making_does_not_keep_a_path_waiting(mode, followed, rate, pushed, moves):
     """A person may hold the arm aside while its path waits; the repulsion may not."""
-    law = loop(way_making=WayMakingConfig(mode="both"))
+    law = loop(way_making=WayMakingConfig(mode=mode))
     state = law.initial_state(Q)
     state = replace(
         state,

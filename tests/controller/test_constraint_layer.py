@@ -165,6 +165,7 @@ def test_hard_limits_hold_whether_solved_or_not(steps: int):
     failed = ~found.solved
     assert failed.any() == (steps == 2)
     assert torch.equal(found.joint_velocity[failed], braking[failed])
+    assert (found.slowed[failed] == 1).all()
 
 
 def test_distances_hold_to_the_violation_that_is_told():
