@@ -135,7 +135,7 @@ class Program:
 def program(state: State, k: int, config: ConstraintConfig) -> Program:
     """Written down anew, with the singular value decomposition of the Jacobian."""
     J = state.jacobian[k].numpy()
-    m, n = J.shape
+    m, n = min(J.shape), J.shape[1]
     Q = np.linalg.svd(J)[2].T
     if np.linalg.matrix_rank(J) < m:
         # Which m directions count as those of the path is a matter of rounding then.

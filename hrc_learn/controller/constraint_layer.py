@@ -339,7 +339,8 @@ def constrained_velocity(
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
-        jacobian: Jacobian of the tool, with at most as many rows as joints; may be singular.
+        jacobian: Jacobian of the tool; may be singular. If it has more rows than the arm has
+            joints, the arm has no null space: all motion belongs to the task.
         lower: Lowest joint velocity allowed by the limits of position, velocity, acceleration
             and jerk [rad/s]. Not above `upper`.
         upper: Highest joint velocity allowed [rad/s].
@@ -351,7 +352,7 @@ def constrained_velocity(
         Joint velocities [rad/s], and the effect of the limits.
     """
     config = config or ConstraintConfig()
-    dtype, m = wanted.dtype, jacobian.shape[-2]
+    dtype, m = wanted.dtype, min(jacobian.shape[-2:])
     # Weights are 1e7 apart, and float32 has seven digits.
     wanted, J, lower, upper = (x.double() for x in (wanted, jacobian, lower, upper))
     # Limits of joints and distances, relative to the wanted velocity.
@@ -396,7 +397,7 @@ def _unit_cost_directions(
     path, one along the path, and the directions of the null space. Second, the speed of the
     task [rad/s].
     """
-    m = jacobian.shape[-2]
+    m = min(jacobian.shape[-2:])
     basis = orthonormal_basis(jacobian).mT
     leaving, null = basis[..., :m, :], basis[..., m:, :]
     task = matmul(matmul(wanted.unsqueeze(-2), leaving.mT), leaving)

@@ -341,7 +341,7 @@ def null_projection(
     projection still removes m directions: the range of J^T and some of the null space.
 
     Args:
-        J: Jacobian with at least as many columns as rows.
+        J: Jacobian; with m >= n, nothing but rounding is left of w.
         w: Vector to project.
     """
     if not torch.compiler.is_compiling():
@@ -349,7 +349,7 @@ def null_projection(
         return w - (Q @ (Q.mT @ w.unsqueeze(-1))).squeeze(-1)
     # Apply the reflections that make J^T triangular, drop the first m entries, and reflect
     # back.
-    m = J.shape[-2]
+    m = min(J.shape[-2:])
     reflections = _reflections(J)
     for k, (v, factor) in enumerate(reflections):
         w = _reflected(w, k, v, factor)
@@ -360,13 +360,11 @@ def null_projection(
 
 
 def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
-    """An orthogonal matrix Q; J maps its last n - m columns to zero, up to rounding.
+    """An orthogonal matrix Q; J maps its last n - m columns (none if m >= n) to zero, up to
+    rounding.
 
     The first m columns span the range of J^T and, if the rank of J is below m, some of the
     null space.
-
-    Args:
-        J: Jacobian with at least as many columns as rows.
     """
     if not torch.compiler.is_compiling():
         return torch.linalg.qr(J.mT, mode="complete").Q
@@ -381,7 +379,7 @@ def _reflections(J: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Householder vector v and factor 2 / |v|^2 for each row of J, to make J^T triangular."""
     columns = list(J.unbind(-2))
     reflections: list[tuple[Tensor, Tensor]] = []
-    for k in range(len(columns)):
+    for k in range(min(J.shape[-2:])):
         x = columns[k][..., k:]
         norm = (x * x).sum(-1, keepdim=True).sqrt()
         # Both terms of the sum have the same sign, so no digits cancel.

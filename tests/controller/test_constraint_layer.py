@@ -30,7 +30,13 @@ from hrc_learn.kinematics import panda
 DOUBLE = torch.float64
 # With steps enough for any state.
 ENOUGH = ConstraintConfig(steps=40)
-BOXES = {"6 of 6": (6, 6), "8, 6 rows": (8, 6), "7, 3 rows": (7, 3), "6, 3 rows": (6, 3)}
+BOXES = {
+    "6 of 6": (6, 6),
+    "8, 6 rows": (8, 6),
+    "7, 3 rows": (7, 3),
+    "6, 3 rows": (6, 3),
+    "5, 6 rows": (5, 6),
+}
 
 
 class Found(NamedTuple):
@@ -314,6 +320,41 @@ def test_last_directions_of_the_basis_leave_the_tool_at_rest(singular, compiling
     eye = torch.eye(7, dtype=DOUBLE).expand(20, 7, 7)
     torch.testing.assert_close(basis.mT @ basis, eye, rtol=0, atol=1e-13)
     assert (J @ basis[..., 6:]).abs().max() < 1e-13
+
+
+@pytest.mark.parametrize("compiling", [False, True])
+def test_the_basis_of_an_arm_of_five_joints_is_orthogonal(compiling, monkeypatch):
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: compiling)
+    J = torch.randn(20, 6, 5, generator=sampling.generator(8), dtype=DOUBLE)
+    basis = orthonormal_basis(J)
+    eye = torch.eye(5, dtype=DOUBLE).expand(20, 5, 5)
+    torch.testing.assert_close(basis.mT @ basis, eye, rtol=0, atol=1e-13)
+    assert null_projection(J, basis[..., 0]).abs().max() < 1e-13
+
+
+def test_an_arm_of_five_joints_reports_the_task_it_gives_up_and_settles_conflicts():
+    """Its Jacobian has more rows than columns: all of its motion belongs to the task."""
+    J = torch.randn(6, 5, generator=sampling.generator(9), dtype=DOUBLE)
+    wanted, wide = torch.full((5,), 0.3, dtype=DOUBLE), torch.full((5,), 2.0, dtype=DOUBLE)
+    ahead = torch.full((1, 5), -0.2, dtype=DOUBLE)
+    person = Distances(
+        distance=torch.zeros(1, dtype=DOUBLE),
+        gradient=ahead,
+        approach_speed=torch.zeros(1, dtype=DOUBLE),
+        person=torch.tensor([True]),
+    )
+    found = constrained(wanted, J, -wide, wide, person)
+    assert found.solved
+    assert float(found.slowed) == pytest.approx(1.0, abs=1e-5)
+    assert found.joint_velocity.abs().max() < 1e-5
+    between = Distances(
+        distance=torch.zeros(2, dtype=DOUBLE),
+        gradient=torch.cat([ahead, -ahead]),
+        approach_speed=torch.zeros(2, dtype=DOUBLE),
+    )
+    found = constrained(wanted, J, -wide, wide, between)
+    assert found.solved
+    assert float(found.violation) == pytest.approx(5.0 * 0.03, rel=1e-3)
 
 
 @pytest.mark.parametrize(
