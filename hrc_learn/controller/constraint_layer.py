@@ -21,7 +21,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.utils import _pytree
 
 from hrc_learn.controller.contact_limits import SeparationConfig
 from hrc_learn.geometry.numerics import (
@@ -30,6 +29,7 @@ from hrc_learn.geometry.numerics import (
     matmul,
     may_branch,
     orthonormal_basis,
+    safe_norm,
 )
 from hrc_learn.pytree import pytree, zero_where
 
@@ -265,10 +265,6 @@ class Distances:
             known = known & is_number(self.contact_speed)
         return (known & is_number(self.gradient).all(-1)).all(-1)
 
-    def double(self) -> Distances:
-        """The distances in float64."""
-        return _pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, self)
-
     def where(self, known: Bool[Tensor, "*batch"]) -> Distances:
         """The distances where `known`, zeros elsewhere."""
         return replace(zero_where(~known, self), person=self.person)
@@ -358,8 +354,7 @@ def constrained_velocity(
     # Limits of joints and distances, relative to the wanted velocity.
     gradient, least, most = None, lower - wanted, upper - wanted
     if distances is not None:
-        distances = distances.double()
-        gradient = distances.gradient
+        gradient = distances.gradient.double()
         allowed = distances.closing_speed(config, separation or SeparationConfig())
         allowed = allowed + torch.linalg.vecdot(gradient, wanted.unsqueeze(-2))
         least = torch.cat([least, torch.full_like(allowed, -torch.inf)], dim=-1)
@@ -401,10 +396,8 @@ def _unit_cost_directions(
     basis = orthonormal_basis(jacobian).mT
     leaving, null = basis[..., :m, :], basis[..., m:, :]
     task = matmul(matmul(wanted.unsqueeze(-2), leaving.mT), leaving)
-    square = (task * task).sum((-2, -1))
-    moves = square > 0
-    speed = torch.where(moves, torch.where(moves, square, 1.0).sqrt(), 0.0)
-    along = task / torch.where(moves, config.task_weight * speed, 1.0)[..., None, None]
+    speed = safe_norm(task.squeeze(-2))
+    along = task / torch.where(speed > 0, config.task_weight * speed, 1.0)[..., None, None]
     return torch.cat([leaving / config.path_cost, along, null], dim=-2), speed
 
 

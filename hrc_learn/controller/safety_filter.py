@@ -123,7 +123,7 @@ class SafetyFilter(nn.Module):
         )
 
     def joint_vector(self, values: ArrayLike, name: str) -> Float[Tensor, "*batch n"]:
-        """Joint values as a tensor (*batch, n); tensors are returned as they are.
+        """Joint values as a tensor (*batch, n) in the dtype of the filter.
 
         Args:
             values: Tensor, array or nested lists.
@@ -132,16 +132,15 @@ class SafetyFilter(nn.Module):
         Raises:
             ValueError: The last axis does not have one value for each joint.
         """
-        vector = (
-            values if isinstance(values, Tensor) else as_tensor(values, self.barrier.velocity)
-        )
-        n = self.barrier.velocity.shape[-1]
-        if vector.dim() == 0 or vector.shape[-1] != n:
+        like = self.barrier.velocity
+        if not isinstance(values, Tensor) or values.dtype != like.dtype:
+            values = as_tensor(values, like)
+        if values.shape[-1:] != like.shape[-1:]:
             raise ValueError(
-                f"{name} needs {n} values, one for each joint, but has the shape "
-                f"{tuple(vector.shape)}"
+                f"{name} needs {like.shape[-1]} values, one for each joint, but has the shape "
+                f"{tuple(values.shape)}"
             )
-        return vector
+        return values
 
     def initial_state(
         self,
@@ -209,11 +208,11 @@ class SafetyFilter(nn.Module):
         joint_velocity_command: ArrayLike,
         dt: float | Float[Tensor, ""],
         *,
-        jacobian: Float[Tensor, "*batch rows n"] | None = None,
+        jacobian: ArrayLike | None = None,
         load: Float[Tensor, "*batch 3"] | None = None,
-        joint_velocity: Float[Tensor, "*batch n"] | None = None,
-        human_distance: Float[Tensor, "*batch"] | None = None,
-        stop: Bool[Tensor, "*batch"] | None = None,
+        joint_velocity: ArrayLike | None = None,
+        human_distance: ArrayLike | None = None,
+        stop: Bool[Tensor, "*batch"] | bool | None = None,
         distances: Distances | None = None,
     ) -> tuple[Float[Tensor, "*batch n"], SafetyState, SafetyReport]:
         """Velocity to send for the next `dt` seconds.
@@ -226,14 +225,16 @@ class SafetyFilter(nn.Module):
                 brake to rest.
             dt: Time until the next step [s], or since the last step where steps are irregular.
                 A tensor outside (0, longest_step]: brake to rest, using the last valid step.
-            jacobian: Jacobian of the tool centre point, linear rows first; enables the cap on
-                the speed of tool, elbow and load. Not finite: brake to rest.
+            jacobian: Jacobian of the tool centre point (*batch, rows, n), linear rows first;
+                enables the cap on the speed of tool, elbow and load. Not finite: brake to rest.
             load: Vector from the tool centre point to the far end of a load, in the base frame
                 [m]; needs all six rows of the Jacobian. Not finite: brake to rest.
-            joint_velocity: Measured joint velocities [rad/s]. If they differ from the initial
-                state in the first step, the filter continues from the measured velocities.
-            human_distance: Distance of the tool from the nearest person [m]; a short distance
-                slows down or stops the arm. NaN (unknown): stop. None: no person is monitored.
+            joint_velocity: Measured joint velocities (*batch, n) [rad/s]. If they differ from
+                the initial state in the first step, the filter continues from the measured
+                velocities.
+            human_distance: Distance of the tool from the nearest person (*batch) [m]; a short
+                distance slows down or stops the arm. NaN (unknown): stop. None: no person is
+                monitored.
             stop: True where the arm has to brake to rest for another reason.
             distances: Distances that `SafetyConfig.constraints` keep. Not finite: brake to
                 rest.
@@ -242,11 +243,14 @@ class SafetyFilter(nn.Module):
             The velocity (*batch, n) [rad/s], the next state, and the interventions.
 
         Raises:
-            ValueError: A vector does not have one value for each joint; `dt` is a number
-                outside (0, longest_step]; a distance is given without a Jacobian or without the
-                constraints that would keep it; or constraints are set without a Jacobian.
+            ValueError: A vector, or a row of the Jacobian, does not have one value for each
+                joint; `dt` is a number outside (0, longest_step]; a distance is given without a
+                Jacobian or without the constraints that would keep it; or constraints are set
+                without a Jacobian.
         """
         self._check_arguments(jacobian, human_distance, distances)
+        if jacobian is not None:
+            jacobian = self.joint_vector(jacobian, "each row of jacobian")
         q = self.joint_vector(joint_position, "joint_position")
         u = self.joint_vector(joint_velocity_command, "joint_velocity_command")
         given = self._validated(state, q, u, dt, jacobian, distances, stop)
@@ -273,8 +277,8 @@ class SafetyFilter(nn.Module):
 
     def _check_arguments(
         self,
-        jacobian: Tensor | None,
-        human_distance: Tensor | None,
+        jacobian: ArrayLike | None,
+        human_distance: ArrayLike | None,
         distances: Distances | None,
     ) -> None:
         if distances is not None and self.config.constraints is None:
@@ -296,15 +300,17 @@ class SafetyFilter(nn.Module):
         dt: float | Tensor,
         jacobian: Tensor | None,
         distances: Distances | None,
-        stop: Tensor | None,
+        stop: Tensor | bool | None,
     ) -> _Inputs:
         """Arguments of a step, with invalid values replaced and flagged."""
         state, dt, invalid = self._validated_state(state, dt)
         numbers = [q, u] if jacobian is None else [q, u, jacobian.flatten(-2)]
         invalid = invalid | ~is_number(torch.cat(numbers, dim=-1)).all(-1, keepdim=True)
         if distances is not None:
+            self.joint_vector(distances.gradient, "each row of distances.gradient")
             known = distances.known()
             invalid, distances = invalid | ~known.unsqueeze(-1), distances.where(known)
+        stop = None if stop is None else torch.as_tensor(stop, device=q.device)
         stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
         q = torch.where(invalid, state.position, q)
         if jacobian is not None:
@@ -345,14 +351,15 @@ class SafetyFilter(nn.Module):
         return replace(state, dt=torch.full_like(state.dt, dt)), dt, invalid
 
     def _from_measured_start(
-        self, given: _Inputs, measured: Tensor | None
+        self, given: _Inputs, joint_velocity: ArrayLike | None
     ) -> tuple[_Inputs, Tensor]:
         """The arguments, and the flag `start`: True where the state takes the measured velocity
         because the initial velocity differed from it.
         """
         state = given.state
-        if measured is None:
+        if joint_velocity is None:
             return given, torch.zeros_like(given.invalid)
+        measured = self.joint_vector(joint_velocity, "joint_velocity")
         error = (measured - state.velocity).abs() > _START_ERROR * self.barrier.velocity
         known = is_number(measured).all(-1, keepdim=True)
         wrong = state.fresh.unsqueeze(-1) & known & error.any(-1, keepdim=True)
@@ -398,7 +405,7 @@ class SafetyFilter(nn.Module):
         return inside if self.config.constraints is None else u, _acts(excess), cut
 
     def _cap_speed(
-        self, given: _Inputs, u: Tensor, human_distance: Tensor | None
+        self, given: _Inputs, u: Tensor, human_distance: ArrayLike | None
     ) -> tuple[Tensor, Tensor | float, Tensor, Tensor]:
         """The slowed velocity, the cap, and the flags `tcp_speed` and `separation`."""
         never = torch.zeros_like(given.invalid)
@@ -409,7 +416,8 @@ class SafetyFilter(nn.Module):
         speeding = _acts(excess)
         if human_distance is None:
             return u / excess.clamp(min=1), self.config.tcp_speed, speeding, never
-        safe = self.config.separation.highest_speed(human_distance).unsqueeze(-1)
+        distance = as_tensor(human_distance, u)
+        safe = self.config.separation.highest_speed(distance).unsqueeze(-1)
         cap = safe.clamp(max=self.config.tcp_speed)
         # At a cap of zero, all joints rest, also joints that do not move the tool.
         factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)

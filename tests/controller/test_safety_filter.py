@@ -7,7 +7,14 @@ import torch
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import INTERVENTIONS, SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.controller import (
+    INTERVENTIONS,
+    ConstraintConfig,
+    Distances,
+    SafetyConfig,
+    SafetyFilter,
+    SafetyState,
+)
 from hrc_learn.kinematics import arm, panda
 
 LIMITS = panda.limits
@@ -328,6 +335,46 @@ def test_follows_its_dtype():
     q = READY.float()
     v, state, _ = safety.step(safety.initial_state(q), q, torch.ones(7), 0.01)
     assert v.dtype == state.position.dtype == torch.float32
+
+
+def test_single_precision_arrays_and_numbers_are_taken_as_the_filters_own():
+    safety, u = SafetyFilter(panda), torch.full((7,), 0.1, dtype=torch.float64)
+    q, J, state = READY.float(), panda.jacobian(READY), safety.initial_state(READY.float())
+    distance = torch.tensor(0.5, dtype=torch.float64)
+    expected, _, _ = safety.step(
+        state, q.double(), u, 0.01, jacobian=J, joint_velocity=0 * u, human_distance=distance
+    )
+    for jacobian in (J.numpy(), J.tolist()):
+        v, after, _ = safety.step(
+            state,
+            q,
+            u.numpy(),
+            0.01,
+            jacobian=jacobian,
+            joint_velocity=[0] * 7,
+            human_distance=0.5,
+            stop=False,
+        )
+        torch.testing.assert_close(v, expected, rtol=0, atol=0)
+        assert after.position.dtype == torch.float64
+    single, _, _ = safety.step(state, q, u.float(), 0.01, jacobian=J.float())
+    torch.testing.assert_close(single, expected, rtol=0, atol=1e-6)  # rounding of float32
+    _, _, report = safety.step(state, q, u, 0.01, stop=True)
+    assert report.acted("stopped")
+    assert safety.initial_state(torch.tensor([0, 0, 0, -1, 0, 1, 0])).dt > 0
+
+
+@shapes_unchecked()  # the annotations refuse them earlier
+def test_matrices_for_another_number_of_joints_are_refused_by_name():
+    safety = SafetyFilter(panda, SafetyConfig(constraints=ConstraintConfig()))
+    state, J, u = safety.initial_state(READY), panda.jacobian(READY), torch.zeros(7)
+    with pytest.raises(ValueError, match="each row of jacobian needs 7 values"):
+        safety.step(state, READY, u, 0.01, jacobian=J[:, :6])
+    near = Distances(distance=u[:2], gradient=torch.zeros(2, 6), approach_speed=u[:2])
+    with pytest.raises(ValueError, match=r"each row of distances\.gradient needs 7 values"):
+        safety.step(state, READY, u, 0.01, jacobian=J, distances=near)
+    with pytest.raises(ValueError, match="joint_velocity needs 7 values"):
+        safety.step(state, READY, u, 0.01, jacobian=J, joint_velocity=u[:6])
 
 
 def test_an_arm_gives_its_limits_and_arrays_and_lists_are_accepted():
