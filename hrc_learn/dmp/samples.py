@@ -355,7 +355,8 @@ def _normalised(
         i, k = stalled.nonzero()[0].tolist()
         raise ValueError(
             f"{demo_label(i, batch)}time must increase, but is {time[i, k].item():.6f} s "
-            f"at sample {k} after {(latest[i, k] + first[i, 0]).item():.6f} s"
+            f"at sample {k} after {(latest[i, k] + first[i, 0]).item():.6f} s: remove repeated "
+            "samples, or give large times in float64"
         )
     duration = last - first
     return elapsed.cummax(-1).values / duration, duration[..., 0]

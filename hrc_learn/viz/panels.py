@@ -229,14 +229,13 @@ def joint_plot(
     unit: str = "rad",
 ) -> Plot:
     """Position of joint i over its demonstration and between its limits."""
-    curves = []
+    curves, path = [], f"{root}/{slug(name)}"
     if limits is not None:
-        curves.append(limit_curves(f"{root}/{name}/limits", limits, i, len(position)))
+        curves.append(limit_curves(f"{path}/limits", limits, i, len(position)))
     if demo is not None:
-        path = f"{root}/{name}/demonstration"
-        curves.append(single(path, "demonstration", demo[:, i], palette.DEMO, width=5.0))
-    path = f"{root}/{name}/position"
-    curves.append(single(path, "position", position[:, i], palette.RUN_ON_DARK))
+        shown = f"{path}/demonstration"
+        curves.append(single(shown, "demonstration", demo[:, i], palette.DEMO, width=5.0))
+    curves.append(single(f"{path}/position", "position", position[:, i], palette.RUN_ON_DARK))
     return Plot(title=f"{name} [{unit}]", curves=tuple(curves))
 
 

@@ -18,7 +18,7 @@ from hrc_learn.geometry import Body, Box, Capsule, MeshFile, MeshPart, read_mesh
 from hrc_learn.log import CameraRecording
 from hrc_learn.store import new_file
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Curves, Plot, Tab
+from hrc_learn.viz.panels import Curves, Plot, Tab, slug
 
 TIMELINE = "time"
 """Timeline of all data [s]: the viewer shows only one timeline at a time."""
@@ -118,7 +118,7 @@ def send_rows(stream: rr.RecordingStream, index: list[rr.TimeColumn], curves: Cu
 
 def body_path(body: Body) -> str:
     """Entity of a body."""
-    return f"world/bodies/{body.name}"
+    return f"world/bodies/{slug(body.name)}"
 
 
 def send_shapes(stream: rr.RecordingStream, body: Body) -> None:

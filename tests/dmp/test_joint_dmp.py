@@ -310,6 +310,7 @@ def broken(values, index, value):
         (broken(TIME, 3, torch.inf), POSITION, {}, "time is inf at sample 3"),
         (broken(TIME, 5, TIME[4]), POSITION, {}, "time must increase.*at sample 5"),
         (TIME.flip(0), POSITION, {}, "time must increase.*at sample"),
+        ((TIME + 1e9).float(), POSITION, {}, "time must increase.*large times in float64"),
         (TIME[:-1], POSITION, {}, r"time has shape \(19,\).*must be \(20,\)"),
         (TIME[:2], POSITION[:2], {}, "at least 3 samples, got 2"),
         (TIME, POSITION, {"velocity": POSITION[:3]}, "velocity has shape"),

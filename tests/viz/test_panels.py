@@ -3,7 +3,7 @@ import pytest
 from sample_runs import OPTIONAL, STEPS, sample_run
 
 from hrc_learn.log import JointRanges
-from hrc_learn.viz.panels import Curves, Tab, run_tabs
+from hrc_learn.viz.panels import Curves, Tab, joint_plot, run_tabs
 
 FIELDS = {"camera": "Servoing", "potentials": "Lyapunov"}
 
@@ -114,6 +114,15 @@ def test_names_with_blanks_and_slashes_make_plain_paths():
     values = np.zeros(STEPS)
     shown = curves(run_tabs(sample_run(potentials={"box [m/s]": values})))
     assert "regions/box_m_s" in shown
+
+
+def test_joints_named_with_blanks_and_slashes_have_plain_paths():
+    values = np.zeros((5, 1))
+    limits = JointRanges(lower=-np.ones(1), upper=np.ones(1))
+    plot = joint_plot("joints", "wrist 1/a", 0, values, values, limits)
+    assert plot.title == "wrist 1/a [rad]"
+    paths = [curves.path for curves in plot.curves]
+    assert paths == [f"joints/wrist_1_a/{x}" for x in ("limits", "demonstration", "position")]
 
 
 def test_joints_at_their_limits_are_at_the_edges_of_the_bands():
