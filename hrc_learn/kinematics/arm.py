@@ -311,7 +311,7 @@ class Arm(SerialChain):
         if q7 is not None:
             return self._closed_form(self, pose, as_tensor(q7))
         lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
-        batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
+        batch = np.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
         # The scan keeps a margin from the limits, so that joint 7 can still move both ways.
         scan = torch.linspace(
             lower + _MARGIN, upper - _MARGIN, samples, dtype=torch.float64, device=near.device

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -216,7 +217,7 @@ def solve_inverse(
     """
     joints = len(chain.joint_names)
     near = chain.ready if near is None else near
-    batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
+    batch = np.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
     goal = _in_rows(pose, batch)
     wish = near.detach().to(goal.position).expand(*batch, joints).reshape(-1, joints)
     lower, upper = _limits(chain, wish)
@@ -267,7 +268,7 @@ def solutions_from(
         Solutions in the order of the starts; NaN where a start does not lead to the pose.
     """
     count, joints = starts.shape[-2:]
-    batch = torch.broadcast_shapes(pose.position.shape[:-1], starts.shape[:-2])
+    batch = np.broadcast_shapes(pose.position.shape[:-1], starts.shape[:-2])
     goal = _in_rows(pose, batch)
     row = torch.arange(len(goal.position), device=starts.device).repeat_interleave(count)
     start = starts.detach().double().expand(*batch, count, joints).reshape(-1, joints)

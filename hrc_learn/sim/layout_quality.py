@@ -8,7 +8,7 @@ in the same way.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,34 +70,40 @@ def _quality(
 def path_quality(
     robot: Arm,
     clearances: Clearances,
-    points: Float[Tensor, "points 3"],
+    paths: Sequence[Float[Tensor, "points 3"]],
     level_at: float,
     start: Float[Tensor, "postures joints"],
 ) -> Float[Tensor, " postures"]:
-    """Smallest quality along a path to a shelf, with the tilt of `coarse_orientation`.
+    """Smallest quality along paths to shelves, with the tilt of `coarse_orientation`.
 
     Args:
         robot: The arm.
         clearances: Clearances of the arm.
-        points: Path of the tool centre point, from home [m].
+        paths: Paths of the tool centre point, all from home [m].
         level_at: Distance to the right of the base at which the hand is level [m].
         start: Joint positions at the first point [rad].
 
     Returns:
         Quality from 0 (pose not reached, or contact) to 1 (ample margins).
     """
-    lengths = (points[1:] - points[:-1]).norm(dim=-1)
-    ends = torch.cat([torch.zeros(1, dtype=torch.float64), lengths.cumsum(0)])
-    at = torch.linspace(0.0, float(ends[-1]), _STEPS, dtype=torch.float64)
-    columns = [np.interp(at.numpy(), ends.numpy(), column) for column in points.T.numpy()]
-    position = torch.from_numpy(np.stack(columns, axis=-1))
+    # All paths are followed at once, which takes hardly longer than one.
+    position = torch.stack([_sampled(points) for points in paths], dim=1)[:, :, None]
     path = Pose(position, coarse_orientation(position, level_at))
-    q, error = follow_poses(robot, path, start)
+    q, error = follow_poses(robot, path, start.expand(len(paths), -1, -1))
     least = _quality(robot, clearances, q, error).amin(0)
     # The peak speed of a minimum-jerk motion is 1.875 times its mean speed.
     speed = (q[1:] - q[:-1]).abs() * 1.875 * _STEPS / _DURATION
     load = (speed / robot.limits.velocity).amax(-1).amax(0)
-    return torch.where(load > _SPEED, least * (_SPEED / load), least)
+    return torch.where(load > _SPEED, least * (_SPEED / load), least).amin(0)
+
+
+def _sampled(points: Float[Tensor, "points 3"]) -> Float[Tensor, "steps 3"]:
+    """Points at equal distances along a path of straight lines [m]."""
+    lengths = (points[1:] - points[:-1]).norm(dim=-1)
+    ends = torch.cat([torch.zeros(1, dtype=torch.float64), lengths.cumsum(0)])
+    at = torch.linspace(0.0, float(ends[-1]), _STEPS, dtype=torch.float64)
+    columns = [np.interp(at.numpy(), ends.numpy(), column) for column in points.T.numpy()]
+    return torch.from_numpy(np.stack(columns, axis=-1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,21 +176,15 @@ def _turned_above_table(
         middle.orientation.expand(_ACROSS, len(aside), 4),
     )
     q, _ = follow_poses(robot, across, hover.expand(len(aside), -1))
-    halves = []
-    for sense in (-1.0, 1.0):
-        turns = sense * torch.linspace(0.0, math.pi, _HALF_TURN + 1, dtype=torch.float64)
-        about = quaternion.exp(torch.stack([0 * turns, 0 * turns, turns], dim=-1))
-        orientation = quaternion.multiply(about, middle.orientation)[:, None]
-        path = Pose(
-            (middle.position + aside).expand(len(turns), -1, -1),
-            orientation.expand(-1, len(aside), 4),
-        )
-        halves.append(follow_poses(robot, path, q[-1]))
-    (left, left_error), (right, right_error) = halves
-    return (
-        torch.cat([left.flip(0), right[1:]]),
-        torch.cat([left_error.flip(0), right_error[1:]]),
-    )
+    # Half a turn either way, both at once.
+    turns = torch.linspace(0.0, math.pi, _HALF_TURN + 1, dtype=torch.float64)[:, None]
+    turns = turns * torch.tensor([-1.0, 1.0])
+    about = quaternion.exp(torch.stack([0 * turns, 0 * turns, turns], dim=-1))
+    orientation = quaternion.multiply(about, middle.orientation)[:, :, None]
+    position = (middle.position + aside).expand(len(turns), 1, -1, -1)
+    q, error = follow_poses(robot, Pose(position, orientation), q[-1].expand(2, -1, -1))
+    q, error = (torch.cat([x[:, 0].flip(0), x[1:, 1]]) for x in (q, error))
+    return q, error
 
 
 def _other_side(plate: Plate) -> Plate:

@@ -539,13 +539,10 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
     except UnreachableError:
         return None
     clearances, level_at = workplace.arm_clearances, workplace.level_at
-    to_shelves = torch.ones(len(at_home), dtype=torch.float64)
-    for name in workplace.shelf_names():
-        path = workplace.path_to_shelf(name)
-        quality = path_quality(robot, clearances, path, level_at, at_home)
-        to_shelves = torch.minimum(to_shelves, quality)
-        if not bool((to_shelves > 0).any()):
-            return None
+    paths = [workplace.path_to_shelf(name) for name in workplace.shelf_names()]
+    to_shelves = path_quality(robot, clearances, paths, level_at, at_home)
+    if not bool((to_shelves > 0).any()):
+        return None
     best: CellLayout | None = None
     for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
         home, quality = at_home[k], float(to_shelves[k])

@@ -102,7 +102,7 @@ def test_a_path_is_as_good_as_its_worst_sample_and_as_fast_as_the_job_asks(slowe
     assert (expected.max() > 0.02) == (clear > 0)
     assert (load > 0.8).all() == (slower < 1)
     clearances = constant(0.04 * clear, 1.0)
-    found = path_quality(arm, clearances, points, WORKPLACE.level_at, starts())
+    found = path_quality(arm, clearances, [points], WORKPLACE.level_at, starts())
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -97,7 +97,7 @@ def test_a_layout_is_as_good_as_the_worst_of_its_paths(robot):
     home, hover = (torch.tensor(q).double() for q in (place.home_posture, place.hover_posture))
     ways = [
         path_quality(
-            robot, clearances, place.path_to_shelf(name), place.level_at, home[None]
+            robot, clearances, [place.path_to_shelf(name)], place.level_at, home[None]
         ).item()
         for name in place.shelf_names()
     ]
