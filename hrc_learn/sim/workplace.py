@@ -135,9 +135,7 @@ class Workplace:
         """
         if not robot.is_franka:
             return layout_for(robot).workplace
-        scene = SceneConfig()
-        scene = replace(scene, arm=replace(scene.arm, robot=robot))
-        return cls(scene=scene)
+        return cls(scene=SceneConfig(arm=replace(SceneConfig().arm, robot=robot)))
 
     @property
     def robot(self) -> Arm:
@@ -412,8 +410,7 @@ def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
         scale: Distance of the table, relative to the usual one.
         beside: Put the cabinet straight to the side of the axis of the first joint.
     """
-    usual = SceneConfig()
-    usual = replace(usual, arm=replace(usual.arm, robot=robot))
+    usual = SceneConfig(arm=replace(SceneConfig().arm, robot=robot))
     if beside:
         # Begin with the longest way to the shelves: in short demonstrations, the tremor of the
         # person's hand dominates the motion.
@@ -541,8 +538,6 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
     clearances, level_at = workplace.arm_clearances, workplace.level_at
     paths = [workplace.path_to_shelf(name) for name in workplace.shelf_names()]
     to_shelves = path_quality(robot, clearances, paths, level_at, at_home)
-    if not bool((to_shelves > 0).any()):
-        return None
     best: CellLayout | None = None
     for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
         home, quality = at_home[k], float(to_shelves[k])

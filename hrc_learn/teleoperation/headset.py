@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,6 +15,7 @@ import numpy as np
 
 from hrc_learn.geometry import Body, Box, Capsule, read_mesh
 from hrc_learn.geometry.shapes import Colour
+from hrc_learn.store import cache_home, new_file
 from hrc_learn.teleoperation.gate import Content
 
 if TYPE_CHECKING:
@@ -92,11 +96,10 @@ def headset_data(
         joints: Number of joints of the arm.
         more: Further entries of the description, such as the page's features.
     """
+    description = {"bodies": [_held(body, joints) for body in bodies], **more}
     made = {
         "scene.glb": scene_glb(bodies, [*boxes, PEDESTAL]),
-        "scene.json": json.dumps(
-            {"bodies": [_held(b, joints) for b in bodies], **more}
-        ).encode(),
+        "scene.json": json.dumps(description).encode(),
     }
     return {f"/xr/{name}": Content.of(name, body) for name, body in made.items()}
 
@@ -201,17 +204,30 @@ def body_shape(body: Body) -> Trimesh:
 def simplified(mesh: Trimesh) -> Trimesh:
     """Approximate a surface by at most `_TRIANGLES` triangles, which browsers draw quickly.
 
-    A mesh that would lose whole parts is returned unchanged.
+    A mesh that would lose whole parts is returned unchanged. As the work takes seconds for an
+    arm, results are kept in the user's cache. Damaged files there are replaced.
     """
     if len(mesh.faces) <= _TRIANGLES:
         return mesh
+    code = Path(__file__).read_bytes() + version("fast-simplification").encode()
+    key = sha256(code + mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
+    path = cache_home() / "hrc_learn" / "meshes" / f"{key}.npz"
+    with suppress(Exception), np.load(path) as kept:  # checks the checksums in the file
+        return type(mesh)(kept["vertices"], kept["faces"], process=False)
+    few = _decimated(mesh)
+    with suppress(OSError):  # without a cache, everything works, only later
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with new_file(path) as part:
+            np.savez(part, vertices=few.vertices, faces=few.faces)
+    return few
+
+
+def _decimated(mesh: Trimesh) -> Trimesh:
     shape = mesh.copy()
     shape.merge_vertices(merge_norm=True)  # otherwise, edges with two normals would tear
     shape.update_faces(shape.nondegenerate_faces())
     few = shape.simplify_quadric_decimation(face_count=_TRIANGLES, aggression=_AGGRESSION)
-    if np.abs(few.bounds - shape.bounds).max() > _OFF:
-        return mesh
-    return few
+    return mesh if np.abs(few.bounds - shape.bounds).max() > _OFF else few
 
 
 def _joined(meshes: Sequence[Trimesh]) -> Trimesh:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile
+from hrc_learn.teleoperation import headset
 from hrc_learn.teleoperation.headset import (
     body_meshes,
     body_shape,
@@ -21,6 +22,24 @@ f 1 2 4
 f 1 4 3
 f 2 3 4
 """
+
+
+@pytest.fixture(autouse=True)
+def kept(tmp_path_factory, monkeypatch):
+    """Folder of the cached meshes."""
+    home = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    return home / "hrc_learn" / "meshes"
+
+
+@pytest.fixture
+def decimated(monkeypatch):
+    """Meshes that were simplified, rather than taken from the cache."""
+    meshes, simplify = [], headset._decimated
+    monkeypatch.setattr(
+        headset, "_decimated", lambda mesh: meshes.append(mesh) or simplify(mesh)
+    )
+    return meshes
 
 
 def volume(mesh):
@@ -180,3 +199,74 @@ def test_a_mesh_of_which_parts_would_be_lost_stays_as_it_is():
     drawn = simplified(whole)
     for end in (np.min, np.max):
         np.testing.assert_allclose(end(drawn.vertices, 0), end(whole.vertices, 0), atol=2e-3)
+
+
+def fine_capsule(length=0.3):
+    capsule = Capsule(start=(0.0, 0.0, 0.0), end=(0.0, 0.0, length), radius=0.06)
+    return capsule_mesh(capsule, segments=60)
+
+
+def assert_same(mesh, other):
+    for name in ("vertices", "faces", "vertex_normals", "face_normals"):
+        np.testing.assert_array_equal(getattr(mesh, name), getattr(other, name))
+
+
+@pytest.mark.parametrize("largest_change", [2e-3, -1.0], ids=["simplified", "unchanged"])
+def test_a_mesh_from_the_cache_is_the_one_that_was_computed(
+    kept, decimated, monkeypatch, largest_change
+):
+    monkeypatch.setattr(headset, "_OFF", largest_change)
+    first, again = simplified(fine_capsule()), simplified(fine_capsule())
+    assert len(decimated) == 1
+    assert (len(first.faces) <= 1500) == (largest_change > 0)
+    assert_same(again, first)
+    (file,) = kept.iterdir()  # no workspace is left
+    assert file.suffix == ".npz"
+
+
+def test_another_mesh_is_not_taken_for_one_in_the_cache(decimated):
+    meshes = [fine_capsule(), fine_capsule(0.3 + 1e-12), fine_capsule()]
+    meshes[2].faces = meshes[2].faces[::-1]
+    results = [simplified(mesh) for mesh in meshes]
+    assert len(decimated) == 3
+    assert np.ptp(results[1].vertices[:, 2]) == pytest.approx(0.42, abs=2e-3)
+
+
+def test_another_version_of_the_code_or_the_library_simplifies_anew(
+    tmp_path, decimated, monkeypatch
+):
+    simplified(fine_capsule())
+    monkeypatch.setattr(headset, "version", lambda name: "another")
+    simplified(fine_capsule())
+    (tmp_path / "code.py").write_text("another")
+    monkeypatch.setattr(headset, "__file__", str(tmp_path / "code.py"))
+    simplified(fine_capsule())
+    assert len(decimated) == 3
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[: len(content) // 2],
+        lambda content: content[:-1],
+        lambda content: content[:300] + bytes([content[300] ^ 1]) + content[301:],
+        lambda content: b"no archive",
+    ],
+    ids=["empty", "half", "cut", "one bit", "other"],
+)
+def test_a_damaged_file_in_the_cache_is_ignored_and_replaced(kept, decimated, damage):
+    first = simplified(fine_capsule())
+    (file,) = kept.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    assert_same(simplified(fine_capsule()), first)
+    assert len(decimated) == 2
+    assert_same(simplified(fine_capsule()), first)
+    assert len(decimated) == 2
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(kept, decimated):
+    kept.parent.write_text("a file where the folder should be")
+    assert_same(simplified(fine_capsule()), simplified(fine_capsule()))
+    assert len(decimated) == 2
