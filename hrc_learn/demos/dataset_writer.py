@@ -93,8 +93,8 @@ class DatasetWriter:
         self.root = Path(root)
         if not 0 < fps < np.inf:
             raise ValueError(f"fps must be positive, got {fps}")
-        if len(set(joint_names)) != len(joint_names):
-            raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
+        if len(set(joint_names) - {""}) != len(joint_names):
+            raise ValueError(f"joint names must differ and not be empty, got {[*joint_names]}")
         for key in features or {}:
             if key != "action" and not key.startswith(("observation.", "action.")):
                 text = f"feature {key!r} needs a key that LeRobot understands"

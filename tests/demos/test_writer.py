@@ -260,7 +260,8 @@ def test_a_recording_without_episodes_leaves_nothing(tmp_path):
     ("wrong", "fault"),
     [
         ({"fps": 0}, "fps must be positive, got 0"),
-        ({"joint_names": ("a", "b", "a")}, "joint names must differ, got a, b, a"),
+        ({"joint_names": ("a", "b", "a")}, "joint names must differ.*'a', 'b', 'a'"),
+        ({"joint_names": ("a", "")}, "joint names must .*not be empty, got .*'a', ''"),
         ({"features": {"shelf": ("row",)}}, "LeRobot understands: 'observation.shelf'"),
     ],
 )
