@@ -37,7 +37,7 @@ from hrc_learn.pytree import pytree, zero_where
 _TOLERANCE = 1e-10
 # The row of a limit counts as linearly dependent on the active rows if its projection onto
 # their null space is shorter than this fraction of the row. Rounding leaves 1e-16; with weights
-# of 1e8, a fraction of 1e-8 of a row is significant.
+# of 1e7, a fraction of 1e-7 of a row is significant.
 _DEPENDENT = 1e-12
 
 
@@ -207,11 +207,9 @@ class ConstraintConfig:
     rate: float = 5.0
     """Fastest decay of a distance towards the clearance [1/s], as for joints towards their
     limits; at most 1/dt."""
-    task_weight: float = 1e3
+    task_weight: float = 100.0
     """Cost of slowing the task down, relative to the same change of the null-space velocity:
-    with 1e3, a change by 1 rad/s costs as much as 0.001 rad/s of the task. Near a worker, lower
-    weights take more time, and higher ones move the null space so fast that the tool leaves
-    its path (`benchmarks/complementarity_map.py`)."""
+    with 100, a change by 1 rad/s costs as much as 0.01 rad/s of the task."""
     path_weight: float = 1e3
     """Cost of leaving the path of the task, relative to slowing it down by the same joint
     velocity."""
@@ -351,7 +349,7 @@ def constrained_velocity(
     """
     config = config or ConstraintConfig()
     dtype, m = wanted.dtype, min(jacobian.shape[-2:])
-    # Weights are 1e8 apart, and float32 has seven digits.
+    # Weights are 1e7 apart, and float32 has seven digits.
     wanted, J, lower, upper = (x.double() for x in (wanted, jacobian, lower, upper))
     # Limits of joints and distances, relative to the wanted velocity.
     gradient, least, most = None, lower - wanted, upper - wanted
