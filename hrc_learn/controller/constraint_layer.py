@@ -362,8 +362,7 @@ def constrained_velocity(
     zero = torch.zeros_like(wanted[..., 0])
     if may_branch(wanted) and bool((torch.maximum(least, -most) <= _TOLERANCE).all()):
         solved = torch.ones_like(zero, dtype=torch.bool)
-        within = wanted.clamp(lower, upper).to(dtype)
-        zero = zero.to(dtype)
+        within, zero = wanted.clamp(lower, upper).to(dtype), zero.to(dtype)
         return within, ConstraintReport(slowed=zero, violation=zero, solved=solved)
 
     basis, speed = _unit_cost_directions(J, wanted, config)

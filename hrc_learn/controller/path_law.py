@@ -36,11 +36,12 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
-# `_ASIDE`: joints farther than this from the start of their path, or moved this far in the null
-# space without a push, are off the path [rad].
+# `_ASIDE`: when a path begins, joints farther than this from its start are off the path [rad].
+# `_MOVED`: near people, joints farther than this from their path in the null space are off the
+# path [rad]. Where people stop the task, the null space comes to rest within 0.15 rad.
 # `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
 # by 0.03 rad at the speed of transfers.
-_ASIDE, _BACK = 0.1, 0.03
+_ASIDE, _MOVED, _BACK = 0.1, 0.3, 0.03
 
 
 class TrackedPose(NamedTuple):
@@ -335,9 +336,10 @@ class PathLaw:
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
         null_error = null_projection(reading.jacobian, error)
-        # Without a push, the constraint layer moves joints off their path. Joints that lag in
-        # other directions are in contact with an object: they do not count as off the path.
-        leaves = pushed | aside | (null_error.norm(dim=-1) > _ASIDE)
+        # Near people, the constraint layer moves joints off their path. Joints that lag for
+        # another reason are in contact with an object: they do not count as off the path.
+        moved = _MOVED if reading.people is not None else torch.inf
+        leaves = pushed | aside | (null_error.norm(dim=-1) > moved)
         stays = (pushed & ~path.blocked) | (leaves & (error.norm(dim=-1) > _BACK))
         aside = (~target.narrow | aside) & stays
         lost, fraction = torch.zeros_like(aside), torch.ones_like(path.rate)

@@ -35,8 +35,8 @@ NEAR_PEOPLE = ConstraintConfig(distance_weight=0.02)
 """Constraint layer of an arm near people. The path has priority over the distance: the arm need
 not leave its path, since it can brake on the path within the reaction time that the protective
 distance includes. The end effector then deviates from its path by 0.5 mm; with priority for the
-distance, it would deviate by 6 mm. Near a worker, a weight of 0.1 costs 3 s per minute, and
-with 0.01 the end effector deviates by twice as much (`benchmarks/complementarity_map.py`)."""
+distance, it would deviate by 6 mm. Near a worker, higher weights take time and lower ones
+let the end effector deviate more (`benchmarks/complementarity_map.py`)."""
 
 
 @dataclass(frozen=True, kw_only=True)

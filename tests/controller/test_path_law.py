@@ -9,8 +9,14 @@ import torch
 from projections import null_space_projector
 from scipy.spatial.transform import Rotation
 
+from hrc_learn.controller import Distances
 from hrc_learn.controller.arm_loop import ArmLoop
-from hrc_learn.controller.arm_loop_state import ArmLoopConfig, ArmReading, FollowPath
+from hrc_learn.controller.arm_loop_state import (
+    ArmLoopConfig,
+    ArmReading,
+    FollowPath,
+    WatchedPeople,
+)
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.controller.path_law import PathLaw
 from hrc_learn.geometry import Pose, quaternion
@@ -48,6 +54,20 @@ def state_of(rows, **path):
         for name, value in ({"followed": True, "last": SAMPLES - 1} | path).items()
     }
     return replace(state, path=replace(state.path, **values))
+
+
+def people():
+    """A person far from one arm."""
+    one = torch.ones(1, dtype=torch.float64)
+    far = Distances(
+        distance=5.0 * one[:, None],
+        gradient=torch.zeros(1, 1, 7, dtype=torch.float64),
+        approach_speed=0.0 * one[:, None],
+        person=torch.ones(1, 1, dtype=torch.bool),
+    )
+    return WatchedPeople(
+        distances=far, nearest=5.0 * one, age=0.0 * one, speed_scale=one, speed_cap=9.0 * one
+    )
 
 
 def reading_at(q, **values):
@@ -468,8 +488,14 @@ def test_joints_on_their_path_move_with_it(progress, rate, override):
 STAYS = {"after_push": "stay"}
 OFF_PATH = {
     "on the path": ({"off": 0.09}, {}, (False, None, None)),
-    "moved by the constraint layer": ({"off": 0.2}, {}, (True, 0.4, 0.0)),
-    "moved where it is narrow": ({"off": 0.2, "narrow": True}, {}, (False, None, None)),
+    "in contact": ({"off": 0.2}, {}, (False, None, None)),
+    "near people": ({"off": 0.2, "people": True}, {}, (False, None, None)),
+    "moved by the constraint layer": ({"off": 0.31, "people": True}, {}, (True, 0.4, 0.0)),
+    "moved where it is narrow": (
+        {"off": 0.31, "people": True, "narrow": True},
+        {},
+        (False, None, None),
+    ),
     "near the path again": ({"off": 0.029, "aside": True}, {}, (False, None, None)),
     "let go": ({"off": 0.05, "aside": True}, {}, (True, 0.2, 0.0)),
     "far": ({"off": 0.2, "aside": True}, {}, (True, 0.4, 0.0)),
@@ -510,7 +536,8 @@ def test_joints_off_their_path_are_pushed_and_return(name):
     )
     q = (Q - case["off"] * unit)[None]
     request = FollowPath(paths=paths, path=torch.tensor([0]))  # which rests
-    wanted, later = law(**settings).follow(state, reading_at(q), request)
+    reading = reading_at(q, people=people() if case.get("people") else None)
+    wanted, later = law(**settings).follow(state, reading, request)
     assert bool(later.aside) == aside
     kept = [float(limitation.kept) for limitation in wanted.limitations]
     bound = case.get("narrow", False) and not aside
