@@ -32,6 +32,13 @@ RUNS = {
         "hrc play --model outputs/so101_fit --goal 0.7 0.2 0.3 -0.4 1.6 --robot so101 "
         "--out outputs/so101_played"
     ),
+    "outputs/placing_set": (
+        "hrc record expert --episodes 4 --out outputs/placing_set --config robot.fps=25"
+    ),
+    "outputs/policy": (
+        "hrc fit --dataset outputs/placing_set --as-lerobot-policy --n-basis 40 "
+        "--out outputs/policy"
+    ),
     "outputs/fit": "hrc fit outputs/demo/placing_demos --out outputs/fit",
     "outputs/near_worker": (
         "hrc run collaboration --pulls random --worker --out outputs/near_worker"
@@ -92,6 +99,16 @@ PROGRAMS = (
         pictures=("so101.webp",),
         needs=("outputs/so101_set", "outputs/so101_fit", "outputs/so101_played"),
         captions={"so101.webp": "A primitive of three demonstrations, sent to a new goal"},
+    ),
+    Program(
+        heading="People beside a LeRobot policy",
+        command="python tools/docs/policy_film.py",
+        pictures=("policy.webp",),
+        needs=("outputs/placing_set", "outputs/policy"),
+        captions={
+            "policy.webp": "A policy places an object. A person pulls the elbow, a worker "
+            "reaches in, and the arm waits and goes on"
+        },
     ),
     Program(
         heading="Page and headset",
