@@ -41,7 +41,7 @@ from hrc_learn.pytree import apply_where
 # path [rad]. Where people stop the task, the null space comes to rest within 0.15 rad.
 # `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
 # by 0.03 rad at the speed of transfers.
-_ASIDE, _MOVED, _BACK = 0.1, 0.3, 0.03
+_ASIDE, _MOVED, _BACK = 0.1, 0.2, 0.03
 
 
 class TrackedPose(NamedTuple):

@@ -489,7 +489,7 @@ STAYS = {"after_push": "stay"}
 OFF_PATH = {
     "on the path": ({"off": 0.09}, {}, (False, None, None)),
     "in contact": ({"off": 0.2}, {}, (False, None, None)),
-    "near people": ({"off": 0.2, "people": True}, {}, (False, None, None)),
+    "near people": ({"off": 0.18, "people": True}, {}, (False, None, None)),
     "moved by the constraint layer": ({"off": 0.31, "people": True}, {}, (True, 0.4, 0.0)),
     "moved where it is narrow": (
         {"off": 0.31, "people": True, "narrow": True},
