@@ -30,7 +30,7 @@ from hrc_learn.sim.recorded_world import MovingBodies, WorkerDistance
 from hrc_learn.viz import palette
 from hrc_learn.viz.film import Picture, annotated
 
-SIZE = 640, 400
+SIZE = 576, 360
 """Of the pictures [px]."""
 EYE, TOWARDS, FOCAL = (1.75, 0.60, 0.95), (0.10, 0.33, 0.36), 1.0
 """View of cabinet, arm and worker [m], and its focal length by the picture's height."""
