@@ -38,8 +38,8 @@ from hrc_learn.pytree import apply_where
 
 # `_ASIDE`: when a path begins, joints farther than this from its start are off the path [rad].
 # `_MOVED`: near people, joints farther than this from their path in the null space are off the
-# path [rad]. Where a person stopped a turn of the base at 0.8 rad/s, the null space came to rest
-# between 0.1 and 0.2 rad.
+# path [rad]. Where a person stopped a turn of the base at 0.8 rad/s, the null space came to
+# rest between 0.1 and 0.2 rad.
 # `_BACK`: joints that were off the path are back on it within this distance [rad]. Servos lag
 # by 0.03 rad at the speed of transfers.
 _ASIDE, _MOVED, _BACK = 0.1, 0.2, 0.03
