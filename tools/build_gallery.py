@@ -32,6 +32,11 @@ RUNS = {
         "hrc play --model outputs/so101_fit --goal 0.7 0.2 0.3 -0.4 1.6 --robot so101 "
         "--out outputs/so101_played"
     ),
+    "outputs/five": (
+        "hrc record expert --scenario grasping --episodes 5 --out outputs/five "
+        "--config robot.object_pose=true"
+    ),
+    "outputs/thousand": "hrc multiply outputs/five --episodes 1000 --out outputs/thousand",
     "outputs/placing_set": (
         "hrc record expert --episodes 4 --out outputs/placing_set --config robot.fps=25"
     ),
@@ -99,6 +104,16 @@ PROGRAMS = (
         pictures=("so101.webp",),
         needs=("outputs/so101_set", "outputs/so101_fit", "outputs/so101_played"),
         captions={"so101.webp": "A primitive of three demonstrations, sent to a new goal"},
+    ),
+    Program(
+        heading="Five demonstrations become a thousand",
+        command="python tools/docs/multiply_film.py",
+        pictures=("multiply.webp",),
+        needs=("outputs/five", "outputs/thousand"),
+        captions={
+            "multiply.webp": "Motions for new places of the object, each of which physics "
+            "judges before it is written"
+        },
     ),
     Program(
         heading="People beside a LeRobot policy",

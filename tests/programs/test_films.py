@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from sample_runs import sample_run
 
 sys.path.append(str(Path(__file__).parents[2] / "tools" / "docs"))
 import film_pictures  # pyright: ignore[reportMissingImports]
+import multiply_film  # pyright: ignore[reportMissingImports]
+import policy_film  # pyright: ignore[reportMissingImports]
+import readme_film  # pyright: ignore[reportMissingImports]
 
 
 def test_noise_of_a_camera_does_not_change_pictures():
@@ -46,7 +50,6 @@ def test_a_film_has_titles_at_both_ends(tmp_path):
 
 
 def test_captions_of_a_policy_follow_the_speed_of_the_arm():
-    policy_film = pytest.importorskip("policy_film")
     assert "waits" in policy_film.said(0.05)
     assert "slows" in policy_film.said(0.5)
     assert "policy moves" in policy_film.said(1.0)
@@ -55,10 +58,71 @@ def test_captions_of_a_policy_follow_the_speed_of_the_arm():
 
 
 def test_speeds_are_relative_to_those_of_the_policy():
-    policy_film = pytest.importorskip("policy_film")
     time = np.arange(100)[:, None] / policy_film.FPS
     wanted = np.repeat(0.5 * np.minimum(time, 3.0), 7, axis=1)
     speed = policy_film.relative(0.2 * wanted, wanted)
     assert speed.shape == (100,)
     assert speed[20:60] == pytest.approx(0.2)
     assert np.isnan(speed[90:]).all()
+
+
+def test_the_film_shows_a_hand_at_the_elbow_while_it_is_pulled():
+    time = np.linspace(0.0, 30.0, 200)
+    elbow, push = np.array([0.15, 0.15, 0.56]), np.full((200, 2, 3), np.nan)
+    pulled = ((time > 9.9) & (time < 14.1)) | ((time > 19.9) & (time < 22.1))
+    push[pulled] = elbow, [0.5, 0.0, 0.56]
+    expert = readme_film.expert_in(sample_run(time=time, push=push))
+
+    def reach(at):
+        lines, pulls = expert(at)
+        return min((np.linalg.norm(line.end - elbow) for line in lines), default=9.0), pulls
+
+    for at in (10.0, 12.0, 13.9, 20.5):
+        near, pulls = reach(at)
+        assert pulls
+        assert near < 0.1  # of the palm: the hand closes round the elbow
+    waiting, pulls = reach(17.0)
+    assert not pulls
+    assert waiting > 0.3
+    assert expert(5.0) == ([], False)  # not yet there
+    assert expert(29.0) == ([], False)  # gone
+
+
+def test_the_film_begins_with_the_person_who_pulls_beside_the_worker():
+    time = np.linspace(0.0, 30.0, 200)
+    push = np.full((200, 2, 3), np.nan)
+    push[(time > 9.9) & (time < 14.1)] = [0.15, 0.15, 0.56], [0.5, 0.0, 0.56]
+    nearest = np.zeros((200, 2, 3))
+    nearest[:, 1, 0] = 0.1 + np.abs(time - 13.0) + 2 * (time < 10.0)
+    times = np.linspace(0.0, 30.0, 61).tolist()
+    alone = sample_run(time=time, push=push, worker_nearest=None)
+    assert readme_film.telling(alone, times) == pytest.approx(12.0, abs=0.5)
+    run = sample_run(time=time, push=push, worker_nearest=nearest)
+    assert readme_film.telling(run, times) == pytest.approx(13.0, abs=0.2)
+    nearest[:, 1, 0] = 1 - 0.5 * (time < 5)  # nearest while nobody pulls
+    assert 9.5 < readme_film.telling(run, times) < 14.5
+
+
+def test_the_film_is_a_picture_that_moves():
+    levels = [20, 90, 160, 230]
+    pictures = (np.full((60, 640, 3), level, np.uint8) for level in levels)
+    shown = Image.open(BytesIO(readme_film.moving_picture(pictures)))
+    assert (shown.size, shown.n_frames) == ((640, 60), 4)
+    for number, level in enumerate(levels):
+        shown.seek(number)
+        assert np.asarray(shown.convert("RGB")).mean() == pytest.approx(level, abs=8)
+
+
+def test_few_motions_appear_first_and_all_at_the_end():
+    counts = [multiply_film.count(fraction, 1000) for fraction in (0.0, 0.1, 0.5, 1.0)]
+    assert counts == [1, 10, 250, 1000]
+
+
+def test_the_share_counts_the_motions_that_failed():
+    still = np.zeros((2, 4, 4))
+    parts = {"joints": still[:, :, 0], "gripper": still[:, 0, 0], "item": still, "duration": 1}
+    made = [
+        multiply_film.Motion(**parts, path=still[:, 0, :3], tried=tried, judged_by=judge)
+        for tried, judge in ((1, "physics: grasping"), (3, "physics: grasping"))
+    ]
+    assert multiply_film.share(made) == "2 of 4 succeed in physics"

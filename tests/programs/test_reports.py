@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from commands import done
 from PIL import Image
-from sample_runs import sample_run
 
 from hrc_learn.experiments import run_report
 from hrc_learn.viz import palette
@@ -179,56 +178,6 @@ def test_lines_keep_their_colours_beside_a_photograph(experiments):
     shown = np.asarray(Image.open(BytesIO(small)).convert("RGB")).astype(int)
     for row, colour in lines.items():
         assert np.abs(shown[row] - colour).max() < 10
-
-
-def test_the_film_shows_a_hand_at_the_elbow_while_it_is_pulled():
-    film = load(ROOT / "tools" / "docs" / "readme_film.py")
-    time = np.linspace(0.0, 30.0, 200)
-    elbow, push = np.array([0.15, 0.15, 0.56]), np.full((200, 2, 3), np.nan)
-    pulled = ((time > 9.9) & (time < 14.1)) | ((time > 19.9) & (time < 22.1))
-    push[pulled] = elbow, [0.5, 0.0, 0.56]
-    expert = film.expert_in(sample_run(time=time, push=push))
-
-    def reach(at):
-        lines, pulls = expert(at)
-        return min((np.linalg.norm(line.end - elbow) for line in lines), default=9.0), pulls
-
-    for at in (10.0, 12.0, 13.9, 20.5):
-        near, pulls = reach(at)
-        assert pulls
-        assert near < 0.1  # of the palm: the hand closes round the elbow
-    waiting, pulls = reach(17.0)
-    assert not pulls
-    assert waiting > 0.3
-    assert expert(5.0) == ([], False)  # not yet there
-    assert expert(29.0) == ([], False)  # gone
-
-
-def test_the_film_begins_with_the_person_who_pulls_beside_the_worker():
-    film = load(ROOT / "tools" / "docs" / "readme_film.py")
-    time = np.linspace(0.0, 30.0, 200)
-    push = np.full((200, 2, 3), np.nan)
-    push[(time > 9.9) & (time < 14.1)] = [0.15, 0.15, 0.56], [0.5, 0.0, 0.56]
-    nearest = np.zeros((200, 2, 3))
-    nearest[:, 1, 0] = 0.1 + np.abs(time - 13.0) + 2 * (time < 10.0)
-    times = np.linspace(0.0, 30.0, 61).tolist()
-    alone = sample_run(time=time, push=push, worker_nearest=None)
-    assert film.telling(alone, times) == pytest.approx(12.0, abs=0.5)
-    run = sample_run(time=time, push=push, worker_nearest=nearest)
-    assert film.telling(run, times) == pytest.approx(13.0, abs=0.2)
-    nearest[:, 1, 0] = 1 - 0.5 * (time < 5)  # nearest while nobody pulls
-    assert 9.5 < film.telling(run, times) < 14.5
-
-
-def test_the_film_is_a_picture_that_moves():
-    film = load(ROOT / "tools" / "docs" / "readme_film.py")
-    levels = [20, 90, 160, 230]
-    pictures = (np.full((60, 640, 3), level, np.uint8) for level in levels)
-    shown = Image.open(BytesIO(film.moving_picture(pictures)))
-    assert (shown.size, shown.n_frames) == ((640, 60), 4)
-    for number, level in enumerate(levels):
-        shown.seek(number)
-        assert np.asarray(shown.convert("RGB")).mean() == pytest.approx(level, abs=8)
 
 
 def test_a_film_becomes_a_smaller_picture_that_moves(tmp_path):

@@ -1,26 +1,29 @@
 """Parts of the films in docs/images: views, still backgrounds, titles and the file."""
 
 from collections.abc import Callable, Iterator, Sequence
+from io import BytesIO
 from itertools import repeat
 from pathlib import Path
 
 import numpy as np
-from readme_film import RATE, moving_picture, titled
+from PIL import Image, ImageDraw
 
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz.film import Picture
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
-SECONDS, FIRST, LAST = 17.0, 1.0, 2.0
-"""Longest duration of a film between its titles, and durations of the titles [s]."""
+RATE, SECONDS, FIRST, LAST = 15.0, 17.0, 1.0, 2.0
+"""Pictures per second [1/s]; longest duration between titles, and those of the titles [s]."""
+BAR = 44
+"""Height of a title [px]."""
 _NOISE = 9
 """Change of a grey level that counts as noise of the camera; it would fill the file."""
 
 
-def view(
+def camera_at(
     size: tuple[int, int],
-    eye: Sequence[float],
-    towards: Sequence[float],
+    eye: Sequence[float] | np.ndarray,
+    towards: Sequence[float] | np.ndarray,
     focal: float,
 ) -> CameraModel:
     """Camera at `eye` that looks at `towards` [m].
@@ -77,3 +80,31 @@ def write_film(
     content = moving_picture(still(pictures()))
     path.write_bytes(content)
     print(f"{path}: {len(content) / 1e6:.1f} MB")
+
+
+def titled(picture: Picture, text: str) -> Picture:
+    """A picture with a title below, where it hides nobody."""
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    width, height = image.size
+    draw.rectangle((0, height - BAR, width, height), fill=(24, 26, 30))
+    middle = width // 2, height - BAR // 2
+    draw.text(middle, text, font_size=30, fill="white", anchor="mm")
+    return np.asarray(image)
+
+
+def moving_picture(pictures: Iterator[Picture]) -> bytes:
+    """Pictures as one that moves, which Markdown shows anywhere."""
+    first, *others = [Image.fromarray(picture) for picture in pictures]
+    buffer = BytesIO()
+    first.save(
+        buffer,
+        "WEBP",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / RATE),
+        loop=0,
+        quality=50,
+        method=4,
+    )
+    return buffer.getvalue()

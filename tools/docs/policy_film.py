@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from film_pictures import IMAGES, view, write_film
+from film_pictures import IMAGES, camera_at, write_film
 
 from hrc_learn import cli
 from hrc_learn.experiments.run_recorder import push_arrows
@@ -134,7 +134,7 @@ def film(path: Path, rollout: Rollout) -> None:
     assert pairs is not None
     assert pushes is not None
     gaps = np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1)
-    world, camera = RecordedWorld(run), view(SIZE, EYE, TOWARDS, FOCAL)
+    world, camera = RecordedWorld(run), camera_at(SIZE, EYE, TOWARDS, FOCAL)
     begin, moves = float(run.time[0]), run.time[np.isfinite(rollout.speed)]
     end = float(moves[-1]) + AFTER
     with closing(OffscreenRenderer(world, *SIZE)) as renderer:

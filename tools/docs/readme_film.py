@@ -14,12 +14,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import repeat
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
+from film_pictures import FIRST, IMAGES, LAST, RATE, camera_at, moving_picture, titled
+from PIL import Image
 
 from hrc_learn import cli
 from hrc_learn.experiments import run_recorder as recorder
@@ -30,18 +30,14 @@ from hrc_learn.log import RunRecording
 from hrc_learn.sim import RecordedWorld
 from hrc_learn.sim.cameras import OffscreenRenderer
 from hrc_learn.sim.worker import COLOURS, PARTS, Posture, Worker
-from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
 from hrc_learn.viz.film import Picture, annotated, camera_inset
 
-IMAGES = Path(__file__).parents[2] / "docs" / "images"
 SIZE = 640, 400
 """Of the pictures [px]."""
-RATE, SECONDS, FIRST, LAST = 15.0, 15.0, 1.0, 2.0
-"""Pictures per second [1/s]; durations of the film, and of its titles at both ends [s]."""
+SECONDS = 15.0
+"""Duration of the film between its titles [s]."""
 TITLE = "A robot arm works with people"
-BAR = 44
-"""Height of a title [px]."""
 AFTER_RELEASE = 7.0
 """Time after the release at which the film ends [s]."""
 EYE, TOWARDS, FOCAL = (1.62, 1.42, 1.02), (0.10, 0.06, 0.36), 1.07
@@ -95,8 +91,8 @@ def frames(run: RunRecording, ending: str) -> Iterator[Picture]:
     width, height = SIZE
     begun = {event.text: event.time for event in run.phases}
     shelf = run.position[np.searchsorted(run.time, begun["release"])]
-    view = _camera(np.array(EYE), np.array(TOWARDS), FOCAL)
-    close = _camera(shelf + CLOSE_UP, shelf - [0.0, 0.0, 0.05], focal=1.5)
+    view = camera_at(SIZE, EYE, TOWARDS, FOCAL)
+    close = camera_at(SIZE, shelf + CLOSE_UP, shelf - [0.0, 0.0, 0.05], 1.5)
     assert run.camera is not None, "the run servoed"
     inset, expert = camera_inset(run.camera, width), expert_in(run)
     small = round(INSET * width), round(INSET * width * 3 / 4)
@@ -216,44 +212,6 @@ def expert_in(run: RunRecording) -> Callable[[float], tuple[list[Line], bool]]:
         return lines, gap < 0.1
 
     return at
-
-
-def titled(picture: Picture, text: str) -> Picture:
-    """A picture with a title below, where it hides nobody."""
-    image = Image.fromarray(picture)
-    draw = ImageDraw.Draw(image, "RGBA")
-    width, height = image.size
-    draw.rectangle((0, height - BAR, width, height), fill=(24, 26, 30))
-    middle = width // 2, height - BAR // 2
-    draw.text(middle, text, font_size=30, fill="white", anchor="mm")
-    return np.asarray(image)
-
-
-def moving_picture(pictures: Iterator[Picture]) -> bytes:
-    """Pictures as one that moves, which Markdown shows anywhere."""
-    first, *others = [Image.fromarray(picture) for picture in pictures]
-    buffer = BytesIO()
-    first.save(
-        buffer,
-        "WEBP",
-        save_all=True,
-        append_images=others,
-        duration=round(1000 / RATE),
-        loop=0,
-        quality=50,
-        method=4,
-    )
-    return buffer.getvalue()
-
-
-def _camera(eye: np.ndarray, towards: np.ndarray, focal: float) -> CameraModel:
-    width, height = SIZE
-    return CameraModel(
-        width=width,
-        height=height,
-        focal=(focal * height, focal * height),
-        principal=((width - 1) / 2, (height - 1) / 2),
-    ).look_at(eye, towards)
 
 
 def _smooth(fraction: float) -> float:
