@@ -26,11 +26,9 @@ from hrc_learn.viz.figures import (
     WIDTH,
     JointCurves,
     active_intervals,
-    draw_box,
     frame_space,
     joint_grid_figure,
     joints_figure,
-    near,
     plots_figure,
     space,
 )
@@ -132,9 +130,6 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
         points = run.position
         if run.demo_path is not None:
             points = np.concatenate([points, run.demo_path])
-        for box in near(run.boxes, points):
-            draw_box(axes, box, "#8D8F94")
-        if run.demo_path is not None:
             axes.plot(*run.demo_path.T, color=palette.DEMO, lw=5.0, label="demonstration")
         carried = np.zeros(len(run.time), dtype=bool)
         for event, end in lasting(run.phases, float(run.time[-1])):
@@ -150,8 +145,8 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
                 axes.plot(*path.T, color=colour, lw=2.0, label=f"carried: {name}")
                 axes.plot(*path[-1], "s", color=colour, ms=5)
         axes.legend(loc="upper right")
-        axes.set_title("Paths of the tool centre point (square: release)", loc="left")
-        frame_space(axes, points)
+        axes.set_title("Paths of the tool centre point", loc="left")
+        frame_space(axes, points, run.boxes)
     return figure
 
 
@@ -260,15 +255,13 @@ def placing_paths_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
         figure = Figure(figsize=(WIDTH, 4.5))
         for i, (planned, label) in enumerate(SPACES.items()):
             axes = space(figure, position=(1, len(SPACES), 1 + i))
-            for box in near(tuple(run.scene.workplace.scene.cabinet.boxes()), points):
-                draw_box(axes, box, "#8D8F94")
             axes.plot(*shown.T, color=palette.DEMO, lw=5, label="demonstration")
             for shelf, colour in zip(shelves, _SHELVES, strict=False):
                 path = paths[planned, shelf]
                 axes.plot(*path.T, color=colour, lw=1.8, label=f"{shelf} shelf")
                 axes.plot(*path[-1], "s", color=colour, ms=4)
             axes.set_title(label.capitalize(), loc="left")
-            frame_space(axes, points)
+            frame_space(axes, points, list(run.scene.workplace.scene.cabinet.boxes()))
             axes.xaxis.set_major_locator(MaxNLocator(3))
             axes.view_init(elev=16, azim=62)
         handles, labels = figure.axes[0].get_legend_handles_labels()

@@ -39,6 +39,8 @@ _NARROW = 3.7
 """Width of a figure for a phone [inch]: 390 pixels, with text as large as the page's."""
 _TITLE = 50  # letters in a line of a title on a phone
 _AROUND = 0.65  # title, ticks and legend of a panel on a phone [inch]
+_ZOOM, _NARROW_ZOOM = 0.96, 0.77  # at which the labels of three axes stay inside a figure
+_EDGES = "#8D8F94"  # of boxes
 _SURROUNDINGS = 0.22  # boxes are drawn up to this distance from the paths [m]
 
 
@@ -65,7 +67,7 @@ def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
     assert isinstance(axes, Axes3D)
     axes.view_init(elev=24, azim=35)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_locator(MaxNLocator(4))
         axis.set_pane_color((1, 1, 1, 0))  # pyright: ignore[reportAttributeAccessIssue]
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.zaxis.set_rotate_label(False)  # it would be read from above
@@ -73,32 +75,29 @@ def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
     return axes
 
 
-def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
-    """Show the surroundings of some points, with the same scale on every axis."""
+def frame_space(
+    axes: Axes3D, points: Float[np.ndarray, "n 3"], boxes: Sequence[Box] = ()
+) -> None:
+    """Show the surroundings of some points, with the same scale on every axis.
+
+    Args:
+        axes: Axes in three dimensions.
+        points: Points [m].
+        boxes: Boxes; their parts in the surroundings of the points are drawn.
+    """
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    # At this zoom, the labels of all three axes stay inside the figure, also on a phone.
-    axes.set_box_aspect(tuple(high - low), zoom=0.77)  # pyright: ignore[reportArgumentType]
-
-
-def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
-    """Parts of the boxes in the surroundings of some points."""
-    low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
-    parts = []
+    axes.set_box_aspect(tuple(high - low), zoom=_ZOOM)  # pyright: ignore[reportArgumentType]
     for box in boxes:
         centre, half = np.array(box.centre), np.array(box.half_size)
         a, b = np.maximum(centre - half, low), np.minimum(centre + half, high)
         if (a < b).all():
             x, y, z = ((a + b) / 2).tolist()
             dx, dy, dz = ((b - a) / 2).tolist()
-            parts.append(Box(centre=(x, y, z), half_size=(dx, dy, dz), colour=box.colour))
-    return parts
-
-
-def draw_box(axes: Axes3D, box: Box, colour: str) -> None:
-    """Draw the edges of a box."""
-    edges = Line3DCollection(list(box.edges()), colors=colour, linewidths=0.6, alpha=0.6)
-    axes.add_collection3d(edges)
+            part = Box(centre=(x, y, z), half_size=(dx, dy, dz), colour=box.colour)
+            lines = list(part.edges())
+            look = {"colors": _EDGES, "linewidths": 0.6, "alpha": 0.6}
+            axes.add_collection3d(Line3DCollection(lines, **look))
 
 
 class JointCurves(NamedTuple):
@@ -177,6 +176,9 @@ def stack_panels(figure: Figure) -> None:
     grid = figure.add_gridspec(len(panels), 1, height_ratios=rows)
     for axes, row in zip(panels, range(len(panels)), strict=True):
         axes.set_subplotspec(grid[row])
+        if isinstance(axes, Axes3D):
+            aspect = axes.get_box_aspect()
+            axes.set_box_aspect(aspect, zoom=_NARROW_ZOOM)  # pyright: ignore[reportArgumentType]
         axes.tick_params(labelbottom=True)
         axes.set_title(fill(axes.get_title("left"), _TITLE), loc="left", fontsize=8)
         if (legend := axes.get_legend()) is not None:
@@ -237,8 +239,8 @@ def plots_figure(
             elif plot.legend:
                 once = dict(zip(names, handles, strict=True))  # names may be repeated
                 beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-                place = beside if columns == 1 else {"loc": "best", "ncols": 2}
-                axes.legend(once.values(), once, **place)
+                below = {"loc": "upper left", "bbox_to_anchor": (0.0, -0.02), "ncols": 4}
+                axes.legend(once.values(), once, **(beside if columns == 1 else below))
         for axes in grid[len(plots) :]:
             axes.set_axis_off()
         if shown is not None and shown.any():

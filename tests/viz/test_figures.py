@@ -9,7 +9,7 @@ from sample_runs import NAMES, STEPS, sample_run
 
 from hrc_learn.geometry import Box
 from hrc_learn.viz import figures, palette
-from hrc_learn.viz.figures import active_intervals, draw_limits, near
+from hrc_learn.viz.figures import active_intervals, draw_limits, frame_space, space
 from hrc_learn.viz.panels import image_jacobian_plots, person_plots
 
 
@@ -122,9 +122,12 @@ def test_active_intervals_are_runs_of_true_samples():
 def test_boxes_are_cut_to_the_surroundings_of_the_paths():
     tall = Box(centre=(0.0, 0.0, 0.0), half_size=(0.1, 0.1, 5.0))
     far = Box(centre=(9.0, 0.0, 0.0), half_size=(0.1, 0.1, 0.1))
-    (part,) = near((tall, far), np.zeros((1, 3)))
-    assert part.centre == (0.0, 0.0, 0.0)
-    assert part.half_size == pytest.approx((0.1, 0.1, 0.22))
+    axes = space(Figure())
+    frame_space(axes, np.zeros((1, 3)), (tall, far))
+    (edges,) = axes.collections
+    corners = np.array(edges._segments3d)
+    np.testing.assert_allclose(corners.min(axis=(0, 1)), [-0.1, -0.1, -0.22])
+    np.testing.assert_allclose(corners.max(axis=(0, 1)), [0.1, 0.1, 0.22])
 
 
 def test_reasons_stand_beside_their_rows_in_place_of_numbers():
