@@ -110,6 +110,35 @@ class SavedModel:
             raise ValueError(f"{path}: not a safetensors file ({error})") from None
 
 
+class StoredModel:
+    """Model with a `config` of JSON values and `tensors` by name, from which `restore` makes it
+    again.
+    """
+
+    @classmethod
+    def restore[S: "StoredModel"](cls: type[S], saved: SavedModel) -> S:
+        """Model from its files.
+
+        Raises:
+            ValueError: A wrong field; the message names the file and the field.
+        """
+        raise NotImplementedError
+
+    def save(self: Any, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        write_model(folder, type(self).__name__, self.config(), self.tensors())
+
+    @classmethod
+    def load[S: "StoredModel"](cls: type[S], folder: str | Path) -> S:
+        """Read a model that `save` wrote.
+
+        Raises:
+            FileNotFoundError: The folder holds no saved model.
+            ValueError: A wrong field; the message names the file and the field.
+        """
+        return cls.restore(SavedModel(folder, cls.__name__))
+
+
 def _read_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     store.settle(folder)

@@ -7,7 +7,7 @@ of these solutions decays like the unforced spring. Steps of any length are ther
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -119,18 +119,9 @@ def step(
     E, y = E.to(target), y - before
     # One fused operation for shapes that allow it.
     y = torch.addmm(after, E, y) if E.ndim == y.ndim == after.ndim == 2 else E @ y + after
-    offset, velocity = y.unbind(dim=-2)
-    return DMPState(
-        position=offset + rest,
-        rate=velocity,
-        start=state.start,
-        goal=goal,
-        displacement=state.displacement,
-        target=target,
-        duration=state.duration,
-        pace=pace,
-        s=s,
-        forced=forced,
+    offset, rate = y.unbind(dim=-2)
+    return replace(
+        state, position=offset + rest, rate=rate, goal=goal, pace=pace, s=s, forced=forced
     )
 
 

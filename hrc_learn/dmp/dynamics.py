@@ -33,12 +33,6 @@ DEGREE = 3
 derivative."""
 
 
-def check_count(count: int) -> None:
-    """Raise ValueError unless `count` is a whole number of two or more."""
-    if not (count >= 2 and count % 1 == 0):
-        raise ValueError(f"a basis needs a whole number of at least 2 functions, got {count}")
-
-
 @dataclass(frozen=True, kw_only=True)
 class SpringDamper:
     """y'' = alpha (beta (g - y) - y'), solved exactly for any gains.
@@ -171,7 +165,33 @@ class ExponentialPhase:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussianBasis:
+class _Bells:
+    """Normalised bells exp(`_exponents`), of which the first `count` are faded by `phase`."""
+
+    count: int
+    periodic: ClassVar[bool] = False
+
+    def __post_init__(self):
+        if not (self.count >= 2 and self.count % 1 == 0):
+            raise ValueError(
+                f"a basis needs a whole number of at least 2 functions, got {self.count}"
+            )
+        object.__setattr__(self, "count", int(self.count))
+        check_settings(self, positive=vars(self).keys() & {"width"})
+
+    def kernels(self: Any, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Bells psi_i at normalised time `s`, before their normalisation."""
+        return self._exponents(s).exp()[..., : self.count]
+
+    def forcing(self: Any, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Forcing term per unit of each weight at normalised time `s`."""
+        # A softmax never divides by zero, however far s lies from every centre.
+        activation = torch.softmax(self._exponents(s), dim=-1)[..., : self.count]
+        return activation * self.phase(s)[..., None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianBasis(_Bells):
     """Normalised Gaussians, faded by the phase z.
 
     psi_i(x) = exp(-(x - c_i)^2 / (2 sigma_i^2)),  phi_i = psi_i z / sum_j psi_j
@@ -193,13 +213,8 @@ class GaussianBasis:
     """Variable of the Gaussians: `"time"` or `"phase"`."""
     phase: ExponentialPhase = ExponentialPhase()
     """Canonical system, whose z fades the forcing term."""
-    periodic: ClassVar[bool] = False
     knot_spacing = None
     """No knots: smooth everywhere."""
-
-    def __post_init__(self):
-        check_count(self.count)
-        check_settings(self, positive=["width"])
 
     @property
     def horizon(self) -> float:
@@ -227,16 +242,6 @@ class GaussianBasis:
         """Normalised times s_i at which the basis functions peak (float64)."""
         return torch.linspace(0, 1, self.count, dtype=torch.float64)
 
-    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Gaussians psi_i at normalised time `s`, before their normalisation."""
-        return self._exponents(s).exp()[..., : self.count]
-
-    def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Forcing term per unit of each weight at normalised time `s`."""
-        # A softmax never divides by zero, however far s lies from every centre.
-        activation = torch.softmax(self._exponents(s), dim=-1)[..., : self.count]
-        return activation * self.phase(s)[..., None]
-
     def _exponents(self, s: Tensor) -> Tensor:
         if self.domain == "time":
             spacing = 1 / (self.count - 1)
@@ -249,7 +254,7 @@ class GaussianBasis:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PeriodicBasis:
+class PeriodicBasis(_Bells):
     """Normalised periodic bells that do not fade.
 
     psi_i(s) = exp(h (cos(2 pi (s - c_i)) - 1)),  phi_i = psi_i / sum_j psi_j
@@ -268,10 +273,6 @@ class PeriodicBasis:
     knot_spacing = 1.0
     """The period, so that a whole number of polynomial pieces of the `Response` covers it."""
 
-    def __post_init__(self):
-        check_count(self.count)
-        check_settings(self, positive=["width"])
-
     @property
     def smooth_interval(self) -> float:
         """Normalised time over which the forcing is nearly a polynomial of low degree."""
@@ -286,14 +287,6 @@ class PeriodicBasis:
         """Normalised times c_i at which the basis functions peak (float64)."""
         return torch.arange(self.count, dtype=torch.float64) / self.count
 
-    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Bells psi_i at normalised time `s`, before their normalisation."""
-        return self._exponents(s).exp()
-
-    def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Forcing term per unit of each weight at normalised time `s`."""
-        return torch.softmax(self._exponents(s), dim=-1)
-
     def _exponents(self, s: Tensor) -> Tensor:
         # cos(x) - 1 is -x^2 / 2 near the centre: a Gaussian of variance 1 / h, in radians.
         sharpness = (self.count / (2 * math.pi * self.width)) ** 2
@@ -302,7 +295,7 @@ class PeriodicBasis:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplineBasis:
+class SplineBasis(_Bells):
     """Uniform cubic B-splines, faded by the phase z: phi_i = B(s / h - i + 2) z.
 
     B is centred at zero and is zero beyond two spacings. A weight therefore has no effect
@@ -319,10 +312,6 @@ class SplineBasis:
     """N, the number of basis functions."""
     phase: ExponentialPhase = ExponentialPhase()
     """Canonical system, whose z fades the forcing term."""
-    periodic: ClassVar[bool] = False
-
-    def __post_init__(self):
-        check_count(self.count)
 
     @property
     def knot_spacing(self) -> float:

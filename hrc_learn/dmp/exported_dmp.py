@@ -80,8 +80,11 @@ def export_dmp(dmp: MotionPrimitive, *, goal_filter: float | None = None) -> Exp
         goal_filter: Goal filter of the program, as in `step`; in the stepper, goals jump.
 
     Raises:
+        TypeError: A model that is no primitive itself, but makes primitives.
         ValueError: The primitive is a batch.
     """
+    if not isinstance(dmp, MotionPrimitive):
+        raise TypeError(f"{type(dmp).__name__} is no primitive: export one that it makes")
     if dmp.duration.ndim:
         raise ValueError(f"export takes one primitive, got a batch {tuple(dmp.duration.shape)}")
     stepper = Stepper(dmp) if isinstance(dmp, JointDMP) else None

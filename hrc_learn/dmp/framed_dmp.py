@@ -12,7 +12,7 @@ deviate. The result is an ordinary primitive.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float
@@ -21,8 +21,10 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import Mask, Points, Times, finite
 from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
-from hrc_learn.dmp.probabilistic_dmp import mean_primitive
+from hrc_learn.dmp.probabilistic_dmp import mean_primitive, on_device
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.model_files import SavedModel, StoredModel
 
 PERSISTENCE = 0.3
 """Correlation length of the assumed smooth deviations, as a fraction of the motion; with 0.1,
@@ -76,7 +78,7 @@ class Frames:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FramedDMP:
+class FramedDMP(StoredModel):
     """Gaussians over the coordinates of a primitive relative to each of F frames (float64).
 
     The coordinates are x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`, M
@@ -149,6 +151,28 @@ class FramedDMP:
         shown = off.permute(1, 2, 3, 0) * math.sqrt(n / (n + 1) / (n - 1))
         precision = _precision(torch.cat([shown, smooth], dim=-1))
         return cls(primitive=mean_primitive(dmps), mean=mean, precision=precision)
+
+    def to(self, device: torch.device | str) -> "FramedDMP":
+        """The same model on another device."""
+        return on_device(self, device)
+
+    def config(self) -> dict[str, Any]:
+        """Config of the primitive."""
+        return self.primitive.config()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the primitive and of the Gaussians."""
+        own = {"gaussian.mean": self.mean, "gaussian.precision": self.precision}
+        return self.primitive.tensors() | own
+
+    @classmethod
+    def restore[S: "FramedDMP"](cls: type[S], saved: SavedModel) -> S:
+        mean, precision = saved.tensor("gaussian.mean"), saved.tensor("gaussian.precision")
+        return cls(primitive=JointDMP.restore(saved), mean=mean, precision=precision)
+
+    def rollout(self, frames: Frames, *arguments: Any, **options: Any) -> Trajectory:
+        """Most likely motion for frames (*batch, F); other arguments as for a `JointDMP`."""
+        return self.at(frames).rollout(*arguments, **options)
 
     def at(self, frames: Frames) -> JointDMP:
         """Most likely primitive for frames, (*batch, F); gradients flow to them.

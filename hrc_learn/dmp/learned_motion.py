@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
@@ -37,7 +36,7 @@ from hrc_learn.dmp.probabilistic_dmp import (
 )
 from hrc_learn.dmp.solvers import fit_ridge
 from hrc_learn.geometry import Pose
-from hrc_learn.model_files import SavedModel, write_model
+from hrc_learn.model_files import SavedModel, StoredModel
 
 BASIS_COUNTS = (10, 20, 30, 50, 100)
 """Numbers of basis functions compared."""
@@ -196,7 +195,7 @@ def choose(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LearnedMotion:
+class LearnedMotion(StoredModel):
     """Motion as a function of start, goal, and a context or frames, predicted by one model."""
 
     each: MotionPrimitive
@@ -304,27 +303,23 @@ class LearnedMotion:
         about = f"{self.chosen.name}, {each.basis.count} basis functions"
         return "\n".join([f"{about}; held-out error relative to the range:", *lines])
 
-    def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        tensors = self.each.tensors() | {"context": self.context, "error": self.chosen.error}
-        if self.frames is not None:
-            tensors |= {"frames.A": self.frames.A, "frames.b": self.frames.b}
+    def config(self) -> dict[str, Any]:
+        """Config of the primitives, and the chosen model."""
         own = {k: v for k, v in vars(self.chosen).items() if k != "error"}
         # JSON has no infinite numbers.
         own["strength"] = None if math.isinf(self.chosen.strength) else self.chosen.strength
         own |= {"by_ends": self.by_ends, "primitive": type(self.each).__name__}
-        config = self.each.motion.config() | {"learned": own}
-        write_model(folder, type(self).__name__, config, tensors)
+        return self.each.config() | {"learned": own}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the primitives, contexts, errors, and frames if the model uses them."""
+        own = {"context": self.context, "error": self.chosen.error}
+        if self.frames is not None:
+            own |= {"frames.A": self.frames.A, "frames.b": self.frames.b}
+        return self.each.tensors() | own
 
     @classmethod
-    def load(cls, folder: str | Path) -> "LearnedMotion":
-        """Read a motion that `save` wrote.
-
-        Raises:
-            FileNotFoundError: The folder holds no saved motion.
-            ValueError: A wrong field; the message names the file and the field.
-        """
-        saved = SavedModel(folder, cls.__name__)
+    def restore[S: "LearnedMotion"](cls: type[S], saved: SavedModel) -> S:
         error = saved.tensor("error")
 
         def parts(own: dict[str, Any]) -> tuple[type[MotionPrimitive], bool, Candidate]:

@@ -8,7 +8,6 @@ become positions relative to this goal.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path as FilePath
 from typing import Any, ClassVar, TypedDict, Unpack
 
 import torch
@@ -33,7 +32,7 @@ from hrc_learn.dmp.samples import FitReport
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.dmp.via_points import ViaPoints, through_via_points
 from hrc_learn.geometry import Pose
-from hrc_learn.model_files import SavedModel, write_model
+from hrc_learn.model_files import StoredModel
 
 REFIT_SAMPLES = 20
 """Samples per basis function when a motion is fitted again: more do not change the result."""
@@ -50,7 +49,7 @@ class EndOptions(TypedDict, total=False):
     """Velocity at the end [1/s], (*batch, D); moving goals only."""
 
 
-class MotionPrimitive[Value, Path, State](nn.Module):
+class MotionPrimitive[Value, Path, State](nn.Module, StoredModel):
     """Learned motion that adapts to start, goal, duration and via points.
 
     Kinds differ in their values: joints, a quaternion, a `Pose`. The class of each kind
@@ -132,10 +131,9 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """Second derivatives of the columns [1/s^2] for a coupling term."""
         return coupling
 
-    @classmethod
-    def restore[S: "MotionPrimitive"](cls: type[S], saved: SavedModel) -> S:
-        """Primitive from a saved model."""
-        raise NotImplementedError
+    def config(self) -> dict[str, Any]:
+        """Contents of a saved primitive besides its tensors, as JSON values."""
+        return self.motion.config()
 
     def tensors(self) -> dict[str, Tensor]:
         """Tensors of the primitive, fit report included, by the names used in files."""
@@ -425,20 +423,6 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         x, timestamps = back.coordinates().detach(), 1 - motion.timestamps.flip(-1)
         backwards = motion.with_coordinates(x, amplitude=back.amplitude, timestamps=timestamps)
         return self.with_motion(backwards)
-
-    def save(self, folder: str | FilePath) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        write_model(folder, type(self).__name__, self.motion.config(), self.tensors())
-
-    @classmethod
-    def load[S: "MotionPrimitive"](cls: type[S], folder: str | FilePath) -> S:
-        """Read a primitive that `save` wrote.
-
-        Raises:
-            FileNotFoundError: The folder holds no saved primitive.
-            ValueError: A wrong field; the message names the file and the field.
-        """
-        return cls.restore(SavedModel(folder, cls.__name__))
 
     def _resolved(
         self, given: Boundary, duration: Scalars | None, speed: Scalars | None, **options: Any

@@ -197,6 +197,17 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Columns of the position and of the body."""
         return slice(0, self.error_columns.start), slice(self.error_columns.stop, None)
 
+    def _joined(
+        self, usual: Tensor, position: Any, error: Any, body: Any
+    ) -> Float[Tensor, "*batch columns"]:
+        """Columns of the given parts, broadcast; a part that is None has its `usual` values."""
+        columns, (P, B) = [], self._others
+        for part, x in ((P, position), (self.error_columns, error), (B, body)):
+            x = usual[..., part] if x is None else to_tensor(x, usual.dtype, usual.device)
+            columns.append(x)
+        batch = broadcast_shapes(*(column.shape[:-1] for column in columns))
+        return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
+
     def _boundary(
         self,
         given: Boundary,
@@ -204,7 +215,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         start_body: Vectors | None = None,
         goal_body: Vectors | None = None,
     ) -> tuple[Boundary, Tensor]:
-        motion, E, (P, B) = self.motion, self.error_columns, self._others
+        motion, E, P = self.motion, self.error_columns, self._others[0]
         if all(x is None for x in (*given, start_body, goal_body)):
             return given, self.reference
         start, rotation = self._parts("start", given.start)
@@ -218,18 +229,8 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         error, rate, reference = self._error_boundary(
             demonstrated[..., E], rotation, goal_rotation, omega
         )
-        start_columns = _join(
-            like[..., P] if start is None else start,
-            error,
-            like[..., B] if start_body is None else start_body,
-            like,
-        )
-        goal_columns = _join(
-            motion.goal[..., P] if goal is None else goal,
-            motion.goal[..., E],
-            motion.goal[..., B] if goal_body is None else goal_body,
-            like,
-        )
+        start_columns = self._joined(like, start, error, start_body)
+        goal_columns = self._joined(motion.goal, goal, None, goal_body)
         if twist is None:
             # The scaling may rotate and scale the start velocity.
             per_s = motion.start_rate(start_columns, goal_columns)
@@ -237,7 +238,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         else:
             linear = twist[..., P]
         # A twist does not include the body, which starts with its demonstrated velocity.
-        velocity = _join(linear, rate, demonstrated[..., B], like)
+        velocity = self._joined(demonstrated, linear, rate, None)
         return Boundary(start_columns, goal_columns, velocity), reference
 
     def _error_boundary(
@@ -505,15 +506,6 @@ def _via_errors(
     unknown = omega.isnan().any(-1, keepdim=True)
     rate = orientation_error.error_rate(torch.where(free, error, via), omega.nan_to_num())
     return via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan)
-
-
-def _join(
-    position: Tensor, error: Tensor, body: Vectors, like: Tensor
-) -> Float[Tensor, "*batch columns"]:
-    """Columns of a linear primitive, broadcast and concatenated."""
-    columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
-    batch = broadcast_shapes(*(column.shape[:-1] for column in columns))
-    return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
 
 
 def _with_columns(values: Tensor, columns: slice, new: Vectors) -> Float[Tensor, "*batch D"]:

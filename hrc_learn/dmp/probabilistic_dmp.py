@@ -6,7 +6,6 @@ functions therefore compute with the columns of `motion`.
 
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,16 +26,17 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import LinearPrimitive
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES, MotionPrimitive
+from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
 from hrc_learn.dmp.pose_dmp import PoseDMP
 from hrc_learn.dmp.samples import expanded
 from hrc_learn.dmp.via_points import ViaPoints
 from hrc_learn.geometry import Pose
-from hrc_learn.model_files import SavedModel, write_model
+from hrc_learn.model_files import SavedModel, StoredModel
 
 KINDS: dict[str, type[MotionPrimitive]] = {
-    kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)
+    kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP, MovingGoalDMP)
 }
 """Kinds of primitive by their names in files."""
 
@@ -132,7 +132,7 @@ def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ProbabilisticDMP[P: MotionPrimitive]:
+class ProbabilisticDMP[P: MotionPrimitive](StoredModel):
     """Gaussian over the coordinates x = (weights, start velocity, start, goal) of a primitive.
 
     A motion is linear in its coordinates, y(s) = H(s) x, and therefore Gaussian too: means,
@@ -241,32 +241,26 @@ class ProbabilisticDMP[P: MotionPrimitive]:
 
     def to(self, device: torch.device | str) -> "ProbabilisticDMP[P]":
         """The same distribution on another device."""
-        parts = {name: getattr(self, name).to(device) for name in GAUSSIAN}
-        return replace(self, primitive=deepcopy(self.primitive).to(device), **parts)
+        return on_device(self, device)
 
-    def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+    def config(self) -> dict[str, Any]:
+        """Config of the primitive, its kind, and the dependence on start and goal."""
+        own = {"dependence": self.dependence, "primitive": type(self.primitive).__name__}
+        return self.primitive.config() | own
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the primitive and of the Gaussian."""
         own = {f"gaussian.{name}": getattr(self, name) for name in GAUSSIAN}
-        config = self.primitive.motion.config() | {"dependence": self.dependence}
-        config["primitive"] = type(self.primitive).__name__
-        write_model(folder, type(self).__name__, config, self.primitive.tensors() | own)
+        return self.primitive.tensors() | own
 
     @classmethod
-    def load(cls, folder: str | Path) -> "ProbabilisticDMP[Any]":
-        """Read a distribution that `save` wrote.
-
-        Raises:
-            FileNotFoundError: The folder holds no saved distribution.
-            ValueError: A wrong field; the message names the file and the field.
-        """
-        saved = SavedModel(folder, cls.__name__)
+    def restore[S: "ProbabilisticDMP"](cls: type[S], saved: SavedModel) -> S:
         kind = saved.get("primitive", str)
         if kind not in KINDS:
             raise saved.invalid(f"unknown primitive {kind!r}; choose from {', '.join(KINDS)}")
-        own = {name: saved.tensor(f"gaussian.{name}") for name in GAUSSIAN}
-        primitive: Any = KINDS[kind].restore(saved)
+        own: Any = {name: saved.tensor(f"gaussian.{name}") for name in GAUSSIAN}
         dependence = float(saved.get("dependence", float, int))
-        return cls(primitive=primitive, dependence=dependence, **own)
+        return cls(primitive=KINDS[kind].restore(saved), dependence=dependence, **own)
 
     def position(self, time: Times) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T D"]]:
         """Mean and standard deviation of the columns at times [s].
@@ -461,6 +455,18 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         spread = self.spread.view(*self.mean.shape, -1)
         root = torch.einsum("tm,dmr->tdr", rows, spread)
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
+
+
+def on_device(model: Any, device: torch.device | str) -> Any:
+    """Dataclass of float64 tensors and a primitive on another device.
+
+    Raises:
+        ValueError: A dtype instead of a device.
+    """
+    if isinstance(device, torch.dtype):
+        raise ValueError(f"{type(model).__name__} needs float64: change its device only")
+    parts = {k: x.to(device) for k, x in vars(model).items() if isinstance(x, Tensor)}
+    return replace(model, primitive=deepcopy(model.primitive).to(device), **parts)
 
 
 def gaussian(

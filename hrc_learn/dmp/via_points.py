@@ -17,6 +17,7 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import full_precision, readable
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry.numerics import cached_tensors
 
 SAMPLES_PER_FUNCTION = 8
@@ -137,9 +138,8 @@ def _check_overshoot(
 
 def _missing(motion: LinearPrimitive, via: ViaPoints) -> Float[Tensor, "*batch n 2 D"]:
     """Via points minus the motion, in position and dy/ds; NaN where a via point is free."""
-    fixed = motion.with_coordinates(motion.coordinates().detach()).requires_grad_(False)
-    time = via.s * motion.duration.double()[..., None]
-    now = fixed.rollout_columns(Boundary(), fixed.duration, time)
+    x = motion._motion_coordinates(Boundary(), motion.duration, None).detach()
+    now = Trajectory(coordinates=x, s=via.s, duration=motion.duration, response=motion.response)
     position = via.position - now.position
     rate = via.rate - now.velocity * motion.duration[..., None, None]
     # Where only a position is given, the rate of the motion stays.

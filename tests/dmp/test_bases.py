@@ -10,6 +10,7 @@ import torch
 from demo_motions import arm_motion
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BSpline
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
     ExponentialPhase,
@@ -272,3 +273,13 @@ def test_descriptions_of_bases_make_them_again():
         assert config["type"] == type(basis).__name__
     with pytest.raises(ValueError, match="unknown type 'Fourier'; choose from GaussianBasis"):
         restored_basis({"type": "Fourier"})
+
+
+@pytest.mark.parametrize("kind", [GaussianBasis, PeriodicBasis, SplineBasis])
+@pytest.mark.parametrize("count", [np.int64(8), 8.0, torch.tensor(8)])
+def test_a_whole_count_of_any_type_is_an_integer(kind, count):
+    with shapes_unchecked():
+        basis = kind(count=count)
+    assert type(basis.count) is int
+    assert basis == kind(count=8)
+    assert restored_basis(json.loads(json.dumps(basis_config(basis)))) == basis
