@@ -20,6 +20,8 @@ from torch.autograd import forward_ad
 from torch.autograd.forward_ad import unpack_dual
 
 FLOATING = (torch.float32, torch.float64)
+MOST_SAMPLES = 10**9
+"""Largest number of samples of a motion at a regular interval."""
 type Nested = Sequence
 """Lists or tuples of numbers, nested to any depth."""
 type Number = float | int | np.number
@@ -57,7 +59,10 @@ def to_tensor(
         if values.dtype.kind not in "biuf":
             raise ValueError(f"expected real numbers, got an array of {values.dtype}")
         values = np.require(values, values.dtype.newbyteorder("="), ["C", "W"])
-    tensor = torch.as_tensor(values)
+    try:
+        tensor = torch.as_tensor(values)
+    except (TypeError, RuntimeError, ValueError) as error:
+        raise ValueError(f"expected numbers, got {values!r:.80} ({error})") from None
     if tensor.is_complex() or (tensor.dtype == torch.bool and dtype in FLOATING):
         raise ValueError(f"expected real numbers, got {tensor.dtype}")
     # Convert the original values again, because `tensor` holds Python's floats as float32.
@@ -271,12 +276,12 @@ def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[T
     """Times [s] at interval `dt`, from zero to the first one at or after the longest duration.
 
     Raises:
-        ValueError: The interval is not positive and finite.
+        ValueError: The interval is not positive and finite, or gives too many samples.
     """
-    if not (math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt must be positive and finite, got {dt}")
-    # The tolerance keeps rounding from adding a sample past the end.
     longest = duration.max().item() if duration.numel() else 0.0
+    if not (dt > (least := longest / MOST_SAMPLES) and math.isfinite(dt)):
+        raise ValueError(f"dt must be positive and finite, above {least:g} s, got {dt}")
+    # The tolerance keeps rounding from adding a sample past the end.
     last = math.ceil(longest / dt * (1 - 1e-7))
     return dt * torch.arange(last + 1, dtype=torch.float64, device=duration.device)
 

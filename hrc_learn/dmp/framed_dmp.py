@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Points, Times, finite
+from hrc_learn.dmp._arguments import Mask, Points, Times, check_not_negative, finite
 from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive, on_device
@@ -226,6 +226,7 @@ def _smooth_deviations(
     if least is None:
         shown = dmps.coordinates().detach().double() @ rows.mT
         least = float((shown.amax(-1) - shown.amin(-1)).max()) / 1000 or 1e-3
+    check_not_negative("tolerance", least)
     # Variance along the motion, averaged over all directions.
     variance = (off @ rows.mT).square().sum(0).mean(-2) / (n - 1)
     size = (variance / (n + 1) + least**2).sqrt()

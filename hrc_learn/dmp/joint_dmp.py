@@ -16,6 +16,7 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     checked_vector,
+    finite,
     full_precision,
     positive,
 )
@@ -172,8 +173,8 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples (the message names them), or a motion for which the scaling
-                is singular.
+            ValueError: Bad samples (the message names them), values whose weights their dtype
+                cannot hold, or a motion for which the scaling is singular.
         """
         scaling = find_scaling(scaling)
         time, mask, (position, velocity) = padded(time, mask, position, velocity)
@@ -194,6 +195,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
             joint_names=joint_names,
             units=units,
         )
+        finite(f"weights in {dmp.weights.dtype}", dmp.weights)
         with torch.no_grad():
             dmp.fit_report = recorded.compare(dmp.rollout().position, noise)
         return dmp

@@ -568,6 +568,8 @@ class LinearPrimitive(nn.Module):
 
 def check_names(joint_names: Sequence[str] | None, D: int) -> None:
     """Raise ValueError unless the names, if there are any, are D different names."""
+    if isinstance(joint_names, str):
+        raise ValueError(f"joint names must be a list of names, got {joint_names!r}")
     if joint_names is not None and len(joint_names) != D:
         raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
     if joint_names is not None and len({*joint_names}) != D:

@@ -45,7 +45,7 @@ from hrc_learn.dmp.orientation_error import (
 from hrc_learn.dmp.samples import check_samples, padded
 from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
 from hrc_learn.dmp.ude_formulation import UdePrimitive
-from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry import quaternion
 from hrc_learn.model_files import SavedModel
 
 
@@ -276,7 +276,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         filtered: bool,
         goal_body: Vectors | None = None,
     ) -> tuple[DMPState, Tensor, Tensor]:
-        P, B = self._others
+        B = self._others[1]
         moved = None if filtered else self._retarget_numbers(columns, frame, goal)
         if moved is not None:
             columns, frame = moved
@@ -288,11 +288,12 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
             columns, frame = self._to_reference(columns, frame, new, filtered), new
             if position is not None:
                 position = checked_vector("position of goal", position, frame[..., :3])
-                columns = replace(columns, target=_with_columns(columns.target, P, position))
+                target = self._joined(columns.target, position, None, None)
+                columns = replace(columns, target=target)
         if goal_body is None:
             return columns, frame, columns.target
         goal_body = checked_vector("goal_body", goal_body, columns.target[..., B])
-        return columns, frame, _with_columns(columns.target, B, goal_body)
+        return columns, frame, self._joined(columns.target, None, None, goal_body)
 
     def _retarget_numbers(
         self, columns: DMPState, frame: Tensor, goal: Value | None
@@ -300,24 +301,21 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Columns and reference of one motion for a goal that jumps, computed without tensors.
 
         Returns:
-            Columns and reference. None where PyTorch has to compute them, or if a value is
-            wrong; the computation in PyTorch then reports it.
+            Columns and reference. None where PyTorch has to compute them, or if the orientation
+            is wrong; the computation in PyTorch then reports it.
         """
         E, motion = self.error_columns, self.motion
         given = columns.position, columns.rate, columns.target
-        if goal is None or frame.ndim != 1 or isinstance(goal, Pose) != (E.start > 0):
+        plain = type(motion) is JointDMP and fits_numpy(frame, *given)
+        if goal is None or frame.ndim != 1 or not plain:
             return None
-        if type(motion) is not JointDMP or not fits_numpy(frame, *given):
-            return None
-        parts: list[Any] = [goal]
-        if isinstance(goal, Pose):
-            parts = [goal.orientation, goal.position]
+        parts = [x for x in reversed(self._parts("goal", goal)) if x is not None]
         parts = [to_tensor(x, frame.dtype, frame.device) for x in parts]
         if [x.shape for x in parts] != [(4,), (3,)][: len(parts)]:
             return None
         numbers = [number for x in parts for number in x.tolist()]
         q, place = numbers[:4], numbers[4:]
-        if not (0.5 < (norm := math.hypot(*q)) < math.inf and math.isfinite(sum(place))):
+        if not 0.5 < (norm := math.hypot(*q)) < math.inf:
             return None
         offset = motion.goal.tolist()[E]
         q = quaternion.product_of_components(exp_numbers(offset), [x / norm for x in q])
@@ -325,8 +323,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         y[E], rate[E] = retarget_numbers(y[E], rate[E], frame.tolist(), q)
         target[: E.start] = place
         y, rate, target = map(torch.from_numpy, np.array(moved, frame.numpy().dtype))
-        columns = replace(columns, position=y, rate=rate, target=target)
-        return columns, frame.new_tensor(q)
+        return replace(columns, position=y, rate=rate, target=target), frame.new_tensor(q)
 
     def _to_reference(
         self, columns: DMPState, old: Tensor, new: Tensor, filtered: bool
@@ -337,12 +334,10 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         acceleration.
         """
         motion, E = self.motion, self.error_columns
-        position, rate = columns.position, columns.rate
-        error = position[..., E], rate[..., E]
+        error = columns.position[..., E], columns.rate[..., E]
         turned = orientation_error.retarget(*error, old, new)
-        position, rate = (
-            _with_columns(x, E, part) for x, part in zip((position, rate), turned, strict=True)
-        )
+        position = self._joined(columns.position, None, turned[0], None)
+        rate = self._joined(columns.rate, None, turned[1], None)
         moved = replace(columns, position=position, rate=rate)
         if not filtered:
             return moved
@@ -351,7 +346,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         # The angular acceleration is linear in e'', plus a bias from the rotation.
         bias = orientation_error.angular_acceleration(*turned, torch.zeros_like(slope))
         curve = orientation_error.error_rate(turned[0], slope - bias)
-        goal = motion.equilibrium_goal(moved, _with_columns(second, E, curve))
+        goal = motion.equilibrium_goal(moved, self._joined(second, None, curve, None))
         return replace(moved, goal=goal)
 
     def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
@@ -363,13 +358,10 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         coupling = to_tensor(coupling, values.dtype, values.device)
         if coupling.shape[-1:] != (P.stop,):  # not a linear acceleration alone
             checked_vector("coupling", coupling, values[..., : E.stop])
-        push = torch.zeros_like(values)
-        if P.stop:
-            push = _with_columns(push, P, coupling[..., P])
+        rate = None
         if coupling.shape[-1] > P.stop:
             rate = orientation_error.error_rate(values[..., E], coupling[..., P.stop :])
-            push = _with_columns(push, E, rate)
-        return push
+        return self._joined(torch.zeros_like(values), coupling[..., P], rate, None)
 
     def _via(
         self, now: Tensor, value: Value | None, velocity: Points | None
@@ -506,11 +498,3 @@ def _via_errors(
     unknown = omega.isnan().any(-1, keepdim=True)
     rate = orientation_error.error_rate(torch.where(free, error, via), omega.nan_to_num())
     return via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan)
-
-
-def _with_columns(values: Tensor, columns: slice, new: Vectors) -> Float[Tensor, "*batch D"]:
-    """Values with some columns replaced; differentiable in both."""
-    new = to_tensor(new, values.dtype, values.device)
-    stop = values.shape[-1] if columns.stop is None else columns.stop
-    new = new.expand(*values.shape[:-1], stop - columns.start)
-    return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)

@@ -4,6 +4,7 @@ For orientations and poses too, the motion of the columns is a linear map of coo
 functions therefore compute with the columns of `motion`.
 """
 
+import warnings
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -48,6 +49,10 @@ is estimated. `SINGULAR`: relative singular value below which start and goal cou
 constant."""
 KNOWN_DURATION = 1e-6
 """Standard deviation of the logarithm of a duration that is given as known."""
+CERTAIN, FAR = 1e-3, 3.0
+"""`CERTAIN`: standard deviation of a motion, in units of the noise of a via point, below which
+conditioning does not move it. `FAR`: distance at which a via point counts as missed, in these
+units."""
 GAUSSIAN = ("mean", "spread", "timing")
 SAME_ORIENTATION = 1e-9
 """Angle [rad] below which orientations count as equal. The bound is larger than rounding errors
@@ -330,21 +335,25 @@ class ProbabilisticDMP[P: MotionPrimitive](StoredModel):
         deviation = deviation.repeat(2, 1).reshape(-1)[given]
         # Rows are in units of the noise. The unknowns z are factors on the columns of the
         # spread, with a unit Gaussian as prior.
-        root = root[given] / deviation[:, None]
-        return self._given(root, (wanted[given] - mean[given]) / deviation)
+        root, missing = root[given] / deviation[:, None], (wanted - mean)[given] / deviation
+        if (root.norm(dim=-1) < CERTAIN).all() and (missing.abs() > FAR).any():
+            text = "all demonstrations agree on other values at the via points: fit with slack"
+            warnings.warn(text, stacklevel=2)
+        return self._given(root, missing)
 
     def _given(
         self, root: Float[Tensor, "k rank"], residual: Float[Tensor, "k"]
     ) -> "ProbabilisticDMP[P]":
         """Gaussian given root z = residual with unit noise, where z are factors on `spread`."""
-        # The prior's identity keeps this positive definite for any number of equal via points.
-        precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
-        factor = torch.linalg.cholesky(precision)
-        z = torch.cholesky_solve((root.mT @ residual)[:, None], factor)[:, 0]
-        # precision^-1 = L^-T L^-1: L^-T is a square root of the remaining variance.
-        remaining = torch.linalg.solve_triangular(factor, self.spread.mT, upper=False).mT
+        # The precision of z is root' root + I = R' R. The QR decomposition keeps the digits of
+        # the prior next to precise via points, and R^-1 is a square root of the remaining
+        # variance.
+        Q, R = torch.linalg.qr(torch.cat([root, torch.eye(root.shape[1]).to(root)]))
+        solve = torch.linalg.solve_triangular
+        z = solve(R, (Q[: len(root)].mT @ residual)[:, None], upper=True)[:, 0]
+        remaining = solve(R.mT, self.spread.mT, upper=False).mT
         moved = self.mean + (self.spread @ z).view(self.mean.shape)
-        timing = torch.linalg.solve_triangular(factor, self.timing[:, None], upper=False)
+        timing = solve(R.mT, self.timing[:, None], upper=False)
         motion = self.primitive.motion
         primitive = self.primitive
         if self.timing.any():

@@ -27,7 +27,7 @@ from torch import Tensor
 from hrc_learn.dmp import orientation_error
 from hrc_learn.dmp._arguments import Scalars, Times, normalised_time, to_tensor
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.dynamics import SpringDamper
+from hrc_learn.dmp.dynamics import ROUNDING, SpringDamper
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
 from hrc_learn.dmp.response import named_response
@@ -170,6 +170,9 @@ class UdeMotion(Trajectory):
         # Steps are at most half a piece of the response, on which the forcing is smooth.
         size = min(MAXIMUM_STEP, self._response.forced.interval / 2)
         s = self.s.expand(*self._batch, -1) if self.s.ndim > 1 else self.s
+        # Later, the motion rests at its goal.
+        end = self._response.forced.end + _settling(self._response.spring)
+        s = s if self._response.basis.periodic else s.clamp(max=end)
         knot = (s.detach() / size).floor()
         z = self._deviations(int(knot.max()) if knot.numel() else 0, size)
         index = knot.long()[..., None, None].expand(*self._batch, -1, 2, 3)
@@ -260,6 +263,12 @@ def deviation(
     k3 = _slope(middle + free + k2 * (h / 2))
     k4 = _slope(end + E @ (free + k3 * h))
     return E @ (E @ (z + k1 * (h / 6)) + (k2 + k3) * (h / 3)) + k4 * (h / 6)
+
+
+def _settling(spring: SpringDamper) -> float:
+    """Normalised time after which the unforced motion is lost in rounding."""
+    # The product of the two modes of an overdamped spring is its stiffness.
+    return ROUNDING / min(spring.alpha / 2, spring.stiffness * spring.smooth_interval)
 
 
 def _slope(x: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 2 3"]:
