@@ -45,7 +45,7 @@ from hrc_learn.dmp.orientation_error import (
 from hrc_learn.dmp.samples import check_samples, padded
 from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
 from hrc_learn.dmp.ude_formulation import UdePrimitive
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.model_files import SavedModel
 
 
@@ -301,21 +301,23 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """Columns and reference of one motion for a goal that jumps, computed without tensors.
 
         Returns:
-            Columns and reference. None where PyTorch has to compute them, or if the orientation
-            is wrong; the computation in PyTorch then reports it.
+            Columns and reference. None where PyTorch has to compute them, or if a value is
+            wrong; the computation in PyTorch then reports it.
         """
         E, motion = self.error_columns, self.motion
         given = columns.position, columns.rate, columns.target
         plain = type(motion) is JointDMP and fits_numpy(frame, *given)
         if goal is None or frame.ndim != 1 or not plain:
             return None
-        parts = [x for x in reversed(self._parts("goal", goal)) if x is not None]
+        parts: list[Any] = [goal]
+        if isinstance(goal, Pose):
+            parts = [goal.orientation, goal.position]
         parts = [to_tensor(x, frame.dtype, frame.device) for x in parts]
-        if [x.shape for x in parts] != [(4,), (3,)][: len(parts)]:
+        if [x.shape for x in parts] != [(4,), (3,)][: 1 + (E.start > 0)]:
             return None
         numbers = [number for x in parts for number in x.tolist()]
         q, place = numbers[:4], numbers[4:]
-        if not 0.5 < (norm := math.hypot(*q)) < math.inf:
+        if not (0.5 < (norm := math.hypot(*q)) < math.inf and math.isfinite(sum(place))):
             return None
         offset = motion.goal.tolist()[E]
         q = quaternion.product_of_components(exp_numbers(offset), [x / norm for x in q])

@@ -402,16 +402,13 @@ def product(
     """
     D, single = X.shape[-2], X.ndim == 2
     if fits_numpy(X):
-        small = D * H.numel() <= numpy_limit()
-        if single:
-            return torch.from_numpy(X.numpy().dot(H.numpy())) if small else X @ H
-        if small and D >= MINIMUM_ROWS and torch.get_num_threads() == 1:
+        beats = single or (D >= MINIMUM_ROWS and torch.get_num_threads() == 1)
+        if beats and D * H.numel() <= numpy_limit():
             return torch.from_numpy(np.matmul(X.numpy(), H.numpy()))
-        y = empty_in_large_pages(X, *X.shape[:-1], H.shape[-1])
-        torch.mm(X.flatten(0, -2), H, out=y.flatten(0, -2))
-        return y
-    if single:
-        return X @ H
+        if not single:
+            y = empty_in_large_pages(X, *X.shape[:-1], H.shape[-1])
+            torch.mm(X.flatten(0, -2), H, out=y.flatten(0, -2))
+            return y
     # One flat product: PyTorch's batched product with a common matrix is ten times slower.
     return (X.flatten(0, -2) @ H).view(*X.shape[:-1], H.shape[-1])
 

@@ -39,3 +39,20 @@ def test_own_durations_take_few_operations():
     with torch.no_grad(), shapes_unchecked():
         count = count_operations(lambda: dmp.rollout(2 * S, duration=duration).position)
     assert count <= 90
+
+
+def test_a_wrong_goal_of_one_motion_is_named():
+    """The shortcut for one motion in plain numbers leaves wrong goals to the general one."""
+    pose = PoseDMP.fit(2 * S, COLUMNS, TURNED, 20)
+    orientation = OrientationDMP.fit(2 * S, TURNED, 20)
+    place, far = COLUMNS[-1], COLUMNS[-1] * math.nan
+    with torch.no_grad(), shapes_unchecked():
+        for dmp, goal, message in (
+            (pose, Pose(far, ASIDE), "position of goal must be finite"),
+            (pose, Pose(place, 0 * ASIDE), "must be unit quaternions"),
+            (pose, ASIDE, "must be a Pose"),
+            (orientation, Pose(place, ASIDE), "unit quaternions|Pose"),
+            (orientation, place, "must be unit quaternions"),
+        ):
+            with pytest.raises((ValueError, TypeError), match=message):
+                dmp.step(dmp.initial_state(), 1e-3, goal=goal)
