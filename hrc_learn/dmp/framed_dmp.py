@@ -56,6 +56,7 @@ class Frames:
                 f"frames must have A (..., F, D, D) and b (..., F, D), got "
                 f"{tuple(self.A.shape)} and {tuple(self.b.shape)}"
             )
+        finite("inverse of A of frames", torch.linalg.inv_ex(self.A.double()).inverse)
 
     @staticmethod
     def of(*poses: Pose) -> "Frames":

@@ -269,13 +269,12 @@ class MotionPrimitive[Value, Path, State](nn.Module, StoredModel):
         filtered = goal_filter is not None
         state = self.retarget(state, goal, goal_body=goal_body, filtered=filtered)
         columns, frame = self._columns(state)
+        push = None if coupling is None else self._acceleration(columns, frame, coupling)
         columns = self.motion.step_columns(
             columns,
             dt,
             goal_filter=goal_filter,
-            external_acceleration=(
-                None if coupling is None else self._acceleration(columns, frame, coupling)
-            ),
+            external_acceleration=push,
             phase_stopping=phase_stopping,
             forcing_gain=forcing_gain,
         )

@@ -79,9 +79,8 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
     motion, columns = _mean_motion(primitives.motion), primitives.error_columns
     if columns is None:
         return primitives.with_motion(motion)
-    goal: Any = primitives.goal
-    q = goal.orientation if isinstance(goal, Pose) else goal
-    middle = intrinsic_mean(q.reshape(-1, 4))
+    oriented: Any = primitives
+    middle = intrinsic_mean(oriented.goal_orientation.reshape(-1, 4))
     return primitives.with_motion(motion, reference_of(motion.goal[..., columns], middle))
 
 

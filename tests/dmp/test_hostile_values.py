@@ -105,3 +105,9 @@ def test_a_via_point_on_the_motion_is_no_reason_to_warn(dmp, varied):
         warnings.simplefilter("error")
         same.condition([1.0], on_path)
         varied.condition([1.0], on_path + 0.1)
+
+
+@pytest.mark.parametrize("A", [torch.zeros(3, 3), torch.ones(3, 3)])
+def test_frames_that_lose_a_direction_are_refused(A):
+    with pytest.raises(ValueError, match="inverse of A of frames must be finite"):
+        Frames(torch.stack([torch.eye(3), A]), torch.zeros(2, 3))

@@ -1,6 +1,7 @@
 """Operations that PyTorch carries out, which no load on the machine changes."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -46,13 +47,14 @@ def test_a_wrong_goal_of_one_motion_is_named():
     pose = PoseDMP.fit(2 * S, COLUMNS, TURNED, 20)
     orientation = OrientationDMP.fit(2 * S, TURNED, 20)
     place, far = COLUMNS[-1], COLUMNS[-1] * math.nan
+    cases: list[tuple[Any, Any, str]] = [
+        (pose, Pose(far, ASIDE), "position of goal must be finite"),
+        (pose, Pose(place, 0 * ASIDE), "must be unit quaternions"),
+        (pose, ASIDE, "must be a Pose"),
+        (orientation, Pose(place, ASIDE), "unit quaternions|Pose"),
+        (orientation, place, "must be unit quaternions"),
+    ]
     with torch.no_grad(), shapes_unchecked():
-        for dmp, goal, message in (
-            (pose, Pose(far, ASIDE), "position of goal must be finite"),
-            (pose, Pose(place, 0 * ASIDE), "must be unit quaternions"),
-            (pose, ASIDE, "must be a Pose"),
-            (orientation, Pose(place, ASIDE), "unit quaternions|Pose"),
-            (orientation, place, "must be unit quaternions"),
-        ):
+        for dmp, goal, message in cases:
             with pytest.raises((ValueError, TypeError), match=message):
                 dmp.step(dmp.initial_state(), 1e-3, goal=goal)

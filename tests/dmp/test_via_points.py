@@ -301,3 +301,27 @@ def test_a_window_has_a_beginning_and_an_end(within):
     dmp = JointDMP.fit(time, position, 20)
     with pytest.raises(ValueError, match="within must be two increasing times of the motion"):
         dmp.condition([1.0], [[0.1, 0.2]], within=within)
+
+
+@pytest.mark.parametrize("kind", ["joints", "orientation"])
+def test_via_points_are_mapped_like_a_loop(kind):
+    """`vmap` over via points, as a search over them needs it."""
+    if kind == "joints":
+        dmp = JointDMP.fit(*arm_motion(n_joints=3))
+        via = dmp.rollout([1.5]).position.detach() + 0.1 * torch.arange(4).double()[:, None]
+    else:
+        dmp = OrientationDMP.fit(*turning_motion())
+        turned = quaternion.exp(
+            0.1 * torch.arange(4).double()[:, None] * torch.ones(3).double()
+        )
+        via = quaternion.multiply(turned, dmp.rollout([1.5]).orientation.detach())
+
+    def weights(value):
+        return dmp.condition([1.5], value[None]).motion.weights
+
+    with shapes_unchecked():
+        mapped = torch.func.vmap(weights)(via)
+        loop = torch.stack([weights(value) for value in via])
+    torch.testing.assert_close(
+        mapped, loop, rtol=0, atol=1e-9 * float(loop.detach().abs().max())
+    )
