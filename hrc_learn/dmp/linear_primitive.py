@@ -306,7 +306,7 @@ class LinearPrimitive(nn.Module):
             weights = weights * gain[..., None, None]
         shape = weights.shape[:-1]
         if not rate.shape == start.shape == goal.shape == shape or duration.shape != shape[:-1]:
-            self._check_batches(rate=rate, start=start, goal=goal, duration=duration)
+            self._check_batches(rate=rate, start=start, goal=goal, duration=duration[..., None])
             shape = broadcast_shapes(shape, rate.shape, start.shape, goal.shape)
             weights = weights.expand(*shape, -1)
             rate, start, goal = (x.expand(shape) for x in (rate, start, goal))
@@ -357,7 +357,7 @@ class LinearPrimitive(nn.Module):
     ) -> DMPState:
         """State at the start of a motion with this duration [s], for `step_columns`."""
         start, goal, rate = self.resolve_boundary(boundary, duration)
-        self._check_batches(rate=rate, start=start, goal=goal, duration=duration)
+        self._check_batches(rate=rate, start=start, goal=goal, duration=duration[..., None])
         ends = (x.shape[:-1] for x in (start, goal, rate))
         batch = broadcast_shapes(self.weights.shape[:-2], *ends, duration.shape)
         start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
@@ -456,18 +456,13 @@ class LinearPrimitive(nn.Module):
 
     def _check_batches(self, **boundary: Tensor) -> None:
         """Raise ValueError unless the primitives and their boundary broadcast."""
-        shapes = {
-            name: (*x.shape, self.weights.shape[-2]) if name == "duration" else x.shape
-            for name, x in boundary.items()
-        }
+        shapes = {name: x.shape for name, x in boundary.items()}
         try:
             broadcast_shapes(self.weights.shape[:-1], *shapes.values())
         except (ValueError, RuntimeError):
+            shapes = {"the primitive has": self.weights.shape[:-1]} | shapes
             batches = ", ".join(f"{name} {tuple(x[:-1])}" for name, x in shapes.items())
-            raise ValueError(
-                f"batches must broadcast, but the primitive has {tuple(self.duration.shape)}, "
-                f"{batches}"
-            ) from None
+            raise ValueError(f"batches must broadcast, but {batches}") from None
 
     @full_precision
     def second_derivative(self, state: DMPState) -> Float[Tensor, "*batch D"]:

@@ -424,7 +424,17 @@ class ProbabilisticDMP[P: MotionPrimitive](StoredModel):
         return self.observed(noise).entropy()
 
     def kl(self, other: "ProbabilisticDMP[P]", noise: float) -> Float[Tensor, ""]:
-        """KL(self || other) of motion and duration observed with this noise."""
+        """KL(self || other) of motion and duration observed with this noise.
+
+        Raises:
+            ValueError: The distributions differ in kind, columns, or reference of orientations.
+        """
+        one, two = (common_reference(each.primitive) for each in (self, other))
+        alike = type(self.primitive) is type(other.primitive)
+        if one is not None and two is not None:
+            alike &= bool((to_error(one, two).abs() < SAME_ORIENTATION).all())
+        if not alike or len(self.mean) != len(other.mean):
+            raise ValueError("kl needs motions of one kind, with equal columns and references")
         return kl_divergence(self.observed(noise), other.observed(noise))
 
     def log_prob(

@@ -111,3 +111,22 @@ def test_a_via_point_on_the_motion_is_no_reason_to_warn(dmp, varied):
 def test_frames_that_lose_a_direction_are_refused(A):
     with pytest.raises(ValueError, match="inverse of A of frames must be finite"):
         Frames(torch.stack([torch.eye(3), A]), torch.zeros(2, 3))
+
+
+def test_kl_compares_motions_of_one_kind_and_reference(varied):
+    paths = torch.stack([CURVE, 1.1 * CURVE, 0.9 * CURVE - 0.1 * TIME[:, None]])
+    turned = [quaternion.exp(0.5 * paths), quaternion.exp(0.5 * paths + 0.3)]
+    here, there = (ProbabilisticDMP.fit(OrientationDMP.fit(TIME, q, 15)) for q in turned)
+    fewer = ProbabilisticDMP.fit(JointDMP.fit(TIME, paths[..., :2], 15))
+    for one, other in ((varied, here), (here, varied), (varied, fewer), (here, there)):
+        with pytest.raises(ValueError, match="kl needs motions of one kind"):
+            one.kl(other, 0.1)
+    assert here.kl(here, 0.1).abs() < 1e-6
+
+
+def test_batches_that_do_not_broadcast_are_listed():
+    dmps = JointDMP.fit(TIME, torch.stack([CURVE, 1.1 * CURVE]), 15)
+    message = r"batches must broadcast, but the primitive has \(2,\), rate \(2,\), start \(3,\)"
+    for made in (dmps.rollout, dmps.initial_state):
+        with pytest.raises(ValueError, match=message):
+            made(start=torch.zeros(3, 3))
