@@ -20,18 +20,14 @@ if TYPE_CHECKING:
     from hrc_learn.kinematics import SerialChain as SerialChain
     from hrc_learn.kinematics import panda as panda
 
-_PACKAGES = {
-    "AdaptiveController": "controller",
-    "SafetyFilter": "controller",
-    "JointDMP": "dmp",
-    "OrientationDMP": "dmp",
-    "PoseDMP": "dmp",
-    "Pose": "geometry",
-    "quaternion": "geometry",
-    "RBFImageJacobian": "jacobian",
-    "SerialChain": "kinematics",
-    "panda": "kinematics",
+_NAMES = {
+    "controller": ("AdaptiveController", "SafetyFilter"),
+    "dmp": ("JointDMP", "OrientationDMP", "PoseDMP"),
+    "geometry": ("Pose", "quaternion"),
+    "jacobian": ("RBFImageJacobian",),
+    "kinematics": ("SerialChain", "panda"),
 }
+_PACKAGES = {name: package for package, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> object:

@@ -34,20 +34,7 @@ import msgspec
 
 from hrc_learn.store import DISK_ERRORS, json_text, parse_json, read_toml, write_json
 
-_LIBRARIES = {
-    "programs": ("tyro", "rich"),
-    "sim": ("mujoco", "cv2"),
-    "demos": ("pyarrow", "av", "scipy"),
-    "import": ("h5py", "zarr", "tfrecord", "rosbags", "mcap", "mcap_protobuf"),
-    "ros2": ("rclpy", "sensor_msgs"),
-    "viz": ("rerun", "matplotlib", "jinja2"),
-    "ui": ("viser",),
-    "gamepad": ("pygame",),
-    "haptic": ("forcedimension_core",),
-    "lerobot": ("lerobot", "gymnasium", "huggingface_hub", "httpx"),
-    "hardware": ("franky", "pylibfranka", "franky_sim"),
-    "meshes": ("example_robot_data",),
-}
+_LIBRARIES = read_toml(Path(__file__).with_name("extras.toml"))
 _DEVICES = {"--robot": "site.device", "--teleop": "site.leader"}
 """Settings that hold LeRobot's options for a device."""
 EXTRAS = {library: extra for extra, names in _LIBRARIES.items() for library in names}

@@ -123,6 +123,7 @@ def page(args: ServePage) -> None:
     guiding = settings.session.guiding
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
+    print("Preparing arm and work cell; the first start takes longer", flush=True)
     robot, console = _arm_of(args, settings.site), Console()
     workplace = Workplace.of(robot)
     world = World(workplace.scene)

@@ -164,7 +164,8 @@ class FieldSearch:
             # The encoding and its order are unknown.
             self.left_out[f"{name}[3:{one.width}]"] = _WORDS["turns"][str(one.width)]
             key, places = "eef_pos", places[:3]
-        if key == "eef_quat" and not re.match(r"robot\d_", bare):  # robosuite: x, y, z, w
+        # Only robosuite is known to write x, y, z, w.
+        if naming.role_of_key(key) == "quaternion_xyzw" and not re.match(r"robot\d_", bare):
             self.left_out[name] = _WORDS["turns"]["7"]
             return
         if (

@@ -67,6 +67,10 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
         header = named if len(named) in (len(header), len(fields[0])) else []
     else:
         rows, fields = rows[1:], fields[1:]
+    units = header and len(fields) > 1 and not any(map(_is_number, fields[0]))
+    if units and all(map(_is_number, fields[1])):
+        header = [f"{name} [{unit}]" for name, unit in zip(header, fields[0], strict=False)]
+        rows, fields = rows[1:], fields[1:]
     if not rows:
         raise DatasetError("holds a header and no numbers", file=path)
     width = len(fields[0])
@@ -83,6 +87,8 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     ]
     table = _parsed(path, [number for number, _ in rows], fields, names, delimiter)
     if not header and not columns:
+        if len(table) < width:
+            raise DatasetError("has text and no header: give all --columns", file=path)
         return {UNNAMED: np.stack([*table.values()], axis=1)}
     return _without_index(path, table)
 
@@ -144,8 +150,7 @@ def _parsed(
         words = column.to_pylist() if pa.types.is_string(column.type) else ["text"]
         wrong = [k for k, word in enumerate(words) if word is None or not _is_number(word)]
         if not wrong:
-            text = "mixes decimal points and decimal commas"
-            raise DatasetError(text, file=path, key=name)
+            raise DatasetError("mixes decimal points and decimal commas", file=path, key=name)
         if wrong[0] != 0:
             text = f"line {lines[wrong[0]]} does not hold {len(names)} numbers separated by"
             raise DatasetError(

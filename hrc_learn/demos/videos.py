@@ -164,8 +164,7 @@ def encoded_samples(segment: VideoSegment) -> CameraImages | None:
                 if times and time - segment.start < times[-1]:
                     return None
                 times.append(time - segment.start)
-                for part in whole.filter(packet) if whole else (packet,):
-                    samples.append(bytes(part))
+                samples += map(bytes, whole.filter(packet) if whole else (packet,))
     except (av.FFmpegError, OSError, IndexError) as error:
         raise DatasetError(f"cannot be read as a video: {error}", file=segment.file) from error
     if len(times) != len(samples):

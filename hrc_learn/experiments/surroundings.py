@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -38,25 +39,11 @@ from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace, pose_on_table
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.vision import Marker
+from hrc_learn.store import read_toml
 
-THREE_OBJECTS = (
-    ObjectConfig(),
-    ObjectConfig(
-        name="carton",
-        half_size=(0.027, 0.034, 0.028),
-        mass=0.15,
-        marker=Marker(12, 0.030),
-        colour=(0.80, 0.47, 0.13, 1.0),
-    ),
-    ObjectConfig(
-        name="tin",
-        half_size=(0.019, 0.036, 0.026),
-        mass=0.10,
-        marker=Marker(13, 0.027),
-        colour=(0.20, 0.55, 0.38, 1.0),
-    ),
-)
+THREE_OBJECTS = read_toml(
+    Path(__file__).with_name("three_objects.toml"), dict[str, tuple[ObjectConfig, ...]]
+)["objects"]
 """Three boxes that fit into the gripper."""
 # Added to the seed of a run's look, because demonstrations use the looks of small seeds.
 _OTHER_LOOK = 10_000

@@ -139,8 +139,7 @@ def image_jacobian_plots(run: RunRecording) -> list[Plot]:
     plots = []
     if run.image_jacobian is not None:
         for row, pixel in enumerate(("u", "v")):
-            for half in ("linear", "angular"):
-                plots.append(_jacobian_plot(run, row, pixel, half))
+            plots += [_jacobian_plot(run, row, pixel, half) for half in ("linear", "angular")]
     if run.weight_norm is not None:
         norm = single("image_jacobian/weight_norm", "‖W‖", run.weight_norm, palette.PURPLE)
         plots.append(Plot(title="Norm of the learned weights [-]", curves=(norm,)))

@@ -35,7 +35,8 @@ def test_a_page_on_the_network_runs_for_its_duration(tmp_path, monkeypatch):
     with shapes_unchecked():  # also in the threads of the page
         output = done("page", "--out", tmp_path / "demos", *where, *limits).output
     address = r"(https://arm\.local:\d+/#token=\S{24})\n"
-    (url,) = re.findall(f"^Page at {address}", output)
+    (url,) = re.findall(f"\nPage at {address}", output)
+    assert output.startswith("Preparing arm and work cell; the first start takes longer\n")
     (watching,) = re.findall(f"\nTo watch only: {address}", output)
     assert url.split("#")[0] == watching.split("#")[0]
     assert url != watching

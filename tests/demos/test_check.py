@@ -270,6 +270,15 @@ def test_joint_sets_that_cannot_be_matched(tmp_path):
     assert load_demos(root)[0].command_position is None
 
 
+def test_a_transform_is_a_pose(tmp_path):
+    moved = np.tile(np.eye(4), (40, 1, 1))
+    moved[:, 0, 3] = np.linspace(0.3, 0.6, 40)
+    names = [f"O_T_EE_{k}" for k in range(16)]
+    episodes = [{"observation.state": moved.transpose(0, 2, 1).reshape(40, 16)}] * 2
+    root = write_folder(tmp_path / "set", episodes, {"observation.state": names})
+    assert not check_dataset(root).errors
+
+
 def test_a_dataset_without_joints_or_poses(tmp_path):
     root = write_folder(tmp_path / "set", [{"observation.environment_state": joint_path()}], {})
     find(check_dataset(root).errors, "no joints and no poses found")

@@ -122,7 +122,30 @@ def tool(kind, count):
             "that of the right arm; the left one",
         ),
         # Of two fingers of one name, the first counts.
-        ("finger.pos finger.pos a.pos", {"joint_position": [0, 2]}, True, ""),
+        (
+            "finger.pos finger.pos a.pos",
+            {"joint_position": [0, 2]},
+            True,
+            "the second finger is left out",
+        ),
+        (
+            "r33 r11 r12 r13 r21 r22 r23 r31 r32",
+            {"rotation_matrix": [1, 2, 3, 4, 5, 6, 7, 8, 0]},
+            False,
+            "",
+        ),
+        (
+            " ".join(f"rot_{row}{column}" for row in range(3) for column in range(3)),
+            {"rotation_matrix": [*range(9)]},
+            False,
+            "",
+        ),
+        (
+            " ".join(f"O_T_EE_{k}" for k in range(16)),
+            {"pose_matrix": [*range(16)]},
+            False,
+            "",
+        ),
         (
             "l_gripper.pos r_gripper.pos a.pos",
             {"joint_position": [2]},

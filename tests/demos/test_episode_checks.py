@@ -341,6 +341,22 @@ def test_the_first_frame_that_is_too_fast_is_named_with_its_fastest_joint():
     assert not [*checks.joint_speeds(ENTRY, slow)]
 
 
+@pytest.mark.parametrize(
+    ("factor", "told"), [(1.0, ""), (2.9, ""), (57.3, "57.3"), (0.3, "0.3"), (-57.3, "")]
+)
+def test_velocities_in_another_unit_than_the_joints(factor, told):
+    q = np.sin(np.arange(60) / 10)[:, None] * [1.0, 0.5, 0.2]
+    one = demo(q)
+    rate = factor * np.gradient(q, one.time, axis=0)
+    issues = [*checks.joint_rates(ENTRY, replace(one, joint_velocity=rate))]
+    assert len(issues) == bool(told)
+    for issue in issues:
+        assert f"is {told} times the rate of joint_position" in issue.message
+    other = np.random.default_rng(0).normal(size=q.shape)
+    assert not [*checks.joint_rates(ENTRY, replace(one, joint_velocity=100 * other))]
+    assert not [*checks.joint_rates(ENTRY, one)]
+
+
 def test_actions_that_copy_the_state():
     q = np.random.default_rng(0).normal(size=(20, 2))
     (issue,) = checks.copied_commands(ENTRY, demo(q, command_position=q.copy()))

@@ -53,6 +53,9 @@ def test_bounds_of_a_declared_shape(dtype, shape, fault):
         (["a", "b", "c"], ("a", "b", "c")),
         ({"axes": ["a", "b", "c"]}, ("a", "b", "c")),
         ({"left": ["a"], "right": {"x": ["b", "c"]}}, ("a", "b", "c")),
+        # Two arms with joints of the same names, and names with their columns.
+        ({"left": ["a", "b"], "right": ["a"]}, ("left_a", "left_b", "right_a")),
+        ({"a": 0, "b": 1, "c": 2}, ("a", "b", "c")),
         ([["a", ["b"]], ("c",)], ("a", "b", "c")),
         ([1, None, "b", "c"], ("1", "b", "c")),
         (["a", "b"], None),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import linregress
 
+from hrc_learn.demos.read import profiles as read_profiles
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.profiles import (
     FeatureProfiles,
@@ -290,7 +291,16 @@ def test_half_a_percent_of_the_range_in_five_frames_is_no_rest(creep, at_rest):
         slow = moved.copy()
         slow[80:, 0] = slow[79, 0] + creep / 5 * np.arange(1, 35)
         pair = (command, slow) if moved is state else (slow, state)
-        assert np.isfinite(track(*pair, 50).offset[0]) == at_rest
+        assert np.isfinite(read_profiles._resting_offset(*pair)[0]) == at_rest
+
+
+@pytest.mark.parametrize(("slope", "known"), [(1.0, True), (0.99, True), (0.97, False)])
+def test_a_copy_that_never_rests_shows_its_offset(slope, known):
+    command = (np.linspace(0, 2, 200) + 0.1 * np.sin(np.arange(200) / 20))[:, None]
+    state = slope * command - 0.3
+    offset = track(command, state, 50).offset[0]
+    assert np.isfinite(offset) == known
+    assert not known or offset == pytest.approx(0.3, abs=0.02)
 
 
 def tracking(residual):

@@ -75,6 +75,11 @@ def taken(search):
         ({"target_q_0": (), "target_q_1": ()}, {"action.qpos": ["target_q_0", "target_q_1"]}),
         ({"pos_0": (), "position_1": ()}, {"observation.qpos": ["pos_0", "position_1"]}),
         ({"joint_1": (), "gripper": ()}, {"observation.state": ["joint_1", "gripper"]}),
+        ({"actuator_1": (), "Actuator2": ()},
+         {"observation.state": ["actuator_1", "Actuator2"]}),
+        # Topics of ROS as `rostopic echo -p` prints them.
+        ({"field.pose.position.x": (), "field.pose.orientation.w": ()},
+         {"observation.state": ["field.pose.position.x", "field.pose.orientation.w"]}),
     ],
 )  # fmt: skip
 def test_names_become_features(shapes, features):
@@ -95,6 +100,8 @@ def test_poses_of_ur_are_rotation_vectors():
 @pytest.mark.parametrize(
     ("shapes", "left_out"),
     [
+        ({"ee_quat": 4, "tcp_quat": 4, "tool_orientation": 4},
+         ["ee_quat", "tcp_quat", "tool_orientation"]),
         ({"reward": 1, "next_obs__q": 3, "obs__next_q": 3},
          ["reward", "next_obs/q", "obs/next_q"]),
         ({"camera_pose": 16, "T_camera": (4, 4)}, ["camera_pose", "T_camera"]),

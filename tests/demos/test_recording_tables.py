@@ -50,6 +50,8 @@ def table(tmp_path, text, columns=()):
         (",0,1,2\n0,5,6,7\n1,8,9,1\n", (), {"array": [[5, 6, 7], [8, 9, 1]]}),
         ("0,1\n5,6\n", (), {"array": [[0, 1], [5, 6]]}),
         ("0,1,2,3\n5,6,7,8\n", ("a", "b", "c", "d"), {"a": [5], "b": [6], "c": [7], "d": [8]}),
+        # A row of units.
+        ("t,a\ns,deg\n1,2\n3,4\n", (), {"t [s]": [1, 3], "a [deg]": [2, 4]}),
         # Times of day.
         ("t,a\n00:01:02,1\n12:00:00,2\n", (), {"t": [62, 43200], "a": [1, 2]}),
         ("t,a\n00:00:01.5,1\n00:01:00.25,2\n", (), {"t": [1.5, 60.25], "a": [1, 2]}),
@@ -97,6 +99,7 @@ def test_a_missing_number_is_nan(tmp_path):
         ("word\nx\ny\n", (), "holds no column of numbers"),
         (",a\n7,1\n9,2\n", (), "holds a column without a name"),
         ("0,1,2,3\n", (), "holds a header and no numbers"),
+        ("[INFO] t=0 q=[1, 2, 3]\n[INFO] t=1 q=[1, 2, 3]\n", (), "has text and no header"),
     ],
 )
 def test_tables_that_are_damaged_name_the_line(tmp_path, text, columns, message):

@@ -318,6 +318,14 @@ def test_rotation_vectors_are_unwrapped(tmp_path):
     np.testing.assert_allclose(raw, np.linspace(2, 5, 60), atol=1e-9)
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_an_episode_too_short_to_move_stays(tmp_path, frames):
+    motions = [joint_path(60), joint_path(60)[:frames]]
+    root = write(tmp_path / "old", motions)
+    repair_dataset(root, tmp_path / "new")
+    assert read_info(tmp_path / "new")["total_episodes"] == 2
+
+
 def test_bad_frames_go_only_when_asked_for(tmp_path):
     q = joint_path(60)
     q[12, 1], q[40:42] = np.nan, np.inf

@@ -288,6 +288,7 @@ def test_names_of_pictures_are_those_of_their_axes(folder):
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
+        (pa.float16(), "float16"),
         (pa.float32(), "float32"),
         (pa.float64(), "float64"),
         (pa.int16(), "int16"),

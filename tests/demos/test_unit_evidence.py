@@ -61,6 +61,16 @@ def test_four_columns_of_unit_length_that_move(columns, found):
     assert measure(columns).unit_length.tolist() == found
 
 
+@pytest.mark.parametrize(
+    ("largest", "clipped"), [(1.0, [0.5, 0]), (100.0, [0, 0.5]), (50.0, [0, 0]), (0.9, [0, 0])]
+)
+def test_values_at_the_limit_of_1_or_100_are_counted(largest, clipped):
+    values = np.array([[1.0, 0.1], [0.2, 0.1], [-1.0, 0.3], [0.5, 0.2]])
+    values[:, 1] = [largest, -largest, 0.3, 0.2] if largest > 1 else values[:, 1]
+    values[:, 0] *= min(largest, 1)
+    assert measure(values).clipped.tolist() == clipped
+
+
 @pytest.mark.parametrize(("angle", "moves"), [(0.9e-3, False), (1.1e-3, True)])
 def test_a_quaternion_moves_by_a_thousandth(angle, moves):
     turn = np.linspace(0, angle, 20)
@@ -143,7 +153,18 @@ HOBBY = ("shoulder_pan", "shoulder_lift", "elbow_flex")
             SIX,
             Guess("deg", 0.75, "values usually reach 100", "%"),
         ),
-        (sizes(2000, 3000, whole=True), SIX, Guess("tick", 0.8, f"{REACH} 3e+03", "deg")),
+        (sizes(2000, 3000, whole=True), SIX, Guess("tick", 0.8, f"{REACH} 3e+03", "mdeg")),
+        # Beyond two turns of an encoder, counts may be thousandths of a degree.
+        (sizes(2000, 8191, whole=True), SIX, Guess("tick", 0.8, f"{REACH} 8.19e+03", "mdeg")),
+        (sizes(2000, 8192, whole=True), SIX, Guess("tick", 0.4, f"{REACH} 8.19e+03", "mdeg")),
+        # Values that were scaled to -1..1.
+        (
+            sizes(1, 1, 0.5, clipped=[0.1, 0.1, 0]),
+            SIX,
+            Guess("1", 0.5, "joints reach exactly 1, but never exceed it", "rad"),
+        ),
+        (sizes(1, 1, clipped=[0.1, 0]), SIX, Guess("rad", 0.95, f"{REACH} 1", "deg")),
+        (sizes(1, 1.5, clipped=0.1), SIX, Guess("rad", 0.95, f"{REACH} 1.5", "deg")),
         (sizes(2000, 3000), SIX, Guess("tick", 0.4, f"{REACH} 3e+03", "deg")),
         (
             sizes(2000, 3000, whole=[True, False]),

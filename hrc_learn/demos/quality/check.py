@@ -49,6 +49,7 @@ MOTION_CHECKS = (
     episode_checks.motion_present,
     episode_checks.rest_at_ends,
     episode_checks.joint_speeds,
+    episode_checks.joint_rates,
     episode_checks.copied_commands,
 )
 _PLACED = 5
@@ -236,6 +237,6 @@ def _meaning(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> I
             yield warning(message=note)
     for role, note in mapping.unmatched.items():
         yield warning(message=note, key=role)
-    if not any(role in mapping.selections for role in (*JOINT_FIELDS, "position")):
+    if {*JOINT_FIELDS, "position", "pose_matrix"}.isdisjoint(mapping.selections):
         text = "no joints and no poses found among the columns: name them (mapping={...})"
         yield Issue(message=text)

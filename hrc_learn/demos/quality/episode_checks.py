@@ -23,6 +23,8 @@ _GAP = 1.6
 _SHORT_FRAMES, _SHORT_SECONDS = 10, 0.5
 _FASTEST_ARM = 12.0
 """Largest joint speed of an arm [rad/s]; faster steps are faults of the recording."""
+_ALIKE = 0.8
+"""Correlation above which two motions are the same, apart from their scale."""
 _STILL_SECONDS = 1.0
 """Longest rest before or after the motion that is not reported [s]."""
 _SMALLEST_MOTION = 1e-4
@@ -265,6 +267,19 @@ def joint_speeds(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
     )
     key = f"joint_position ({name})"
     yield entry.warning(text, frame=frame + 1, key=key, components=(name,))
+
+
+def joint_rates(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
+    """Report joint velocities in another unit than the rates of the joint positions."""
+    joints, velocity = demo.joint_position, demo.joint_velocity
+    if joints is None or velocity is None or len(joints) < 3:
+        return
+    rate = np.gradient(joints, demo.time, axis=0)
+    sizes = [float(np.linalg.norm(x)) for x in (velocity, rate)]
+    ratio = sizes[0] / max(sizes[1], 1e-9)
+    if (rate * velocity).sum() > _ALIKE * sizes[0] * sizes[1] and not 1 / 3 < ratio < 3:
+        text = f"is {ratio:.3g} times the rate of joint_position: in another unit?"
+        yield entry.warning(f"{text} --units joint_velocity deg/s", key="joint_velocity")
 
 
 def copied_commands(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:

@@ -207,7 +207,7 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
     """
     quantities = edit.quantities
     role = next((r for r in ("joint_position", "position") if r in quantities), None)
-    if role is None:
+    if role is None or len(edit) < 3:
         return edit
     moving: dict[str, Any] = {role: quantities[role] * edit.units[role].factor}
     names = edit.columns.joint_names if role == "joint_position" else ()
@@ -315,6 +315,8 @@ def _turns(
     switches between -3 and 3 rad leaves a remainder of 0.28 rad, but rests before and after:
     it does not turn.
     """
+    if len(values) < 2:
+        return np.zeros_like(values)
     steps = np.diff(values, axis=0)
     whole = np.rint(steps)
     left = np.abs(steps - whole)

@@ -124,7 +124,8 @@ def _number_type(kind: pa.DataType) -> str | None:
         if not hasattr(kind, "value_type"):
             return None
         kind = kind.value_type
-    return {"double": "float64", "float": "float32"}.get(str(kind), str(kind))
+    names = {"double": "float64", "float": "float32", "halffloat": "float16"}
+    return names.get(str(kind), str(kind))
 
 
 def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
@@ -248,8 +249,7 @@ def component_names(folder: DatasetFolder) -> Iterator[Issue]:
             text = f"{len(declared)} names for {feature.width} components: they are not used"
             yield warning(message=f"{text}; correct names or shape", file=INFO_PATH, key=key)
         if len({*names}) < len(names):
-            text = "two components have the same name"
-            yield warning(message=text, file=INFO_PATH, key=key)
+            yield warning(message="two components have the same name", file=INFO_PATH, key=key)
         if any(plain_text(name) != name for name in (key, *names)):
             text = "a name holds unprintable characters"
             yield warning(message=text, file=INFO_PATH, key=key)

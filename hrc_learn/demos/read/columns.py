@@ -380,7 +380,8 @@ class _Conventions:
             if meaning is not None:
                 # If two fingers have the same name, the first counts.
                 slots = groups.setdefault((meaning.role, meaning.side), {})
-                slots.setdefault(meaning.slot, index)
+                if slots.setdefault(meaning.slot, index) < index and "joint" in meaning.role:
+                    self._notes.append(f"{feature.key}: the second {meaning.slot} is left out")
         for role, side in [*groups]:
             if role == "pose_matrix" and len(groups[role, side]) in _CARTESIAN:
                 # The components of this pose are only numbered, so their count decides on the

@@ -100,7 +100,10 @@ def flatten_names(names: object) -> tuple[str, ...] | None:
     if names is None:
         return None
     if isinstance(names, dict):
-        names = list(names.values())
+        parts = {k: (k,) if isinstance(x, int) else flatten_names(x) for k, x in names.items()}
+        pairs = [(key, name) for key, part in parts.items() for name in part or ()]
+        alike = len({name for _, name in pairs}) < len(pairs)
+        names = [f"{key}_{name}" if alike else name for key, name in pairs]
     if not isinstance(names, list | tuple):
         return (str(names),)
     return tuple(name for item in names for name in flatten_names(item) or ())

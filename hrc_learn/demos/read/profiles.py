@@ -355,6 +355,10 @@ def track(
         slope = product / power
         fit = product**2 / (power * answer)
     slope[~moving] = fit[~moving] = np.nan
+    # Where nothing rests, a state that copies its command, with a slope of 1 up to noise, shows
+    # the offset, too.
+    copied = np.isnan(offset) & (fit > 1 - _NEGLIGIBLE) & (np.abs(slope - 1) < 2 * _NEGLIGIBLE)
+    offset = np.where(copied, a.mean(0) - s.mean(0), offset)
     return Tracking(
         delay=delay, residual=residual.astype(np.float32), slope=slope, fit=fit, offset=offset
     )

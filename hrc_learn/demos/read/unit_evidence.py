@@ -28,6 +28,8 @@ _BOUNDS = {role: {unit: most for most, unit, *_ in rows} for role, rows in SIZES
 # Largest joint angles in rad and in deg. Wrists may turn more than once, so that the bound in
 # rad is two turns, 12.6 rad. No demonstration in degrees stays within 13 degrees.
 _TWO_TURNS, _DEGREES = _BOUNDS["rotation_vector"]["rad"], 400.0
+# Two turns of an encoder. Some arms report whole thousandths of a degree.
+_TICKS = 8192.0
 _FINGER_RATIO = 1.05
 _PERCENT, _BYTE = _BOUNDS["gripper"]["%"], _BOUNDS["gripper"]["byte"]
 # Unit, and one step of an encoder in this unit. LeRobot divides a turn by 4095.
@@ -69,7 +71,7 @@ class Sizes(NamedTuple):
     peak: Float64[np.ndarray, " components"]
     """99.5 % quantile of the absolute values."""
     clipped: Float64[np.ndarray, " components"]
-    """Fraction of the frames at exactly 100 or -100."""
+    """Fraction of the frames at exactly 100 or -100; at 1 or -1 if no component exceeds 1."""
     whole: Bool[np.ndarray, " components"]
     """True where all values are whole numbers."""
     unit_length: Bool[np.ndarray, " components"]
@@ -103,7 +105,7 @@ def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
         length[first] = np.ptp(known[:, first : first + 4], axis=0).max() > 1e-3
     return Sizes(
         peak=np.partition(sizes, place, axis=0)[place],
-        clipped=(sizes == 100.0).mean(0),
+        clipped=(sizes == (_CLIP if sizes.max() > 1 else 1.0)).mean(0),
         whole=(known == np.rint(known)).all(0),
         unit_length=length,
         opening=(known.min(0) == 0) & (known.max(0) == 1),
@@ -240,11 +242,14 @@ def guess_joints(
     if limit == _TWO_TURNS:
         # Radians beyond a turn are rare; small values in degrees are not.
         guess = Guess("rad", 0.95 if largest <= math.tau + 0.1 else 0.7, reach, "deg")
+        if largest == 1 and (sizes.clipped[fitting] > _CLIPPED).sum() > 1:
+            guess = Guess("1", 0.5, "joints reach exactly 1, but never exceed it", "rad")
     elif limit == _DEGREES:
         guess = _degrees_or_range(sizes, fitting, largest, labels, robot_type)
     else:
         whole = bool(sizes.whole[fitting].all())
-        guess = Guess("tick", 0.8 if whole else 0.4, reach, "deg")
+        sure = 0.8 if whole and largest < _TICKS else 0.4
+        guess = Guess("tick", sure, reach, "mdeg" if whole else "deg")
     if not outliers:
         return guess
     beyond = ", ".join(f"{labels[i]} {peaks[i]:.3g}" for i in outliers)
