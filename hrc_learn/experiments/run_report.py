@@ -277,6 +277,6 @@ def placing_joints_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
     curves = [JointCurves("demonstration", time, shown.joint_position, *DEMO_LOOK)]
     for shelf, colour in zip(shelves, _SHELVES, strict=False):
         placed = run.placings["pose", shelf]
-        label = f"{shelf} shelf"
-        curves.append(JointCurves(label, placed.time, placed.joint_position, colour))
+        name, position = f"{shelf} shelf", placed.joint_position
+        curves.append(JointCurves(name, placed.time, position, colour))
     return joint_grid_figure(chain.joint_names, curves, JointRanges.of(chain.limits))

@@ -28,11 +28,14 @@ _INDEXED = {
 
 
 def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
-    """Mask of the geoms of the named bodies and of all bodies that they carry."""
+    """Mask of the geoms of the named bodies and of all bodies that they carry.
+
+    The body "world" stands for what is fixed to the ground: floor and pedestal.
+    """
     roots = {model.body(name).id for name in bodies}
     member = np.zeros(model.nbody, dtype=bool)
-    for body in range(model.nbody):  # parents come before children
-        member[body] = body in roots or (body != 0 and member[model.body_parentid[body]])
+    for body, parent in enumerate(model.body_parentid):  # parents come before children
+        member[body] = body in roots or (parent != 0 and member[parent])
     return member[model.geom_bodyid]
 
 

@@ -46,7 +46,7 @@ class World:
         cabinet_contacts: Touches of the arm or its hand with the cabinet or an obstacle.
         object_contacts: Touches of objects with the cabinet or an obstacle.
         table_contacts: Touches of the arm or its hand with the table.
-        self_contacts: Touches of the arm with itself.
+        self_contacts: Touches of the arm with itself, its pedestal or the floor.
         worker_contacts: Touches of the arm, and of objects, with the worker.
     """
 
@@ -68,13 +68,14 @@ class World:
         self.data = mujoco.MjData(self.model)
         self._watch = PhysicsWatch(self.model, self.data)
         self.arm = MujocoArm(self.model, self.data, self.config.arm.robot, self.imperfections)
-        obstacles = [box.name for box in self.config.obstacles]
-        cabinet = [box.name for box in self.config.cabinet.boxes()] + obstacles
+        fixed = (*self.config.cabinet.boxes(), *self.config.obstacles)
+        cabinet = [box.name for box in fixed]
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
         objects = [item.name for item in self.config.objects]
         self.object_contacts = ContactMonitor(self.model, objects, cabinet)
         self.table_contacts = ContactMonitor(self.model, _ARM_BODIES, [self.config.table.name])
-        self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, ("link0",))
+        # The tree from link 0 on is the whole arm; "world" has pedestal and floor.
+        self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, ("link0", "world"))
         workers = WORKER_BODIES if self.config.worker is not None else ()
         self.worker_contacts = ContactMonitor(self.model, (*_ARM_BODIES, *objects), workers)
         self._monitors = [x for x in vars(self).values() if isinstance(x, ContactMonitor)]
@@ -254,11 +255,10 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def _object(self, name: str):
-        for item in self.config.objects:
-            if item.name == name:
-                return item
-        known = ", ".join(item.name for item in self.config.objects)
-        raise KeyError(f"no object named {name!r}; there are: {known}")
+        found = {item.name: item for item in self.config.objects}
+        if name not in found:
+            raise KeyError(f"no object named {name!r}; there are: {', '.join(found)}")
+        return found[name]
 
     def object_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
         """Pose of an object's centre in the base frame."""
@@ -329,8 +329,8 @@ class World:
     def collisions_along(
         self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> list[Touch]:
-        """Touches of the arm with cabinet, table, obstacles or itself along a path of joint
-        positions.
+        """Touches of the arm with cabinet, table, obstacles, base, pedestal, floor or itself
+        along a path of joint positions.
 
         The test is purely geometric: nothing is simulated, and the world does not change. Times
         in the touches are sample numbers.
@@ -345,11 +345,11 @@ class World:
         in_hand = None
         if carried is not None:
             in_hand = np.linalg.inv(self.arm.tcp_pose()) @ self.object_pose(carried)
-        boxes = [box.name for box in (*self.config.boxes(), *self.config.obstacles)]
+        boxes = ["world", *(b.name for b in (*self.config.boxes(), *self.config.obstacles))]
         movers = _ARM_BODIES if carried is None else (*_ARM_BODIES, carried)
         monitors = [
             ContactMonitor(self.model, movers, boxes),
-            ContactMonitor(self.model, _ARM_BODIES, _ARM_BODIES),
+            ContactMonitor(self.model, _ARM_BODIES, ("link0",)),
         ]
         for k, q in enumerate(path):
             data.qpos[self.arm.joints] = q

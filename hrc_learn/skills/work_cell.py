@@ -49,6 +49,9 @@ from hrc_learn.skills.step_report import (
 
 # Longest time for the joints to return at the end of a path [s].
 _LONGEST_RETURN = 5.0
+# Distance of the end effector from its path at which an unknown object holds it [m]. Servos lag
+# by 0.03 m at most.
+_HELD = 0.15
 # Time at the end of a straight line in which the pose error decays at the rate `pose_gain` [s].
 _SETTLING_TIME = 0.4
 # Longest total time for which a straight line waits for a lagging end effector [s]: the goal
@@ -464,7 +467,7 @@ class WorkCell:
             BlockedPathError: The arm was pushed aside and cannot return to the waiting path
                 without a collision.
             TaskFailedError: A person holds the arm aside while the path waits, or blocks the
-                arm, for longer than `longest_wait`.
+                arm, for longer than `longest_wait`; or the arm does not follow the path.
         """
         if not len(path):
             return 0
@@ -605,10 +608,14 @@ class WorkCell:
             self.images.append(KeptImage(time=self.time, image=image))
 
     def _give_up_if_blocked(self) -> None:
-        """Raise if people block the arm for too long, or if obstacles block its return."""
-        blocked = "a person has been in the way of the arm"
+        """Raise if people block the arm for too long, or if objects block it or its return."""
+        blocked, path = "a person has been in the way of the arm", self.loop_state.path
         self._give_up_after(float(self.pace.blocked_for), blocked, "clear its path")
-        if self.loop_state.path.direct_return.blocked:
+        off = float((path.pose.position - self.pose.position).norm())
+        on_path = path.followed and not path.finished and not self.loop_state.aside
+        if on_path and off > _HELD:
+            raise TaskFailedError(f"the arm is {off:.2f} m off its path: an object holds it.")
+        if path.direct_return.blocked:
             raise BlockedPathError(
                 "path: the arm was pushed aside and cannot return without a collision with its "
                 "surroundings."

@@ -150,10 +150,9 @@ def joint_grid_figure(
 
 def joints_figure(run: RunRecording) -> Figure:
     """Joint positions over time, with the demonstration and the limits."""
-    motions, demo = [], run.demo_joint_position
-    if demo is not None:
-        motions.append(JointCurves("demonstration", run.time, demo, *DEMO_LOOK))
-    motions.append(JointCurves("run", run.time, run.joint_position))
+    motions = [JointCurves("run", run.time, run.joint_position)]
+    if (demo := run.demo_joint_position) is not None:
+        motions.insert(0, JointCurves("demonstration", run.time, demo, *DEMO_LOOK))
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
 

@@ -8,9 +8,9 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import arm, panda
 from hrc_learn.protocols import ArmState
-from hrc_learn.sim import World
+from hrc_learn.sim import ArmModelConfig, SceneConfig, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.sim.world import _PADS
 
@@ -183,6 +183,21 @@ def test_contacts_tell_who_met_whom(world, workplace):
     assert any(touch.second == "cabinet_door" for touch in touches)
     assert all(touch.first.startswith(("link", "hand", "finger")) for touch in touches)
     assert world.time == 0.0
+
+
+def test_collisions_include_base_pedestal_and_floor():
+    world = World(SceneConfig(arm=ArmModelConfig(robot=arm("ur5e").with_hand())))
+    home = np.array([0.0, -1.6, 1.6, -1.6, -1.6, 0.0])
+    assert world.collisions_along(home[None]) == []
+    # The shoulder lift swings the upper arm down through the pedestal.
+    path = home + np.linspace(0.0, 2 * np.pi, 200)[:, None] * np.eye(6)[1]
+    met = {touch.second for touch in world.collisions_along(path)}
+    assert {"link0", "pedestal"} <= met
+    watched = {"link0": 0, "pedestal": 0, "floor": 0, "table": 0}
+    for name in watched:
+        geom, link = (world.model.geom(n).id for n in (name, "link3_0"))
+        watched[name] = int(world.self_contacts.watched[geom, link])
+    assert watched == {"link0": 1, "pedestal": 1, "floor": 1, "table": 0}
 
 
 def test_collisions_include_what_is_carried(world, workplace):

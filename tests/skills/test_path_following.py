@@ -55,6 +55,26 @@ def test_a_path_is_left_when_its_end_is_told(cell):
     assert cell.follow_path(path, until=lambda: len(cell.log) == 12) == 12
 
 
+class HeldArm(ObedientArm):
+    """Arm whose first joint an object stops after 0.1 rad."""
+
+    def advance(self, duration):
+        super().advance(duration)
+        self.q[0] = min(self.q[0], float(panda.ready[0]) + 0.1)
+
+
+def test_an_arm_that_an_object_holds_does_not_go_on():
+    cell = cell_with(HeldArm(panda.ready.numpy()))
+    far = torch.tensor([1.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    path = joint_line(panda.ready, panda.ready + far, speed=0.8, dt=0.01).numpy()
+    with pytest.raises(
+        TaskFailedError, match=r"arm is 0\.15 m off its path: an object holds it"
+    ):
+        cell.follow_path(path)
+    near = joint_line(cell.joints, panda.ready, speed=0.8, dt=0.01).numpy()
+    assert cell.follow_path(near) == len(near)
+
+
 def pushed_along(path, push, seconds, clearance=None, **settings):
     """A cell that follows a path while a person pushes from its first to its last second."""
     arm = ObedientArm(path[0])
@@ -209,9 +229,10 @@ def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
 
     config = WorkCellConfig(dt=DT, command_delay=DT)
     cell, path = cell_with(Stuck(panda.ready.numpy()), config=config), transfer()
-    assert cell.follow_path(path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
-    assert abs(float(cell.joints[0]) - path[-1, 0]) > 0.5
-    assert len(cell.log) == len(path)
+    with pytest.raises(TaskFailedError, match="off its path: an object holds it"):
+        cell.follow_path(path)
+    assert not cell.loop_state.aside
+    assert len(cell.log) < len(path)
 
 
 @pytest.mark.long
