@@ -331,7 +331,7 @@ def test_bad_frames_go_only_when_asked_for(tmp_path):
     q[12, 1], q[40:42] = np.nan, np.inf
     root = write(tmp_path / "old", [joint_path(50, seed=1), q])
     with pytest.raises(
-        DatasetError, match=r"not finite in 3 frames.*drop_bad_frames"
+        DatasetError, match=r"not finite in 3 frames.*--drop bad-frames"
     ) as raised:
         repair_dataset(root, tmp_path / "new", QUIET)
     assert (raised.value.episode, raised.value.frame) == (1, 12)

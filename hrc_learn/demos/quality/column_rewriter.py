@@ -215,7 +215,7 @@ class ColumnRewriter:
         for frame, index in enumerate(indices):
             if index not in listed:
                 text = f"task {index:g} is not in the list of tasks: leave the episode out"
-                raise edit.fault(f"{text} (drop_bad_episodes)", frame, "task_index")
+                raise edit.fault(f"{text} (--drop bad-episodes)", frame, "task_index")
         return [listed[index] for index in indices]
 
     def stage(

@@ -162,7 +162,7 @@ def drop_bad_frames(edit: EpisodeEdit, allowed: bool) -> EpisodeEdit:
     bad = np.logical_or.reduce(rows)
     if bad.any() and not allowed:
         text = f"holds values that are not finite in {bad.sum()} frames; drop those"
-        text += " (drop_bad_frames), or the episode (drop_bad_episodes)"
+        text += " (--drop bad-frames), or the episode (--drop bad-episodes)"
         raise edit.fault(text, frame=int(bad.argmax()))
     return edit.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
 

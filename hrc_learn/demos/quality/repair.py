@@ -403,6 +403,6 @@ class _Repair:
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
         if len(stalled):
             text = "stamps must increase; drop the late frames (drop_late), or leave the"
-            text += " episode out (drop_bad_episodes)"
+            text += " episode out (--drop bad-episodes)"
             raise edit.fault(text, frame=int(stalled[0]) + 1)
         return edit if options.fps is None else edits.resample_to_grid(edit, options.fps)
