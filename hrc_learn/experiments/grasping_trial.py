@@ -91,8 +91,9 @@ class GraspingScene:
     ) -> "GraspingScene":
         """Draw a scene.
 
-        The arm starts anywhere within its joint limits. It touches nothing there, does not hide
-        the object from the camera, and can move home on straight lines in joint space.
+        The arm starts anywhere within its joint limits, joints of more than one turn within
+        half a turn of home. It touches nothing there, does not hide the object from the camera,
+        and can move home on straight lines in joint space.
 
         Args:
             workplace: Workplace with the camera of the demonstrations.
@@ -107,8 +108,7 @@ class GraspingScene:
         """
         scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
         # A separate generator, so that the scenes do not depend on the imperfections.
-        robot = workplace.robot
-        drawn = sizes.draw(rng.spawn(1)[0], robot.joints, robot.hand_size)
+        drawn = sizes.draw(rng.spawn(1)[0], workplace.robot.joints, workplace.robot.hand_size)
         yaw = max(_ALONG_EDGES, sizes.object_yaw)
         pose = workplace.random_object_pose(workplace.scaled(_OBJECT_REACH), rng, yaw)
         camera_model = _draw_camera(workplace, config, rng)
@@ -238,12 +238,15 @@ def _starts(
     workplace: Workplace, rng: np.random.Generator
 ) -> Iterator[Float[np.ndarray, " joints"]]:
     """Joint positions [rad] with the end effector high enough, and far enough from its goal."""
-    limits, hover = workplace.robot.chain.limits, workplace.hover().position
-    lower, upper = limits.lower + _LIMIT_MARGIN, limits.upper - _LIMIT_MARGIN
+    limits, home = workplace.robot.chain.limits, workplace.home_joints()
+    hover, size = workplace.hover().position, workplace.robot.hand_size
+    # Joints of more than one turn start within half a turn of home: cables must not wind up.
+    half = torch.where(limits.upper - limits.lower > 2 * torch.pi, torch.pi, torch.inf)
+    lower = torch.maximum(limits.lower + _LIMIT_MARGIN, home - half)
+    upper = torch.minimum(limits.upper - _LIMIT_MARGIN, home + half)
     for _ in range(_MOST_STARTS):
         q = rng.uniform(lower, upper)
         tool = workplace.robot.chain.forward(torch.from_numpy(q)).position
-        size = workplace.robot.hand_size
         if tool[2] > size * _START_HEIGHT and (tool - hover).norm() > size * START_DISTANCE:
             yield q
 

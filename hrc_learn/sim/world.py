@@ -68,8 +68,7 @@ class World:
         self.data = mujoco.MjData(self.model)
         self._watch = PhysicsWatch(self.model, self.data)
         self.arm = MujocoArm(self.model, self.data, self.config.arm.robot, self.imperfections)
-        fixed = (*self.config.cabinet.boxes(), *self.config.obstacles)
-        cabinet = [box.name for box in fixed]
+        cabinet = [b.name for b in (*self.config.cabinet.boxes(), *self.config.obstacles)]
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
         objects = [item.name for item in self.config.objects]
         self.object_contacts = ContactMonitor(self.model, objects, cabinet)

@@ -33,7 +33,7 @@ from hrc_learn.experiments.grasping_trial import (
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.sim import World
@@ -136,6 +136,14 @@ def test_the_recording_tells_how_the_estimate_came_to_the_truth(grasp):
     )
     assert wrong[known[-1]] < 0.15 * wrong[known[0]]
     assert np.isfinite(run.potential_rate[known]).all()
+
+
+@pytest.mark.long
+def test_joints_of_several_turns_start_within_half_a_turn_of_home():
+    workplace = Workplace.of(ArmChoice("ur5e").work_arm())
+    scene = GraspingScene.draw(workplace, GraspingSceneConfig(), np.random.default_rng(1))
+    off = np.abs(scene.start - workplace.home_joints().numpy())
+    assert 1.0 < off.max() <= np.pi
 
 
 @pytest.mark.long
