@@ -32,6 +32,7 @@ RUNS = {
         "hrc play --model outputs/so101_fit --goal 0.7 0.2 0.3 -0.4 1.6 --robot so101 "
         "--out outputs/so101_played"
     ),
+    "outputs/demo_ur5e": "hrc demo --markerless --robot ur5e --out outputs/demo_ur5e",
     "outputs/five": (
         "hrc record expert --scenario grasping --episodes 5 --out outputs/five "
         "--config robot.object_pose=true"
@@ -104,6 +105,16 @@ PROGRAMS = (
         pictures=("so101.webp",),
         needs=("outputs/so101_set", "outputs/so101_fit", "outputs/so101_played"),
         captions={"so101.webp": "A primitive of three demonstrations, sent to a new goal"},
+    ),
+    Program(
+        heading="No marker anywhere",
+        command="python tools/docs/markerless_film.py",
+        pictures=("markerless.webp",),
+        needs=("outputs/demo_ur5e",),
+        captions={
+            "markerless.webp": "Arm and object are found by the look that demonstrations "
+            "showed, with their uncertainty, and the arm servoes to the target"
+        },
     ),
     Program(
         heading="Five demonstrations become a thousand",

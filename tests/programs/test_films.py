@@ -9,8 +9,11 @@ import pytest
 from PIL import Image
 from sample_runs import sample_run
 
+from hrc_learn.vision.landmarks import Finding
+
 sys.path.append(str(Path(__file__).parents[2] / "tools" / "docs"))
 import film_pictures  # pyright: ignore[reportMissingImports]
+import markerless_film  # pyright: ignore[reportMissingImports]
 import multiply_film  # pyright: ignore[reportMissingImports]
 import policy_film  # pyright: ignore[reportMissingImports]
 import readme_film  # pyright: ignore[reportMissingImports]
@@ -126,3 +129,21 @@ def test_the_share_counts_the_motions_that_failed():
         for tried, judge in ((1, "physics: grasping"), (3, "physics: grasping"))
     ]
     assert multiply_film.share(made) == "2 of 4 succeed in physics"
+
+
+def test_findings_are_drawn_where_they_were_found():
+    size, scale = markerless_film.CAMERA, markerless_film.FINE * 360 / 1080
+    grey = Image.new("RGB", tuple(markerless_film.FINE * side for side in size), (90, 90, 90))
+    points = np.array([[300.0, 300.0], [600.0, 300.0], [600.0, 600.0], [300.0, 600.0]])
+    tool = Finding(pixel=np.array([450.0, 450.0]), covariance=0.25 * np.eye(2), points=points)
+    target = np.array([900.0, 450.0])
+    picture, labels = markerless_film.drawn(grey, {"tool": tool}, target, scale)
+    assert picture.size == size
+    assert labels[0] == ("arm: 4 points, ± 0.5 px", markerless_film.ARM)
+    changed = (np.asarray(picture) != 90).any(axis=-1)
+    assert changed[100, 150]  # edge of the outline
+    assert changed[150, 150]  # the arm's pixel
+    assert changed[145:156, 290:311].any()  # ring around the target
+    assert not changed[250:, :].any()
+    _, labels = markerless_film.drawn(grey, {}, np.full(2, np.nan), scale)
+    assert labels == []
