@@ -256,10 +256,9 @@ def frames(recording: RunRecording) -> Iterator[Picture]:
 
 def caption(recording: RunRecording, time: float) -> str:
     """Caption of the phase at a time [s]."""
-    begun = [event.text for event in recording.phases if event.time <= time]
-    if not begun:
-        return recording.title
-    return _CAPTIONS.get(begun[-1], begun[-1].capitalize())
+    begun = ["", *(event.text for event in recording.phases if event.time <= time)]
+    phase = begun[-1] if "grasp" in begun else begun[-1].replace("home", "approach")
+    return _CAPTIONS.get(phase, phase.capitalize() or recording.title)
 
 
 @contextmanager

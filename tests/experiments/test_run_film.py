@@ -68,6 +68,13 @@ def test_the_caption_is_of_the_phase_that_was_entered_last():
     assert caption(run, 3.0) == "My own phase"
 
 
+def test_an_arm_that_has_grasped_nothing_carries_nothing_home():
+    phases = (Event(0.5, "home"), Event(2.0, "grasp"), Event(4.0, "home"))
+    run = sample_run(phases=phases)
+    assert caption(run, 1.0) == "Moves home"
+    assert caption(run, 5.0) == "Carries the object home"
+
+
 def test_a_pull_is_an_arrow_above_the_forearm_while_it_lasts():
     run, pulled, free = pushed(slice(80, 120)), 100, 20
     lines, _ = film._drawn_in(run, pulled)
