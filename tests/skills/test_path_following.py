@@ -1,5 +1,6 @@
 """Planned paths of the joints, off which a person pushes an arm that does as it is told."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -53,6 +54,10 @@ def test_a_path_is_left_when_its_end_is_told(cell):
     far = torch.full((7,), 0.1, dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
     assert cell.follow_path(path, until=lambda: len(cell.log) == 12) == 12
+    # Another motion may lead far from the path that was left.
+    away = cell.pose.position - torch.tensor([0.0, 0.0, 0.2], dtype=torch.float64)
+    cell.move_straight(replace(cell.pose, position=away))
+    np.testing.assert_allclose(cell.pose.position, away, atol=1e-3)
 
 
 class HeldArm(ObedientArm):
