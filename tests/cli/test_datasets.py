@@ -271,7 +271,7 @@ def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):
     assert hrc("check", root)[0] == 1
     status, _, error = hrc("repair", root, tmp_path / "new")
     assert (status, error.count("\n")) == (2, 1)
-    assert "drop_bad_frames" in error
+    assert "--drop bad-frames" in error
     status, text, _ = hrc(
         *("repair", root, tmp_path / "new", "--drop", "bad-frames", "--fps", 40),
         *("--units", "joint_position", "rad", "--json", tmp_path / "values.json"),

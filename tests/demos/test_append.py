@@ -35,7 +35,7 @@ def record(root, seeds, tasks, *, append=False, then=None, saved=None, **setting
         for seed, task in zip(seeds, tasks, strict=True):
             writer.start_episode(task)
             for k, q in enumerate(joint_path(40 + seed, seed=seed)):
-                writer.add_frame(time=0.02 * k, joint_position=q, command_position=q + 0.1)
+                writer.add_frame(time=0.02 * k, joint_position=q, command_position=q + 0.01)
             episode = writer.save_episode()
             if saved is not None:
                 saved.append(episode)

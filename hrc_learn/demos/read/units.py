@@ -265,13 +265,14 @@ def _guess(
 def _with_command(joints: Sizes, command: Sizes) -> Sizes:
     """Sizes of joints and commands together.
 
-    Commands reach the limit of 100 and are clipped there even where joints stop earlier.
+    Commands reach the limit of 100 and are clipped there even where joints stop earlier. Those
+    of at most 1 may be changes of the joints, clipped at 1.
     """
     if len(command.peak) != len(joints.peak):
         return joints
     near = (joints.peak > 90) & (command.peak > 90)
     return joints._replace(
-        clipped=np.maximum(joints.clipped, command.clipped),
+        clipped=np.maximum(joints.clipped, command.clipped * (command.peak > 1)),
         peak=np.where(near, np.maximum(joints.peak, command.peak), joints.peak),
     )
 
