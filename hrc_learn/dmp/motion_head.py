@@ -11,7 +11,7 @@ dynamic and probabilistic movement primitives").
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -343,8 +343,7 @@ class MotionHead(nn.Module):
         return torch.cat([H[..., :N] @ self.modes.to(H), H[..., -1:]], -1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
+class _Plan(NamedTuple):
     """Motion determined by parameters and a state."""
 
     coordinates: Float[Tensor, "*batch D M"]
@@ -368,7 +367,7 @@ class PlannedTrajectory(ContinuedTrajectory):
         response: Response,
     ):
         """Describe the motion of a plan, at rest while `waiting`."""
-        motion = dict(vars(plan))
+        motion = plan._asdict()
         self.delay: Tensor = motion.pop("delay")
         """Delay before the motion begins [s]."""
         super().__init__(s=s, response=response, **motion)

@@ -358,7 +358,6 @@ for options in ({}, {"duration": (1.0, 2.0), "delay": 0.3}):
 """
 
 
-@pytest.mark.slow
 def test_compiles_without_a_break():
     """In a process of its own: a compiler cannot follow the shape checks of these tests."""
     subprocess.run([sys.executable, "-c", COMPILED], check=True)
