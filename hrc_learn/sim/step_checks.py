@@ -30,7 +30,7 @@ _INDEXED = {
 def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
     """Mask of the geoms of the named bodies and of all bodies that they carry.
 
-    The body "world" stands for what is fixed to the ground: floor and pedestal.
+    The body "world" has floor and pedestal only.
     """
     roots = {model.body(name).id for name in bodies}
     member = np.zeros(model.nbody, dtype=bool)
